@@ -58,7 +58,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
         gated = text.replace('"balls"', '"gated_balls"').replace("name: balls", "name: gated_balls")
         gated = gated.replace("import math\n", "import math\nfrom collections.abc import Sequence\n")
         gated = gated.replace("GaussianModel, Raw\n", "Raw\nfrom gsbench.models.gated import GatedModel\n")
-        gated = gated.replace("(GaussianModel)", "(GatedModel)")
+        gated = gated.replace("(GaussianModel)", "(GatedModel, gates=True)")
         more = "\n" + methods_for_gates() if path.endswith(".py") else ""
         (project / path.replace("balls", "gated_balls")).write_text(gated + more)
     return project

@@ -10,7 +10,7 @@ from gsbench.effects.sensitivity import MOST_VIEWS
 from gsbench.measure.quality import evenly
 from gsbench.models import GaussianModel, Query
 from gsbench.models.effect_sets import DIRECTION
-from gsbench.models.gated import GatedModel
+from gsbench.models.gated import has_gates
 from gsbench.models.simplifications import STATIC, shares_of
 from gsbench.scenes import View
 
@@ -25,7 +25,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
         model: the trained model.
         views: the training views; direction is replaced by its mean over these views.
     """
-    if not isinstance(model, GatedModel) or "direction" not in model.observes:
+    if not has_gates(model) or "direction" not in model.observes:
         return None
     queries = [Query.of(view.camera, view.time) for view in evenly(views, MOST_VIEWS)]
     weights = shares_of([model.slice(query).opacities for query in queries])

@@ -25,7 +25,7 @@ from gsbench.scenes.scene import Points
 
 
 @register("dbs")
-class DirectBetaModel(BetaModel, MovingGaussians3D):
+class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
     """dBS: Gaussians with Beta profiles that move and fade with the direction d from the camera and the time t.
 
     Let q = (d, t), delta = q - mu_q, and V_qq = L L^T the precision over direction and time. Then
@@ -124,7 +124,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D):
 
 
 @register("dbs_static")
-class StaticDirectBetaModel(DirectBetaModel):
+class StaticDirectBetaModel(DirectBetaModel, gates=True):
     """dBS over direction alone, for scenes without time."""
 
     observes: ClassVar[tuple[str, ...]] = ("direction",)

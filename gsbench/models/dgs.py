@@ -32,7 +32,7 @@ COUPLING_SPREAD = 0.01  # initial standard deviation of the entries of Theta
 
 
 @register("dgs")
-class DirectModel(MovingGaussians3D):
+class DirectModel(MovingGaussians3D, gates=True):
     """dGS: 3D Gaussians that move and fade with the direction d from the camera and the time t.
 
     Let q = (d, t), delta = q - mu_q with the mean mu_q, and V_qq = L L^T the precision over direction and time. Then

@@ -22,7 +22,7 @@ from gsbench.scenes.scene import Points
 
 
 @register("freetime")
-class FreeTimeModel(MovingGaussians3D):
+class FreeTimeModel(MovingGaussians3D, gates=True):
     """FreeTimeGS: each Gaussian has a mean time mu_t, a standard deviation in time s and a velocity v,
 
         mean = mu_p + v (t - mu_t)      opacity = sigmoid(o) exp(-1/2 ((t - mu_t) / s)^2)      cov = R S S^T R^T

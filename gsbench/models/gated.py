@@ -1,12 +1,12 @@
 """Define the base class of models in which single Gaussians can be made independent of time, direction or AGR.
 
-AGR is the neural refinement of 7DGS. `gsbench.effects.gate` chooses these Gaussians. A model that does not support this
-derives from `GaussianModel` instead.
+AGR is the neural refinement of 7DGS. `gsbench.effects.gate` chooses these Gaussians. A model that supports this says so
+in its own class statement, `class Model(GatedModel, gates=True)`.
 """
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar, TypeGuard
 
 import torch
 from torch import Tensor
@@ -27,6 +27,16 @@ class GatedModel(GaussianModel):
 
     AGR is the neural refinement of 7DGS. `effect_sets` stores what each Gaussian still depends on.
     """
+
+    gates: ClassVar[bool] = False  # whether gates may simplify the model
+
+    def __init_subclass__(cls, *, gates: bool = False, **more: Any) -> None:
+        """Set whether gates may simplify the models of this class. This is not inherited.
+
+        A subclass may have parameters of which the inherited methods `static`, `frozen` and `kept` know nothing.
+        """
+        super().__init_subclass__(**more)
+        cls.gates = gates
 
     # ---- what a subclass provides
 
@@ -138,13 +148,23 @@ class GatedModel(GaussianModel):
         return whole
 
 
+def has_gates(model: GaussianModel) -> TypeGuard[GatedModel]:
+    """Return whether single Gaussians of the model can be made independent of time or direction."""
+    return isinstance(model, GatedModel) and model.gates
+
+
 def as_gated(model: GaussianModel) -> GatedModel:
     """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
-    if not isinstance(model, GatedModel):
-        raise InputError(f"effects.gate: expected a model that gates can simplify, {type(model).__name__} is no "
-                         f"GatedModel: make it one, or use effects.gate=off",
-                         docs="adding_a_model.md")  # fmt: skip
-    return model
+    if has_gates(model):
+        return model
+    name = type(model).__name__
+    if isinstance(model, GatedModel):
+        cure = (f"{name} inherits its methods for gates: see that they know all of its parameters, and write class "
+                f"{name}(.., gates=True)")  # fmt: skip
+    else:
+        cure = f"{name} is no GatedModel: make it one"
+    raise InputError(f"effects.gate: expected a model that gates can simplify, {cure}, or use effects.gate=off",
+                     docs="adding_a_model.md")  # fmt: skip
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:

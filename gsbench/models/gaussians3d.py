@@ -20,7 +20,7 @@ from gsbench.scenes.trained import TrainedGaussians
 
 
 @register("3dgs")
-class Gaussians3DModel(GatedModel):
+class Gaussians3DModel(GatedModel, gates=True):
     """3DGS: the covariance of a Gaussian is R S S^T R^T, with rotation R and scales S (3DGS, eq. 6)."""
 
     geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")

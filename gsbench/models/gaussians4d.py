@@ -31,7 +31,7 @@ MAX_DEGREE = 32  # largest degree of the Fourier series; the frames of a scene d
 
 
 @register("4dgs")
-class Gaussians4DModel(JointModel):
+class Gaussians4DModel(JointModel, gates=True):
     """4DGS: the factor of the covariance over (x, y, z, t) is a 4D rotation M_left(l) M_right(r) times four scales.
 
     A 4D rotation needs the same unit for space and time. The model uses the size of the scene as the length of its time

@@ -5,7 +5,7 @@ from gsbench.models.registry import register
 
 
 @register("6dgs")
-class Gaussians6DModel(DirectionalModel):
+class Gaussians6DModel(DirectionalModel, gates=True):
     """6DGS: Gaussians over position and direction, conditioned on the direction from the camera to the Gaussian."""
 
     observes = ("direction",)

@@ -16,7 +16,7 @@ from gsbench.models.sliced import Geometry
 
 
 @register("7dgs")
-class Gaussians7DModel(TimedModel, DirectionalModel):
+class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
     """7DGS: Gaussians over position, time and direction, conditioned on a time and the direction from the camera."""
 
     observes = ("time", "direction")

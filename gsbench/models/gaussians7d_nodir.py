@@ -9,7 +9,7 @@ from gsbench.models.registry import register
 
 
 @register("7dgs_nodir")
-class Gaussians7DWithoutDirectionModel(TimedModel):
+class Gaussians7DWithoutDirectionModel(TimedModel, gates=True):
     """7DGS without direction: Gaussians over position and time, conditioned on a time."""
 
     observes = ("time",)

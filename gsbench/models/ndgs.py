@@ -7,7 +7,7 @@ from gsbench.models.registry import register
 
 
 @register("ndgs")
-class NDGSModel(Gaussians7DModel):
+class NDGSModel(Gaussians7DModel, gates=True):
     """N-DGS, the later code of the authors of 7DGS: Gaussians over position, direction and time."""
 
     def __init__(

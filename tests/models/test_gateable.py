@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench import models
+from gsbench.effects.direction import without_direction
 from gsbench.errors import InputError
 from gsbench.models import registry
 from gsbench.models.base import SHRINK, GaussianModel, Raw
@@ -50,9 +51,48 @@ def made(kind: type[GaussianModel]) -> GaussianModel:
 
 def test_models_that_can_be_gated() -> None:
     """Catches a model of ours whose gates are refused, and one without the methods whose gates are not."""
-    assert all(issubclass(models.find(name), GatedModel) for name in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"))
+    for name in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir", "ndgs", "dgs", "freetime", "dbs", "dbs_static"):
+        kind = models.find(name)
+        assert issubclass(kind, GatedModel)
+        assert kind.gates
     with pytest.raises(InputError, match="Balls is no GatedModel"):
         as_gated(made(Balls))
+
+
+class Breathing(Gaussians3DModel):
+    """Gaussians whose size changes with time by a parameter of which the inherited methods know nothing."""
+
+    geometry = (*Gaussians3DModel.geometry, "breath")
+    observes = ("time",)
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        return super().initial_geometry(points, distances, generator) | {"breath": torch.ones(len(distances), 1)}
+
+    def condition(self, raw: Raw, query: Any) -> Conditioned:
+        calm = super().condition(raw, query)
+        return calm._replace(factors=calm.factors * (1 + query.time * raw["breath"])[:, :, None])
+
+
+class Checked(Breathing, gates=True):
+    """The same, with the methods that know of it."""
+
+    def static(self, raw: Raw) -> Conditioned:
+        return Gaussians3DModel.condition(self, raw, None)
+
+
+def test_gates_are_not_inherited() -> None:
+    """Catches a model that is gated by its base's methods, which drop what it adds without a word."""
+    with pytest.raises(InputError) as caught:
+        as_gated(made(Breathing))
+    assert str(caught.value) == (
+        "effects.gate: expected a model that gates can simplify, Breathing inherits its methods for gates: see that "
+        "they know all of its parameters, and write class Breathing(.., gates=True), or use effects.gate=off "
+        "(docs/adding_a_model.md)"
+    )
+    assert without_direction(made(Breathing), []) is None
+    assert as_gated(made(Checked)).gates
+    with pytest.raises(InputError, match="More inherits"):
+        as_gated(made(type("More", (Checked,), {})))
 
 
 def test_a_model_that_lacks_a_method(monkeypatch: pytest.MonkeyPatch) -> None:
