@@ -13,7 +13,7 @@ from gsbench.measure.record import Effects, OnDemand, Record
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
-from gsbench.run.checks import check_config, check_scene, check_values, evaluated_views, trained_start
+from gsbench.run.checks import check_config, check_scene, check_start, check_values, evaluated_views, trained_start
 from gsbench.run.comparing import best_of, check_candidates, check_compare, reporter
 from gsbench.run.identity import Run
 from gsbench.run.lengths import best_length
@@ -60,6 +60,8 @@ class Attempt:
         elif config.effects.compare:
             check_candidates(self.this.config, scene)
         check_scene(self.model, scene, config)
+        if self.start is not None:
+            check_start(self.start, scene)
         evaluated_views(scene, config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")
         return self.model, scene

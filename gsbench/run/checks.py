@@ -4,6 +4,7 @@ import dataclasses
 import importlib.resources
 import itertools
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
 from gsbench.run.identity import hash_of
 from gsbench.scenes import RESIZES, Scene, View
-from gsbench.scenes.trained import TrainedGaussians, read_trained
+from gsbench.scenes.trained import TrainedGaussians, read_trained, share_seen
 from gsbench.train.densify import check_kind
 from gsbench.train.gating import GATES
 from gsbench.train.losses import WINDOW
@@ -32,6 +33,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
 SPLITS = ("test", "val")
 LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
+ENOUGH_SEEN = 0.5  # share of Gaussians to start from that a camera sees; below it a line says so
 ENDLESS = 10**9  # more than any machine can do
 RANGES = {  # the ranges of settings, both ends included
     "train.iterations": (1, ENDLESS),
@@ -125,6 +127,23 @@ def trained_start(config: Config) -> TrainedGaussians | None:
         raise InputError(f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, found "
                          f"{found}: another file, or one that has just changed")  # fmt: skip
     return trained
+
+
+def check_start(trained: TrainedGaussians, scene: Scene) -> None:
+    """Print the share of trained Gaussians that the training cameras see if it is below ENOUGH_SEEN.
+
+    Raises:
+        InputError: the cameras see none of them, so that a training would move none.
+    """
+    cameras = [view.camera.to("cpu") for view in scene.train]
+    share = share_seen(trained, cameras, ENOUGH_SEEN)
+    if share == 0:
+        raise InputError(f"init.ply: expected Gaussians of {scene.name}, no training camera sees one of the "
+                         f"{len(trained)}: is the file of another scene, or in other coordinates or units?",
+                         docs="viewing.md#start-from-a-ply")  # fmt: skip
+    if share < ENOUGH_SEEN:
+        print(f"{scene.name}: the training cameras see {share:.0%} of the Gaussians of init.ply: is it of this scene?",
+              file=sys.stderr)  # fmt: skip
 
 
 def lpips_weights(config: Config) -> dict[str, Path]:

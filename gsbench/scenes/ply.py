@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.process.memory import require
 from gsbench.reading import read_file
+from gsbench.scenes.formats import check_readable
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -27,10 +29,27 @@ _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
 
+class _Element(NamedTuple):
+    """An element of a PLY: the number of its rows, and their type with a field for each property."""
+
+    count: int
+    dtype: np.dtype[np.void]
+
+    @property
+    def values(self) -> int:
+        """The number of values of all rows."""
+        return self.count * len(self.dtype.names or ())
+
+    @property
+    def size(self) -> int:
+        """The bytes of all rows in a binary file."""
+        return self.count * self.dtype.itemsize
+
+
 def read_vertices(path: Path) -> NDArray[np.void]:
     """Return the vertices of a PLY file as a structured array [P] with a field for each property.
 
-    The vertex element must be the first element and have scalar properties only, as in files of COLMAP and 3DGS. Other
+    The vertices and the elements before them must have scalar properties only, as in files of COLMAP and 3DGS. Other
     elements are ignored.
 
     Raises:
@@ -38,20 +57,24 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     """
     data = read_file(path, str(path), MAX_FILE)
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
+    if not data.startswith(b"ply"):
+        check_readable(path, data)
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
-    encoding, count, dtype = _read_header(lines, path)
+    encoding, before, vertices = _read_header(lines, path)
     if encoding == "ascii":
-        return _read_ascii(data[end.end() :], count, dtype, path)
-    found = len(data) - end.end()
-    if count * dtype.itemsize > found:
-        raise InputError(f"{path}: element vertex: expected {count} x {dtype.itemsize} bytes, found {found}: truncated")
-    return np.frombuffer(data, dtype, count, end.end())
+        return _read_ascii(data[end.end() :], sum(element.values for element in before), vertices, path)
+    start = end.end() + sum(element.size for element in before)
+    found = max(len(data) - start, 0)
+    if vertices.size > found:
+        raise InputError(f"{path}: element vertex: expected {vertices.count} x {vertices.dtype.itemsize} bytes, found "
+                         f"{found}: truncated")  # fmt: skip
+    return np.frombuffer(data, vertices.dtype, vertices.count, start)
 
 
-def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.void]]:
-    """Return the encoding, the vertex count and the vertex type of a PLY header."""
+def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _Element]:
+    """Return the encoding of a PLY, the elements before the vertices, and the vertices."""
     words = [line.split() for line in lines[1:]]
     words = [line for line in words if line and line[0] not in ("comment", "obj_info")]
     match words:
@@ -59,41 +82,60 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, int, np.dtype[np.vo
             pass
         case _:
             raise InputError(f"{path}: format: expected one of {', '.join(_ENCODINGS)}, got {words[:1]!r:.80}")
-    match rest:
-        case [["element", "vertex", count], *rest] if re.fullmatch("[0-9]{1,18}", count):
-            pass
-        case _:
-            raise InputError(f"{path}: expected 'element vertex <count>' first, got {rest[:1]!r:.80}")
+    before: list[_Element] = []
+    while rest:
+        match rest:
+            case [["element", name, count], *rest] if re.fullmatch("[0-9]{1,18}", count):
+                fields, rest = _read_properties(name, rest, _ENCODINGS[encoding], path)
+            case _:
+                raise InputError(f"{path}: expected 'element vertex <count>', or another element first, got "
+                                 f"{rest[:1]!r:.80}")  # fmt: skip
+        element = _Element(int(count), np.dtype(list(fields.items())))
+        if name == "vertex":
+            if not element.values:
+                raise InputError(f"{path}: element vertex: expected points, got {count} of {len(fields)} properties")
+            return encoding, before, element
+        before.append(element)
+    raise InputError(f"{path}: expected an 'element vertex <count>', found none")
+
+
+def _read_properties(
+    element: str, lines: list[list[str]], order: str, path: Path
+) -> tuple[dict[str, str], list[list[str]]]:
+    """Return the numpy types of the properties of an element, and the lines of the header behind them."""
     fields: dict[str, str] = {}
-    for line in rest:
+    for i, line in enumerate(lines):
         match line:
             case ["element", *_]:
-                break
+                return fields, lines[i:]
             case ["property", kind, name] if kind in _TYPES and name not in fields:
-                fields[name] = _ENCODINGS[encoding] + _TYPES[kind]
+                fields[name] = order + _TYPES[kind]
             case _:
-                raise InputError(f"{path}: element vertex: expected distinct scalar properties, got {line!r:.80}")
-    if not fields or int(count) == 0:
-        raise InputError(f"{path}: element vertex: expected points, got {count} of {len(fields)} properties")
-    return encoding, int(count), np.dtype(list(fields.items()))
+                raise InputError(f"{path}: element {element:.80}: expected distinct scalar properties, as far as the "
+                                 f"vertices, got {line!r:.80}")  # fmt: skip
+    return fields, []
 
 
-def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -> NDArray[np.void]:
-    """Parse the rows of an ascii PLY; raise InputError for a number that the type of its property cannot represent."""
-    names = dtype.names or ()
-    expected = count * len(names)
+def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> NDArray[np.void]:
+    """Parse the vertices of an ascii PLY, which `skipped` values of other elements precede.
+
+    Raises:
+        InputError: a number cannot be represented by the type of its property, or the file is truncated.
+    """
+    count, dtype = vertices
+    names, expected = dtype.names or (), skipped + vertices.values
     # A value needs at least two bytes, so a wrong count in the header is found before memory is allocated.
     values = []
     if 2 * expected <= len(body) + 1:
         require(_ASCII_VALUE * expected, f"{path}: {expected} values in ascii", "write a binary PLY")
-        values = body.split(maxsplit=expected)[:expected]
-    if len(values) < expected:
+        values = body.split(maxsplit=expected)[skipped:expected]
+    if len(values) < vertices.values:
         raise InputError(f"{path}: element vertex: expected {count} x {len(names)} values, the file is truncated")
     try:
         table = np.array([float(value) for value in values]).reshape(count, len(names))
     except ValueError as error:
         raise InputError(f"{path}: element vertex: expected numbers, some values are not") from error
-    vertices = np.empty(count, dtype)
+    rows = np.empty(count, dtype)
     for name, column in zip(names, table.T, strict=True):
         kind = dtype[name]
         if kind.kind in "iu":
@@ -101,5 +143,5 @@ def _read_ascii(body: bytes, count: int, dtype: np.dtype[np.void], path: Path) -
             if not ((column >= limits.min) & (column <= limits.max)).all():
                 raise InputError(f"{path}: {name}: expected values of {limits.min}..{limits.max}, some are outside")
         with np.errstate(over="ignore"):  # becomes infinite, and is refused where the property is read
-            vertices[name] = column
-    return vertices
+            rows[name] = column
+    return rows

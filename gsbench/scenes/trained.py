@@ -7,6 +7,7 @@ of the red channel, then green, then blue.
 
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.headers import ALPHA_MAX
+from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN
 from gsbench.process.memory import require
+from gsbench.scenes.formats import FILTER, check_columns, shortened
 from gsbench.scenes.ply import read_vertices
+from gsbench.scenes.scene import Camera
 
 MAX_DEGREE = 3  # largest SH degree of gsbench's models; a file may have degree 4
 _FILE_DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(MAX_DEGREE + 2)}  # by the number of f_rest_*
@@ -55,18 +58,18 @@ def read_trained(path: Path) -> TrainedGaussians:
     """Read trained 3D Gaussians from an ascii or binary PLY file of 3DGS with SH degree 0 to 4.
 
     An opacity of exactly 0 or 1, which converters of compressed files write as an infinite logit, becomes 0.001 or
-    0.999, the largest alpha that is blended; a line on stderr says how many.
+    0.999, the largest alpha that is blended. The 3D filter of Mip-Splatting becomes a part of scales and opacities.
+    Lines on stderr say both, and which columns are left out.
 
     Raises:
-        InputError: the file is not such a PLY, lacks a column, or has another value that is not finite.
+        InputError: the file is not such a PLY, lacks a column, has one that may change the look and is not known, or
+            has another value that is not finite.
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    for name in (name for columns in _COLUMNS.values() for name in columns):
-        if name not in names:
-            raise InputError(f"{path}: expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and "
-                             f"f_rest_*, found no '{name}': is it a cloud of points, or compressed?",
-                             docs="viewing.md#start-from-a-ply")  # fmt: skip
+    left_out = check_columns(names, [name for columns in _COLUMNS.values() for name in columns], path)
+    if left_out:
+        print(f"{path}: columns that change no image are left out: {shortened(left_out)}", file=sys.stderr)
     count = sum(name.startswith("f_rest_") for name in names)
     if count not in _FILE_DEGREES:
         expected = ", ".join(map(str, _FILE_DEGREES))
@@ -81,6 +84,8 @@ def read_trained(path: Path) -> TrainedGaussians:
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
+    if FILTER in names:
+        _fuse(read, _table(vertices, (FILTER,), path), path)
     higher = channels.view(len(vertices), 3, count // 3).mT.contiguous()
     return TrainedGaussians(read["means"], read["log_scales"], read["quats"], read["logits"], read["dc"], higher)
 
@@ -108,6 +113,31 @@ def ply_of(trained: TrainedGaussians) -> bytes:
     return "\n".join(header).encode() + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
 
 
+def share_seen(
+    trained: TrainedGaussians,
+    cameras: Sequence[Camera],
+    enough: float,  # share at which the search ends
+) -> float:
+    """Return the share of Gaussians that at least one camera sees; at least `enough`, once it is reached.
+
+    A camera sees a Gaussian of opacity 1/255 or more if a ball of three of its largest standard deviations reaches into
+    the camera's pyramid of view, and is at least one pixel wide. What stands in front of it does not count.
+    """
+    unseen = (torch.sigmoid(trained.logits) >= ALPHA_MIN).nonzero()[:, 0]
+    hidden, N = len(trained) - len(unseen), len(trained)
+    means, radii = trained.means.double(), 3 * trained.log_scales.double().amax(1).exp()
+    for camera in cameras:
+        if 1 - (hidden + len(unseen)) / N >= enough:
+            break
+        K, viewmat = camera.K.double(), camera.viewmat.double()
+        sides = torch.stack([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1], K[2]])
+        sides = sides / sides.norm(dim=1, keepdim=True)  # [5, 3] unit normals into the pyramid
+        centers, radius = means[unseen] @ viewmat[:3, :3].T + viewmat[:3, 3], radii[unseen]
+        outside = (centers @ sides.T < -radius[:, None]).any(1)
+        unseen = unseen[outside | (2 * radius * K[0, 0] < centers[:, 2])]
+    return 1 - (hidden + len(unseen)) / N
+
+
 def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.void]:
     """Return vertices with logits of the opacities 0.001 and 0.999 in place of infinite ones; say how many."""
     infinite = np.isinf(vertices["opacity"])
@@ -117,6 +147,29 @@ def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.vo
         print(f"{path}: {int(infinite.sum())} of {len(vertices)} opacities are exactly 0 or 1, taken for "
               f"{1 - ALPHA_MAX:.3f} or {ALPHA_MAX:.3f}", file=sys.stderr)  # fmt: skip
     return vertices
+
+
+def _fuse(
+    read: dict[str, Tensor],  # log_scales [N, 3] and logits [N], which are overwritten
+    filters: Tensor,  # [N, 1] standard deviations, world units
+    path: Path,
+) -> None:
+    """Make the 3D filter of Mip-Splatting a part of scales and opacities, as its export for viewers does; say so.
+
+    With the squared scales S and the squared filter f^2: S' = S + f^2, and opacity' = opacity sqrt(det S / det S').
+
+    Raises:
+        InputError: a filter is negative.
+    """
+    if not (filters >= 0).all():
+        raise InputError(f"{path}: {FILTER}: expected sizes of at least 0, some are negative: export the file anew")
+    scales, logits = read["log_scales"].double(), read["logits"].double()
+    wider = torch.logaddexp(2 * scales, 2 * filters.double().log()) / 2
+    lower = (scales - wider).sum(1)  # ln of the factor of the opacity, at most 0
+    odds = torch.logaddexp(torch.zeros_like(logits), logits + (-torch.expm1(lower)).log())
+    read["log_scales"], read["logits"] = wider.float(), (logits + lower - odds).float()
+    print(f"{path}: {FILTER} of Mip-Splatting is now a part of scales and opacities; its filter of images is "
+          f"raster.antialias=true", file=sys.stderr)  # fmt: skip
 
 
 def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:

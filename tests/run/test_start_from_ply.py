@@ -12,9 +12,11 @@ from gsbench.run.load import load_run
 from gsbench.scenes.trained import TrainedGaussians, ply_of
 
 
-def write_trained(path: Path, count: int = 8) -> TrainedGaussians:
+def write_trained(path: Path, count: int = 8, away: int = 0) -> TrainedGaussians:
+    """Write Gaussians around the origin, the last `away` of them 500 units above it; return them."""
     g = torch.Generator().manual_seed(0)
     draws = [torch.randn(shape, generator=g) for shape in ((count, 3), (count, 3), (count, 4), (count,), (count, 3))]
+    draws[0][count - away :, 1] += 500 / 0.3
     trained = TrainedGaussians(0.3 * draws[0], 0.1 * draws[1] - 1, *draws[2:], torch.zeros(count, 15, 3))
     path.write_bytes(ply_of(trained))
     return trained
@@ -58,3 +60,17 @@ def test_a_hash_without_a_file_and_an_endless_file_are_refused(tmp_path: Path) -
     assert "init.ply_sha256" in (record.reason or "")
     with pytest.raises(InputError, match=r"init\.ply='/dev/zero': expected a file, found a device"):
         run_here(*words, "+init.ply=/dev/zero")
+
+
+def test_gaussians_that_no_camera_sees_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a training of black images from a file of another scene, and one of a few Gaussians without a line."""
+    data = write_moving_square(tmp_path / "data")
+    words = [*overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
+    write_trained(tmp_path / "a.ply", 8, away=8)
+    record, _ = run_here(*words)
+    assert record.status == "failed"
+    assert "no training camera sees one of the 8" in (record.reason or "")
+    for away, line in ((6, True), (3, False)):
+        write_trained(tmp_path / "a.ply", 8, away)
+        assert run_here(*words)[0].status == "ok"
+        assert ("the training cameras see 25% of the Gaussians" in capsys.readouterr().err) == line
