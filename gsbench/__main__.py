@@ -4,6 +4,7 @@ torch is imported only when the first run starts, so that wrong options are repo
 """
 
 import os
+import shlex
 import signal
 import sys
 import warnings
@@ -11,13 +12,14 @@ from pathlib import Path
 
 import hydra
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from gsbench import usage
 from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line, printable
 from gsbench.run.stop import Stopped, stop_at_once
-from gsbench.sweep.axes import expand
+from gsbench.sweep.axes import check_complete, check_words, expand
 from gsbench.sweep.callbacks import started
 from gsbench.sweep.explain import explain, raised_by_library
 from gsbench.sweep.finish import see_through
@@ -31,21 +33,18 @@ _problems: list[Problem] = []  # problems of the runs that failed; the sweep con
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def entry(composed: DictConfig) -> None:
     """Do one run of a sweep. If the run fails, the error is stored and the sweep continues."""
-    if OmegaConf.is_missing(composed, "experiment"):
-        raise InputError(f"no experiment was chosen: add +exp=NAME. Valid: {', '.join(_group('exp'))}.", docs="runs.md")
+    try:
+        check_complete(composed)
+    except InputError as error:
+        print(f"gsbench: error: {printable(error)}", file=sys.stderr)
+        _problems.append(Problem(str(error), True))
+        return
     if composed.experiment == "stability":  # the only experiment that trains no model on a scene
         from gsbench.stability.__main__ import main as audit
 
         if audit(["--out", str(Path(composed.results) / "stability")]):
             _problems.append(Problem("stability: a default breaks its bound", False))
         return
-    if OmegaConf.is_missing(composed.scene, "name"):
-        raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
-    if OmegaConf.is_missing(composed.data, "root"):
-        raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
-                         f"{composed.data.dataset} ({', '.join(composed.data.scenes)}), each with "
-                         f"transforms_{{train,val,test}}.json and the images they name. "
-                         f"Published at: {composed.data.published}", docs="data.md#what-is-read")  # fmt: skip
     problem = do(composed)
     if problem is not None:
         _problems.append(problem)
@@ -62,12 +61,16 @@ def main() -> None:
     if "--version" in sys.argv[1:]:  # Hydra would print its own
         print(f"gsbench {__version__}")
         return
+    if sys.argv[1:2] != ["doctor"] and {"-h", "--help"} & set(sys.argv[1:]):  # Hydra would compose a config first
+        print(usage.text(sys.argv[1:]), end="")
+        return
     if sys.argv[1:2] == ["doctor"]:
         from gsbench.doctor import main as doctor
 
         sys.exit(doctor(sys.argv[2:]))
     try:
         sys.argv[1:] = expand(sys.argv[1:])
+        check_words(sys.argv[1:])
         broken = see_through(entry, started)
     except (Stopped, KeyboardInterrupt) as stopped:
         print(f"gsbench: {str(stopped) or 'stopped by SIGINT'}", file=sys.stderr)
@@ -80,7 +83,7 @@ def main() -> None:
         sys.exit(BAD_INPUT)
     if broken:
         print(f"gsbench: {len(broken)} runs did not end well: python -m gsbench.sweep status "
-              f"{started[0].parents[1]}", file=sys.stderr)  # fmt: skip
+              f"{shlex.quote(str(started[0].parents[1]))}", file=sys.stderr)  # fmt: skip
     if _problems and all(problem.is_refused for problem in _problems) and not broken:
         sys.exit(BAD_INPUT)
     sys.exit(FAILED if _problems or broken else 0)
@@ -107,10 +110,6 @@ def _in_one_line(
     if not Path(filename).is_relative_to(HERE):
         return _in_two_lines(message, category, filename, lineno, line)
     return f"gsbench: warning: {message}\n"
-
-
-def _group(name: str) -> list[str]:
-    return sorted(path.stem for path in (CONF / name).glob("*.yaml"))
 
 
 if __name__ == "__main__":

@@ -9,23 +9,49 @@ import pytest
 import torch
 from tiny_run import ROOT, gsbench, main_here, overrides, write_moving_square
 
+from gsbench.config import CONF
 from gsbench.errors import TooLargeError
 from gsbench.measure import record
 from gsbench.train import step
+from gsbench.usage import DESCRIBED, first_sentence
 
 
-def test_help_lists_what_there_is_without_torch() -> None:
-    """Catches a help text that pays for importing torch, or does not name models, experiments and scenes."""
+def test_help_describes_what_there_is_without_torch() -> None:
+    """Catches a help text that pays for importing torch or composing a config, does not say what a model or an
+    experiment is, or lists trials."""
     code = (
         "import sys; sys.argv = ['gsbench', '--help']\n"
+        "import hydra._internal.hydra as composer; composer.Hydra.create_main_hydra2 = None\n"
         "from gsbench.__main__ import main\n"
         "try: main()\n"
         "finally: sys.stderr.write('torch imported' if 'torch' in sys.modules else 'no torch')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert "no torch" in done.stderr
-    for word in ("7dgs_noagr", "dnerf", "mini", "pbr", "suzanne", "agr=true|false"):
+    assert done.stderr == "no torch"
+    assert "  4dgs          4DGS (Yang et al. 2023): Gaussians in space and time\n" in done.stdout
+    assert "  mini          The three embedded scenes, on a laptop\n" in done.stdout
+    for word in ("suzanne", "+recipe=NAME", "agr=true|false", "gsbench doctor"):
         assert word in done.stdout
+    for word in ("late_harmonics", "row_scaled", "trex100"):
+        assert word not in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 120
+
+
+@pytest.mark.parametrize("path", sorted(p for group in DESCRIBED for p in (CONF / group).glob("*.yaml")), ids=str)
+def test_every_choice_in_the_help_has_a_sentence(path: Path) -> None:
+    """Catches a model or an experiment without a description, or one that is cut behind 'et al.'."""
+    sentence = first_sentence(path)
+    assert len(sentence.split()) > 2
+    assert sentence.count("(") == sentence.count(")")
+
+
+def test_the_help_lists_models_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches `--config-dir` that is not read, as Hydra's own help does."""
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "balls.yaml").write_text("# Balls of one size. Not much.\nname: balls\n")
+    for words in (["--config-dir", str(tmp_path), "--help"], ["-h", f"--config-dir={tmp_path}"]):
+        assert main_here(*words) == 0
+        assert "  balls         Balls of one size\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -51,6 +77,9 @@ def test_help_lists_what_there_is_without_torch() -> None:
         (["+exp=mini", "scene=suzanne", f"+init.ply={__file__}"], ["test_command_line.py", "expected a PLY"]),
         (["+exp=mini", "data.scenes=[]"], ["data.scenes", "empty list"]),
         (["+exp=mini", "model=1e400"], ["model '1e400'", "Valid: 3dgs"]),
+        (["+exp=mini", "scene=suzanne,pendulum"], ["scene=suzanne,pendulum: commas", "\"scene='suzanne,pendulum'\""]),
+        (["results/mini"], ["'results/mini': expected KEY=VALUE"]),
+        (["Küche=1"], ["'Küche=1': expected KEY=VALUE"]),
         (["model=7dgs"], ["+exp=NAME", "ablation, colmap, dnerf, frontier, mini, pbr, stability"]),
         (["+exp=dnerf", "scene=trex"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
         (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
@@ -73,6 +102,50 @@ def test_what_is_typed_wrong_is_told_in_one_line(
         assert (one.status, one.metrics) == ("failed", None)
         assert one.reason is not None
         assert one.reason in said
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["+exp=dnerf"], ["-m", "+exp=dnerf", "scene=trex,lego"], ["+exp=dnerf,pbr", "-m", "scene=trex"]]
+)
+def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches lines of Hydra and warnings around the reason, and runs that are planned and then lost for ever."""
+    assert main_here(*words, *([f"results={tmp_path}"] if words else [])) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"gsbench: error: {'data.root is not set' if words else 'expected an experiment'}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_only_its_own_config_refuses_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a sweep whose later runs lack data: 'Error executing job', and a warning of a callback."""
+    words = ["-m", "data.root=.,???", "+exp=dnerf", "scene=custom", "scene.name=a", f"results={tmp_path}"]
+    assert main_here(*words) == 1
+    said = capsys.readouterr()
+    assert "Warning" not in said.err
+    assert "Error executing" not in said.err
+    assert said.err.count("data.root is not set") == 1
+
+
+def test_a_failed_run_says_its_reason_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches the reason on stdout and on stderr, which a terminal shows twice."""
+    assert main_here("+exp=mini", "scene=suzanne", "train.iterations=0", f"results={tmp_path}") == 1
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("train.iterations: expected") == 1
+    assert "failed; " in said.out
+    assert "record.json" in said.out
+
+
+@pytest.mark.parametrize(("place", "root"), [("a/b/square", ""), ("a/square", ""), ("a/square", "a/square")])
+def test_a_data_root_too_high_or_too_low_names_the_right_one(
+    place: str, root: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a message that lists where the scene is not, while it lies in a folder beside."""
+    (tmp_path / place).parent.mkdir(parents=True)
+    (tmp_path / place).symlink_to(square / "square")
+    words = overrides(tmp_path / root, tmp_path / "r", "model=3dgs", "train.iterations=1")
+    assert main_here(*words) == 1
+    assert f'type "data.root={(tmp_path / place).parent}"' in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

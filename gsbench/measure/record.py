@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.reading import MAX_JSON, parse_json, read_file
 
 VERSION = 1
+LONGEST_NAME = 200  # bytes; of a scene, a model or an experiment, which are names of folders
 MAX_POINTS = 10_000  # the most points of a training curve, which a page can still draw quickly
 FILE_NAME = "record.json"
 PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
@@ -339,7 +341,8 @@ def model_folder(model: str, variant: str) -> str:
 def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:
     """Raise InputError if a name is not a valid folder name, for instance because it leads out of its parent."""
     for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}", name):
+        letters = unicodedata.normalize("NFC", name)  # letters of every script, as a folder of the user's has them
+        if not re.fullmatch(r"[^\W_][\w.+-]{0,99}", letters) or len(name.encode()) > LONGEST_NAME:
             raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
     if not re.fullmatch(r"([A-Za-z0-9][A-Za-z0-9_.+,=-]{0,99})?", variant):
         raise InputError(f"{where}variant: expected words such as iterations=10, got {variant!r:.80}")

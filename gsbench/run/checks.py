@@ -5,7 +5,7 @@ import importlib.resources
 import itertools
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
 from gsbench.run.identity import hash_of
+from gsbench.run.overrides import typed
 from gsbench.scenes import RESIZES, Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained, share_seen
 from gsbench.train.densify import check_kind
@@ -250,6 +251,10 @@ def scene_folder(config: Config) -> Path:
     for folder in folders:
         if folder.is_dir():
             return folder
+    for root in _roots_nearby(data_root(data.root), names):
+        raise InputError(f"data.root={data.root}: expected the folder that holds {' or '.join(map(repr, names))}: "
+                         f"type {typed('data.root', str(root), several=False)}",
+                         docs="data.md#what-is-read")  # fmt: skip
     published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
     raise InputError(
         f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with a scene, such "
@@ -257,6 +262,15 @@ def scene_folder(config: Config) -> Path:
         f"{published}",
         docs="data.md#what-is-read",
     )
+
+
+def _roots_nearby(root: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield folders that hold a scene, if `root` is one or two folders above such a folder, or is the scene's own."""
+    if root.is_dir() and root.absolute().name in names:
+        yield root.absolute().parent
+    for name in names:
+        for pattern in (f"*/{name}", f"*/*/{name}"):
+            yield from (path.parents[name.count("/")] for path in sorted(root.glob(pattern)) if path.is_dir())
 
 
 def check_scene_names(config: Config) -> None:

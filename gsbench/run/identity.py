@@ -19,7 +19,7 @@ from gsbench.measure import record as records
 from gsbench.measure.renamed import present_key
 from gsbench.measure.settings import Plain, flat, training_part
 from gsbench.reading import read_file
-from gsbench.run.overrides import UNNAMED, deciding
+from gsbench.run.overrides import UNNAMED, deciding, quoted_value
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
@@ -127,9 +127,10 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
         if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
     }
     words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if DEFAULTS.get(group) != choice]
-    own = [f"{'' if group in DEFAULTS or group in ('model', 'scene') else '+'}{group}={choice}"
+    own = [f"{'' if group in DEFAULTS or group in ('model', 'scene') else '+'}{group}={quoted_value(choice)}"
            for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
-    own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}", f"scene.name={plain['scene']['name']}"]
+    own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}"]
+    own += [f"scene.name={quoted_value(plain['scene']['name'])}"]
     base: Plain = OmegaConf.to_container(hydra.compose("config", own), resolve=True)  # type: ignore[assignment]
     effects = base["effects"]
     theirs = {"effects.budget_db": effects["budget_db"]} | dict(flat(training_part(

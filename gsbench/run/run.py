@@ -103,7 +103,8 @@ def _done(attempt: Attempt) -> Record:
         raise UnrecordedError(f"{summary(record)}; its record cannot be written: {error.strerror}") from None
     for line in messages.lines(record.on_demand) if record.on_demand else []:
         print(f"{this.name}: {line}")
-    print(f"{this.name}: {summary(record)}; {this.folder / records.FILE_NAME}")
+    ended = summary(record) if record.status == "ok" else record.status  # the caller prints the reason
+    print(f"{this.name}: {ended}; {this.folder / records.FILE_NAME}")
     try:
         attempt.draw()
     except Exception as error:  # the record is written, so an error in the pictures must not end the sweep

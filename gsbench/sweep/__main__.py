@@ -16,6 +16,7 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
+from gsbench.run.overrides import quoted_value
 from gsbench.sweep import estimate
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
@@ -152,7 +153,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
               if run.state in BROKEN and identity(run.overrides) not in experiment.requested]  # fmt: skip
     count = retry(experiment, launch, do)
     for run in single[:MOST_COMMANDS]:
-        words = " ".join(map(shlex.quote, (*run.overrides, f"results={folder.parent}")))
+        words = " ".join(map(shlex.quote, (*run.overrides, f"results={quoted_value(str(folder.parent))}")))
         print(f"gsbench.sweep: not of a sweep, so only its own command starts it again: python -m gsbench "
               f"{printable(words)}", file=sys.stderr)  # fmt: skip
     if len(single) > MOST_COMMANDS:

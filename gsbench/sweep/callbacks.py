@@ -6,6 +6,7 @@ object is pickled into every job.
 
 import copy
 import os
+import shlex
 import socket
 import sys
 import time
@@ -19,8 +20,9 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.errors import InputError
+from gsbench.errors import InputError, one_line
 from gsbench.measure.record import FILE_NAME
 from gsbench.run.progress import born
 from gsbench.sweep import container, plan
@@ -40,7 +42,8 @@ class WritePlan(Callback):
         started.append(folder)
         container.use(config, planned.runs)
         experiment = folder.parents[1]
-        print(f"{len(planned.runs)} runs; their status: python -m gsbench.sweep status {experiment}", file=sys.stderr)
+        print(f"{len(planned.runs)} runs; their status: python -m gsbench.sweep status {shlex.quote(str(experiment))}",
+              file=sys.stderr)  # fmt: skip
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Prepare the process of a job that runs in a container image."""
@@ -88,8 +91,8 @@ def ended(config: DictConfig, results: Path) -> Ended:
         del composed["hydra"]
     try:
         path = identify(composed, config.hydra.runtime.choices).folder / FILE_NAME
-    except InputError as error:
-        return Ended(None, str(error))
+    except (InputError, OmegaConfBaseException) as error:  # the latter: a key of the run has no value
+        return Ended(None, one_line(error))
     if not path.exists():
         return Ended(None, "it ended without a record")
     return Ended(os.path.relpath(path, results), None)

@@ -1,5 +1,6 @@
 """Explain in one line why Hydra, OmegaConf or a launcher rejects a command line or a config."""
 
+import re
 import traceback
 
 from hydra.errors import MissingConfigException
@@ -8,8 +9,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.errors import did_you_mean
 from gsbench.measure.renamed import present_key
+from gsbench.run.overrides import typed
 
 LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
+AMBIGUOUS = re.compile(r"Ambiguous value for argument '((.*?)=(.*))'\n")  # Hydra's, of a sweep without --multirun
 NO_SLURM = 'Could not detect "srun"'  # how submitit says so
 
 
@@ -29,6 +32,10 @@ def explain(error: Exception) -> str:
         if keys and cause.key not in keys:
             return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
         return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+    if ambiguous := AMBIGUOUS.match(str(error)):
+        word, key, text = ambiguous.groups()
+        return (f"{word}: commas separate the values of a sweep: type -m too for a run of each, or "
+                f"{typed(key, text, several=False)} for one value")  # fmt: skip
     if str(error).startswith(NO_SLURM):
         return ("+launch=slurm: expected a machine of a Slurm cluster, srun is not on PATH: use its login node, or "
                 "+launch=parallel (docs/runs.md#slurm-from-a-login-node-to-the-table)")  # fmt: skip
