@@ -20,8 +20,8 @@ from gsbench.measure.record import MAX_POINTS, run_path
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
+from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
-from gsbench.run.overrides import typed
 from gsbench.scenes import RESIZES, Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained, share_seen
 from gsbench.train.densify import check_kind

@@ -19,7 +19,8 @@ from gsbench.measure import record as records
 from gsbench.measure.renamed import present_key
 from gsbench.measure.settings import Plain, flat, training_part
 from gsbench.reading import read_file
-from gsbench.run.overrides import UNNAMED, deciding, quoted_value
+from gsbench.run.grammar import quoted_value
+from gsbench.run.overrides import UNNAMED, deciding
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 

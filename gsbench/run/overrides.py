@@ -1,23 +1,13 @@
-"""Check the overrides of a command line, and separate those that change results from those that launch a run."""
+"""Separate command-line overrides that change results from those that set folders or how a run is launched."""
 
 import re
-import shlex
 from collections.abc import Sequence
-from dataclasses import is_dataclass
-from typing import Any, get_type_hints
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, Quote, QuotedString
-from hydra.errors import HydraException
-
-from gsbench.config import Config
-from gsbench.errors import InputError
 from gsbench.measure.renamed import present_override
 
 UNNAMED = ("results", "resume", "log", "launch")  # groups and keys that change no number of a run
 _UNNAMED = re.compile(rf"[+~]*({'|'.join(UNNAMED)})\b")
 _LAUNCH = re.compile(r"[+~]*launch\b")
-_TEXTS = (str, str | None)  # the types of keys whose values are texts
 
 
 def deciding(overrides: Sequence[str]) -> list[str]:
@@ -28,63 +18,3 @@ def deciding(overrides: Sequence[str]) -> list[str]:
 def launches(override: str) -> bool:
     """Return whether an override only sets how a run is launched, for instance on Slurm."""
     return _LAUNCH.match(override) is not None
-
-
-def check_override(word: str) -> None:
-    """Raise InputError if Hydra cannot read an override, or would read another text, such as 20240102 for 2024_01_02.
-
-    The message has the override as it is to be typed in a shell, with quotes around the value.
-    """
-    key, _, text = word.partition("=")
-    kind, read = _type_of(key), _read(word)
-    if isinstance(read, HydraException):
-        if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:
-            raise InputError(f"{word!r:.300}: expected KEY=VALUE, such as model=7dgs or +exp=mini")
-        raise InputError(f"{key}: expected quotes around {text}, as some of its characters have another meaning for "
-                         f"Hydra: type {typed(key, text, several=kind not in _TEXTS)}")  # fmt: skip
-    several = isinstance(read, ChoiceSweep) or (isinstance(read, list) and kind not in _TEXTS)
-    values = list(read.list) if isinstance(read, ChoiceSweep) else read if several else [read]
-    texts = _parts(text) if several else [text]
-    if kind in (*_TEXTS, list[str]) and any(
-        isinstance(value, int | float | list | dict) and str(value) != part
-        for value, part in zip(values, texts, strict=False)
-    ):
-        raise InputError(f"{key}: expected a text, Hydra reads {text} as {', '.join(map(str, values))}: type "
-                         f"{typed(key, text, several)}")  # fmt: skip
-
-
-def quoted_value(text: str) -> str:
-    """Return a text for Hydra: as it is, or in quotes if Hydra would read another value or none."""
-    return text if text and _read(f"x={text}") == text else QuotedString(text, Quote.single).with_quotes()
-
-
-def typed(key: str, text: str, several: bool) -> str:
-    """Return an override for a shell, with its value, or each of several values, in quotes that Hydra removes."""
-    values = ",".join(map(quoted_value, _parts(text) if several else [text]))
-    word = f"{key}=[{values}]" if several and _is_list(text) else f"{key}={values}"
-    return shlex.quote(word) if "!" in word else '"' + re.sub(r'(["$`\\])', r"\\\1", word) + '"'
-
-
-def _read(word: str) -> Any:
-    """Return the value of an override as Hydra reads it, or Hydra's error."""
-    try:
-        return OverridesParser.create().parse_override(word).value()
-    except HydraException as error:
-        return error
-
-
-def _type_of(key: str) -> Any:
-    """Return the type of a config key, such as str for data.root; None if gsbench/config.py does not declare it."""
-    kind: Any = Config
-    for name in key.lstrip("+").split("."):
-        kind = get_type_hints(kind).get(name) if is_dataclass(kind) else None
-    return kind
-
-
-def _is_list(text: str) -> bool:
-    return text.startswith("[") and text.endswith("]")
-
-
-def _parts(text: str) -> list[str]:
-    """Return the values of a list or a sweep, which commas separate."""
-    return [part.strip() for part in (text[1:-1] if _is_list(text) else text).split(",")]

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
-from gsbench.run.overrides import quoted_value
 from gsbench.sweep import estimate
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
@@ -144,7 +143,8 @@ def _verdict(runs: list[RunStatus]) -> int:
 
 
 def _retry(folder: Path, launch: list[str]) -> int:
-    from gsbench.sweep.retry import retry  # imports Hydra, which a status does not need
+    from gsbench.run.grammar import quoted_value  # imports Hydra, which a status does not need
+    from gsbench.sweep.retry import retry
     from gsbench.sweep.task import do
 
     folder = folder.resolve()  # runs are launched from the folder that the first command was given in

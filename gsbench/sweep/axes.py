@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config import CONF
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.renamed import present_override
-from gsbench.run.overrides import check_override, quoted_value
+from gsbench.run.grammar import check_override, quoted_value
 
 MULTIRUN = ("-m", "--multirun")
 SCENES_DEPEND_ON = ("exp", "data.scenes")  # the overrides on which the list of scenes depends

@@ -9,7 +9,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.errors import did_you_mean
 from gsbench.measure.renamed import present_key
-from gsbench.run.overrides import typed
+from gsbench.run.grammar import typed
 
 LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
 AMBIGUOUS = re.compile(r"Ambiguous value for argument '((.*?)=(.*))'\n")  # Hydra's, of a sweep without --multirun

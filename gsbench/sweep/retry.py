@@ -19,7 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError, printable
 from gsbench.measure.renamed import present_override
-from gsbench.run.overrides import launches, quoted_value
+from gsbench.run.grammar import quoted_value
+from gsbench.run.overrides import launches
 from gsbench.sweep import container, plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
 from gsbench.sweep.callbacks import plan_of
