@@ -18,6 +18,7 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import one_line, printable
+from gsbench.extras import how_to_install, requirements
 from gsbench.measure.machine import hardware
 from gsbench.measure.provenance import git_commit
 from gsbench.version import __version__
@@ -83,14 +84,14 @@ def _packages() -> Iterator[Check]:
     there = [extra for extra, names in extras.items() if all(map(_version, names))]
     lacking = [extra for extra in extras if extra not in there]
     yield Check("extras", OK if there else ABSENT, ", ".join(there) or "none",
-                f"pip install 'gsbench[NAME]' of {', '.join(lacking)}" if lacking else "")  # fmt: skip
+                f"{how_to_install('NAME')}, NAME of {', '.join(lacking)}" if lacking else "")  # fmt: skip
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
     """Return the names of the required packages, and those of each extra for users."""
     core: list[str] = []
     extras: dict[str, list[str]] = {}
-    for line in metadata.requires("gsbench") or []:
+    for line in requirements():
         name = re.match(r"[\w.-]+", line)[0]  # type: ignore[index]
         extra = re.search(r"extra == ['\"](\w+)['\"]", line)
         if extra is None:

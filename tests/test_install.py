@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT, environment
 
+from gsbench.version import __version__
+
 MB = 1e6
 HOOK = """
 import sys
@@ -36,6 +38,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_sdist_has_what_builds_and_tests_it(sdist: Path) -> None:
     """Catches an sdist without sources or scenes, or one that records, builds and trials have bloated."""
+    assert sdist.name == f"gsbench_splatting-{__version__}.tar.gz"  # as .github/workflows/wheels.yml expects it
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     for name in ("CMakeLists.txt", "conf/exp/mini.yaml", "gsbench/kernels/cpu/triangular.cpp", "tests/smoke.py",

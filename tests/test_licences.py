@@ -54,6 +54,7 @@ def test_the_sbom_lists_what_users_install(capsys: pytest.CaptureFixture[str]) -
     licences.main(["--sbom"])
     found = json.loads(capsys.readouterr().out)
     named = {one["name"]: one for one in found["components"]}
+    assert found["metadata"]["component"]["purl"].startswith("pkg:pypi/gsbench-splatting@")
     assert {"torch", "markupsafe", "viser"} <= named.keys()
     assert not {"plyfile", "pytest", "gsbench"} & named.keys()
     assert named["hydra-core"]["purl"] == f"pkg:pypi/hydra-core@{metadata.version('hydra-core')}"

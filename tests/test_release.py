@@ -2,7 +2,9 @@
 
 import fnmatch
 import re
+import subprocess
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +13,12 @@ from packaging.specifiers import SpecifierSet
 from tiny_run import ROOT
 
 import gsbench
+from gsbench import extras
+from gsbench.extras import how_to_install
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PYTHONS = [f"3.{n}" for n in range(30) if f"3.{n}" in SpecifierSet(PYPROJECT["project"]["requires-python"])]
+DISTRIBUTION = PYPROJECT["project"]["name"].replace("-", "_")  # as files are named
 MAKEFILE = (ROOT / "Makefile").read_text()
 
 
@@ -35,7 +40,7 @@ def test_the_version_is_one() -> None:
     (source,) = (one["input"] for one in PYPROJECT["tool"]["dynamic-metadata"] if one["field"] == "version")
     assert f'__version__ = "{gsbench.__version__}"' in (ROOT / source).read_text()
     for page in ("CONTRIBUTING.md", "docs/install.md"):
-        named = re.findall(r"(?:gsbench[- ]|\bv)(\d+\.\d+\.\d+)", (ROOT / page).read_text())
+        named = re.findall(r"(?:gsbench(?:_splatting)?[- ]|\bv)(\d+\.\d+\.\d+)", (ROOT / page).read_text())
         assert named, page
         assert {*named} == {gsbench.__version__}, page
 
@@ -46,6 +51,41 @@ def test_the_changelog_has_the_version_and_its_day() -> None:
     released = re.findall(r"^## (\d+\.\d+\.\d+) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert released[0] == (gsbench.__version__, str(citation["date-released"]))
+
+
+STRANGERS = re.compile(r"gsbench\[[a-zA-Z]|pip3? install(?: +-\S+(?: +\S+\.txt)?)* +['\"]?gsbench(?![\w.-])")
+"""What installs another project's package, which has the name gsbench in PyPI."""
+
+
+def test_nobody_is_told_to_install_a_strangers_package() -> None:
+    """Catches a page, a message, a workflow or an image that installs gsbench by that name, and that name itself."""
+    for told in (
+        "pip install 'gsbench[view]'",
+        "`pip install gsbench`",
+        "pip install -c c.txt gsbench==0.3",
+        "gsbench[dev]",
+    ):
+        assert STRANGERS.search(told), told
+    for told in (
+        f"'{how_to_install('view')}'",
+        "pip install gsbench_splatting-0.3.0-cp311.whl",
+        "pip install -c c.txt .",
+    ):
+        assert not STRANGERS.search(told), told
+    tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if tracked.returncode:
+        pytest.skip("not a checkout: git lists no files")
+    suffixes = {"", ".md", ".py", ".yml", ".yaml", ".toml", ".txt", ".def", ".ipynb", ".j2", ".sh", ".cff"}
+    files = [ROOT / name for name in tracked.stdout.split("\0") if Path(name).suffix in suffixes]
+    texts = {
+        path: path.read_text()
+        for path in files
+        if path.is_file() and path.name not in ("CHANGELOG.md", Path(__file__).name)
+    }
+    assert len(texts) > 300
+    assert {path: found[0] for path, text in texts.items() if (found := STRANGERS.search(text))} == {}
+    assert PYPROJECT["project"]["name"] != "gsbench"
+    assert PYPROJECT["project"]["scripts"] == {"gsbench": extras.COMMAND}
 
 
 def test_every_python_is_tested() -> None:
@@ -77,7 +117,7 @@ def test_the_image_is_of_a_wheel_of_this_project() -> None:
     said = dict(steps)  # the last of each
     *sources, target = said["COPY"].split()
     (wheel,) = (one for one in sources if one.endswith(".whl"))
-    assert fnmatch.fnmatch(f"dist/gsbench-{gsbench.__version__}-cp311-cp311-manylinux_2_28_x86_64.whl", wheel)
+    assert fnmatch.fnmatch(f"dist/{DISTRIBUTION}-{gsbench.__version__}-cp311-cp311-manylinux_2_28_x86_64.whl", wheel)
     assert "3.11" in PYTHONS
     assert "Python 3.11" in text  # of the base image
     kept = [line[1:] for line in (folder / "Dockerfile.dockerignore").read_text().splitlines() if line[0] == "!"]

@@ -130,9 +130,10 @@ def sbom() -> dict[str, Any]:
                 "licenses": [{"license": {"name": licence}}]}  # fmt: skip
 
     found = {name_of(one.metadata["Name"]): one for one in installed(of_users(), set())}
+    project = PROJECT["project"]
     return {
         "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1,
-        "metadata": {"component": component("application", "gsbench", __version__, PROJECT["project"]["license"])},
+        "metadata": {"component": component("application", project["name"], __version__, project["license"])},
         "components": [component("library", name, one.version, licence_of(one)) for name, one in sorted(found.items())],
     }  # fmt: skip
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gsbench.errors import InputError, did_you_mean, one_line
+from gsbench.extras import how_to_install
 from gsbench.measure.atomic import write_atomically
 
 ID_FILE = "tracker.txt"  # in the run's folder: the id that the tracker gave the run, so that a resumed run continues it
@@ -138,7 +139,7 @@ def check(name: str | None) -> None:
         raise InputError(f"log '{name}' is not known. {did_you_mean(name, TRACKERS)}")
     if importlib.util.find_spec(name) is None:
         raise InputError(
-            f"log={name}: the package {name} is not installed: pip install 'gsbench[{name}]'",
+            f"log={name}: the package {name} is not installed: {how_to_install(name)}",
             docs="runs.md#the-folder-of-a-run",
         )
 

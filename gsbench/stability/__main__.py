@@ -11,8 +11,9 @@ import sys
 from pathlib import Path
 
 from gsbench.errors import InputError, one_line
+from gsbench.extras import how_to_install
 
-EXTRA = ("matplotlib", "mpmath")  # the packages of gsbench[stability]
+EXTRA = ("matplotlib", "mpmath")  # the packages of the extra stability
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -36,8 +37,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"gsbench.stability: error: expected {' and '.join(missing)}: install with "
-              "pip install 'gsbench[stability]'", file=sys.stderr)  # fmt: skip
+        print(
+            f"gsbench.stability: error: expected {' and '.join(missing)}: {how_to_install('stability')}",
+            file=sys.stderr,
+        )
         return 2
     os.environ.setdefault("MPLBACKEND", "Agg")
     if options.checkpoint:

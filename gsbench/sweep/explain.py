@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.errors import did_you_mean
+from gsbench.extras import how_to_install
 from gsbench.measure.renamed import present_key
 from gsbench.run.grammar import typed
 
@@ -21,7 +22,7 @@ def explain(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group == "hydra/launcher":
-            return "+launch=slurm and +launch=parallel need packages of their own: pip install 'gsbench[cluster]'"
+            return f"+launch=slurm and +launch=parallel need more packages: {how_to_install('cluster')}"
         return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:

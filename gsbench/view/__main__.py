@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 from gsbench.errors import InputError, one_line
+from gsbench.extras import how_to_install
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -43,7 +44,7 @@ def serve(options: argparse.Namespace) -> None:
         KeyboardInterrupt: the user ends the viewer with Ctrl-C.
     """
     if options.page is None and importlib.util.find_spec("viser") is None:
-        raise InputError("the viewer needs viser: pip install 'gsbench[view]'", docs="viewing.md#the-viewer")
+        raise InputError(f"the viewer needs viser: {how_to_install('view')}", docs="viewing.md#the-viewer")
     if not 0 < options.port < 65536:
         raise InputError(f"--port: expected 1 to 65535, got {options.port}")
     from gsbench.models.registry import import_models

@@ -254,7 +254,7 @@ def test_a_run_with_a_server_that_is_down_is_ok(
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("wandb", "log=wandb: the package wandb is not installed: pip install 'gsbench[wandb]'"),
+        ("wandb", "log=wandb: the package wandb is not installed: pip install '.[wandb]'"),
         ("tensorbord", "log 'tensorbord' is not known. Did you mean 'tensorboard'"),
     ],
 )

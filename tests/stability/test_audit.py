@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsbench.extras import how_to_install
 from gsbench.stability import __main__ as command
 from gsbench.stability import audit, page, picture_cases, pictures, population, training_cases, trainings
 from gsbench.stability.cases import CASES, Bound, Cell
@@ -150,7 +151,7 @@ def test_without_the_extra_a_line_says_what_to_install(
 
     for name in missing:
         monkeypatch.setitem(sys.modules, name, None)
-    line = f"expected {' and '.join(missing)}: install with pip install 'gsbench[stability]'\n"
+    line = f"expected {' and '.join(missing)}: {how_to_install('stability')}\n"
     assert command.main(["--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err == f"gsbench.stability: error: {line}"
     monkeypatch.setattr(sys, "argv", ["gsbench", "+exp=stability", f"results={tmp_path}"])
