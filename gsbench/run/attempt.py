@@ -21,6 +21,7 @@ from gsbench.run.log import RunLog
 from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
+from gsbench.scenes.placement import gaussians_to_standard
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train.loop import Trainer
 
@@ -50,7 +51,7 @@ class Attempt:
         if is_auto(self.this.config):
             check_values(with_candidate(self.this.config, "static"))
         self.model = build(config)
-        self.start = trained_start(config)
+        start = trained_start(config)
         self.scene = scene = load_scene(config)
         for note in scene.notes:
             print(f"{scene.name}: {note}", file=sys.stderr)
@@ -60,7 +61,8 @@ class Attempt:
         elif config.effects.compare:
             check_candidates(self.this.config, scene)
         check_scene(self.model, scene, config)
-        if self.start is not None:
+        if start is not None:
+            self.start = gaussians_to_standard(start, scene.placement)
             check_start(self.start, scene)
         evaluated_views(scene, config.scene.eval_split)
         records.check(self.describe("failed", "not run"), "planned record")

@@ -18,8 +18,7 @@ from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import Run
 from gsbench.run.load import plain_description
 from gsbench.scenes import Points, Scene
-from gsbench.scenes.placement import gaussians_to_standard
-from gsbench.scenes.points import frustum_points, random_points, share_seen
+from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen
 from gsbench.scenes.scene import STANDARD
 from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
@@ -42,11 +41,11 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
         model: the model, still without Gaussians.
         scene: the scene with its views, and with initial points if the data set has some.
         config: the settings of the run.
-        start: trained Gaussians to start from; None to start from points.
+        start: trained Gaussians to start from, in the coordinates of the scene; None to start from points.
     """
     random = generator(config.seed)
     if start is not None:
-        start_from(model, gaussians_to_standard(start, scene.placement), scene.extent, random)
+        start_from(model, start, scene.extent, random)
     else:
         model.initialise(scene.points or initial_points(config.data, scene, random), scene.extent, random)
     model.to(config.device)
@@ -156,7 +155,7 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
     if data.initial_half_width is None:
         return frustum_points(data.initial_points, cameras, scene.extent, random)
     points = random_points(data.initial_points, data.initial_half_width, random)
-    share = share_seen(points, cameras)
+    share = share_of_points_seen(points, cameras)
     where = f"{data.initial_points} initial points in a cube of half width {data.initial_half_width:g}"
     if share < LEAST_SEEN:
         raise InputError(f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "

@@ -85,7 +85,7 @@ def is_seen(
     return (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
 
 
-def share_seen(points: Points, cameras: Sequence[Camera]) -> float:
+def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
     """Return the share of points that are inside the image of at least one camera."""
     seen = torch.zeros(len(points.means), dtype=torch.bool)
     for camera in cameras:
