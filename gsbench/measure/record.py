@@ -82,8 +82,8 @@ class Region:
 class Cost:
     """The cost of a run: training seconds, memory, frame times and the size of the model."""
 
-    train_s: float  # seconds of all stages of the training loop, without evaluation and what Python does between them
-    stage_s: dict[str, float]  # the same seconds by stage of training
+    train_s: float  # wall-clock seconds of all training steps: gsbench.train.loop.Trainer.run says what does not count
+    stage_s: dict[str, float]  # the same seconds by stage of training; "other": between the stages
     render_ms: RenderTimes
     fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
     num_gaussians: int

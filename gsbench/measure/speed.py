@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from gsbench.errors import InputError
 
 LEAST_RENDERS = 30
+OTHER = "other"  # the stage of all work that is in no other stage, such as checks of values and Python
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,9 @@ def time_in_turns(
 class StageClock:
     """Sums the seconds of each stage of training; `with stages("loss"): ...` adds to the stage "loss".
 
+    In a block `with stages.running(): ...` the work between stages counts too, as the stage OTHER, so that all stages
+    add up to the wall-clock seconds of these blocks.
+
     On a GPU, CUDA events mark the start and end of a stage, so that the CPU waits for the GPU only when the sums are
     read. GPU work counts for the stage that launched it.
     """
@@ -125,6 +129,17 @@ class StageClock:
         self._clock = _clock_of(device)
         self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end of stages that are not yet in the sums
         self._current: str | None = None
+        self._last: Any = None  # when the last stage ended; None outside of `running`
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Time a block of work as a whole: what is in none of its stages counts as the stage OTHER."""
+        self._last = self._clock.mark()
+        try:
+            yield
+        finally:
+            self._end(OTHER, self._last)
+            self._last = None
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -136,21 +151,39 @@ class StageClock:
         if self._current is not None:
             raise InputError(f"stages: '{name}' was opened inside '{self._current}'; close that one first")
         self._current = name
-        start = self._clock.mark()
+        start = self._begin()
         try:
             yield
         finally:
-            self._ended.append((name, start, self._clock.mark()))
+            self._end(name, start)
             self._current = None
-            while self._ended and self._clock.has_passed(self._ended[0][2]):
-                self._add_one()
+
+    @contextmanager
+    def side_by_side(self, workers: int) -> Iterator[list["StageClock"]]:
+        """Time a block in which several threads of the CPU work at the same time.
+
+        The seconds of the block are divided among the stages in proportion to the seconds that the threads took.
+
+        Args:
+            workers: the number of threads, each of which gets a clock of its own.
+        """
+        clocks = [StageClock() for _ in range(workers)]
+        start = self._begin()
+        yield clocks
+        end = self._clock.mark()
+        self.share([clock.seconds for clock in clocks], self._clock.seconds(start, end))
+        if self._last is not None:
+            self._last = end
 
     def share(self, workers: list[dict[str, float]], wall: float) -> None:
         """Add `wall` seconds of parallel workers, divided among stages in proportion to the seconds in `workers`."""
-        total = sum(sum(seconds.values()) for seconds in workers) or 1.0
+        total = sum(sum(seconds.values()) for seconds in workers)
+        if not total:
+            self.add(OTHER, wall)
+            return
         for seconds in workers:
             for name, own in seconds.items():
-                self._seconds[name] = self._seconds.get(name, 0.0) + wall * own / total
+                self.add(name, wall * own / total)
 
     def add(self, name: str, seconds: float) -> None:
         """Add seconds that were measured elsewhere to a stage."""
@@ -163,9 +196,26 @@ class StageClock:
             self._add_one()
         return self._seconds
 
+    def _begin(self) -> Any:
+        """Mark the start of a stage, at which the work since the last stage ends."""
+        start = self._clock.mark()
+        if self._last is not None:
+            self._ended.append((OTHER, self._last, start))
+            self._last = start
+        return start
+
+    def _end(self, name: str, start: Any) -> None:
+        """Mark the end of a stage, and add up the stages that the device has finished."""
+        end = self._clock.mark()
+        self._ended.append((name, start, end))
+        if self._last is not None:
+            self._last = end
+        while self._ended and self._clock.has_passed(self._ended[0][2]):
+            self._add_one()
+
     def _add_one(self) -> None:
         name, start, end = self._ended.popleft()
-        self._seconds[name] = self._seconds.get(name, 0.0) + self._clock.seconds(start, end)
+        self.add(name, self._clock.seconds(start, end))
 
     def state_dict(self) -> dict[str, float]:
         """Return the seconds of each stage, for a checkpoint."""

@@ -108,6 +108,9 @@ class Trainer:
     ) -> None:
         """Train until the last step, until PSNR on val no longer rises, or until `goes_on()` returns False.
 
+        The seconds of the training (`stages`) are the wall-clock seconds of all steps, and of the removal of effects at
+        the end. Measuring on val, `save`, `goes_on` and the progress bar do not count.
+
         Args:
             save: a function that gets the state every `checkpoint_minutes` and once at the end.
             label: the name of the run in the progress bar.
@@ -125,10 +128,11 @@ class Trainer:
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
             while self.step < train.iterations:
-                camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
-                with self.effort, fitting_threads(len(self.model), camera.width * camera.height // factor**2):
-                    self._descend()
-                    self.average.add(self.step)
+                with self.effort, self.stages.running():
+                    camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
+                    with fitting_threads(len(self.model), camera.width * camera.height // factor**2):
+                        self._descend()
+                        self.average.add(self.step)
                 measured = self.schedule.measures(self.step)
                 if measured:
                     self._measure()

@@ -3,7 +3,6 @@
 The gradients of the views are added in a fixed order, so the result has the same bits for any number of threads.
 """
 
-import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -193,15 +192,12 @@ class Step:
         workers = len(bounds) - 1
         if workers == 1:
             return [work(i, self.stages) for i in range(bounds[1])]
-        started = time.perf_counter()
-        clocks = [StageClock() for _ in range(workers)]
+        with self.stages.side_by_side(workers) as clocks:
 
-        def run(worker: int) -> list[Seen]:
-            return [work(i, clocks[worker]) for i in range(bounds[worker], bounds[worker + 1])]
+            def run(worker: int) -> list[Seen]:
+                return [work(i, clocks[worker]) for i in range(bounds[worker], bounds[worker + 1])]
 
-        seen = [one for part in side_by_side(run, range(workers), workers) for one in part]
-        self.stages.share([clock.seconds for clock in clocks], time.perf_counter() - started)
-        return seen
+            return [one for part in side_by_side(run, range(workers), workers) for one in part]
 
     def _see(
         self, index: int, view: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages

@@ -157,8 +157,41 @@ def test_workers_share_the_time_they_took_together():
     stages.load_state_dict({"slice": 1.0, "density": 0.5})
     stages.share([{"slice": 1.0, "raster": 3.0}, {"raster": 2.0, "loss": 2.0}], 4.0)  # 8 s of two workers in 4
     assert stages.seconds == pytest.approx({"slice": 1.5, "density": 0.5, "raster": 2.5, "loss": 1.0})
-    stages.share([{}, {}], 1.0)  # of no stage: nothing is divided by zero
-    assert sum(stages.seconds.values()) == pytest.approx(5.5)
+    stages.share([{}, {}], 1.0)  # of no stage: nothing is divided by zero, and nothing is lost
+    assert stages.seconds[speed.OTHER] == 1.0
+    assert sum(stages.seconds.values()) == pytest.approx(6.5)
+
+
+def test_stages_add_up_to_the_wall_clock(monkeypatch):
+    """Would catch work between stages that no stage has, work of threads that counts twice, and time outside of
+    `running` that counts at all."""
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def work(seconds: float) -> None:
+        now[0] += seconds
+
+    stages = speed.StageClock()
+    for _ in range(2):
+        with stages.running():
+            work(0.1)
+            with stages("loss"):
+                work(1.0)
+            work(0.2)
+            with stages.side_by_side(2) as clocks:
+                for clock in clocks:
+                    with clock("raster"):
+                        work(2.0)
+                work(0.5)
+            work(0.3)
+            with stages("loss"):
+                work(0.5)
+            work(0.4)
+        work(100.0)
+    assert stages.seconds == pytest.approx({"other": 2.0, "loss": 3.0, "raster": 9.0})
+    with stages("gate"):  # after the loop
+        work(7.0)
+    assert sum(stages.seconds.values()) == pytest.approx(21.0)
 
 
 def test_stages_do_not_nest():

@@ -3,6 +3,7 @@
 import copy
 import math
 import re
+import time
 from dataclasses import fields, replace
 from typing import Any
 
@@ -308,6 +309,53 @@ def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
     last = capsys.readouterr().err.split("\r")[-1]
     assert fitted.curve.progress in last
     assert re.search(r"\d+ s of training, val \d+\.\d\d dB \([+-]\d", last)
+
+
+def with_fake_clock(fitted: Trainer, now: list[float], patch: pytest.MonkeyPatch) -> Trainer:
+    """A trainer whose steps take 2 s in a stage and 1 s around it, and whose measuring takes 100 s."""
+
+    def work(seconds: float) -> None:
+        now[0] += seconds
+
+    def step() -> None:
+        work(0.75)
+        with fitted.stages("loss"):
+            work(2.0)
+        work(0.25)
+
+    def measure(_: object) -> float:
+        work(100.0)
+        return 20.0
+
+    patch.setattr(time, "perf_counter", lambda: now[0])
+    patch.setattr(fitted, "_descend", step)
+    patch.setattr(fitted, "psnr", measure)
+    return fitted
+
+
+def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches Python between stages that no second holds, val, checkpoints and reports that are held to be training,
+    a curve of another clock, and a stopped run that loses seconds or counts them twice."""
+    now = [0.0]
+    saved: list[dict[str, Any]] = []
+
+    def save(state: dict[str, Any]) -> None:
+        now[0] += 1000.0
+        saved.append(state)
+
+    def goes_on() -> bool:
+        now[0] += 10_000.0
+        return fitted.step != 3
+
+    settings = ("3dgs", "train.iterations=10", "train.curve_points=5", "train.densify.stop=0")
+    for _ in range(2):  # the second training continues the first, which ends after three steps
+        fitted = with_fake_clock(trainer(*settings), now, monkeypatch)
+        if saved:
+            fitted.load_state_dict(saved[-1])
+        fitted.run(save, "square", goes_on)
+    assert fitted.step == 10
+    assert fitted.stages.seconds == pytest.approx({"loss": 20.0, "other": 10.0})
+    assert [(p.iteration, p.seconds) for p in fitted.curve.points] == [(n, 3.0 * n) for n in (2, 4, 6, 8, 10)]
 
 
 def test_early_steps_see_small_images() -> None:
