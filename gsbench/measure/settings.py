@@ -102,7 +102,7 @@ def listed(differences: list[str]) -> str:
 
 
 def _differences(theirs: Plain, mine: Plain) -> list[str]:
-    return [f"{key}: {_shown(theirs, key)} there, {_shown(mine, key)} now"
+    return [f"{key} {_shown(mine, key)} instead of {_shown(theirs, key)}"
             for key in sorted(theirs.keys() | mine.keys())
             if config_hash({"": theirs.get(key, [])}) != config_hash({"": mine.get(key, [])})]  # fmt: skip
 

@@ -9,7 +9,7 @@ from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
-from gsbench.report import against_table, layout, live, paper_tables, select, tables
+from gsbench.report import against_lines, against_table, layout, live, paper_tables, select, tables
 from gsbench.report.against import DIFFERS, Comparison, compare
 from gsbench.report.latex import latex
 from gsbench.report.numbers import numbers
@@ -115,7 +115,8 @@ def _against(records: list[Record], faults: list[str], options: argparse.Namespa
         tables.write(records, options.results, built)
         page = build.write(records, options.results, faults, against=compared)
         print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {page}")
-        print(f"\n{layout.terminal(made)}\n{compared.line}")
+        print(f"\n{layout.terminal(made)}")
+        print("\n".join(against_lines.lines(compared, records, page)))
     return compared.verdict == DIFFERS
 
 

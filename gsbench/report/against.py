@@ -1,14 +1,17 @@
 """Compare the runs in two folders of records, and judge for each quantity whether the folders agree.
 
 For example, this compares the results of this machine with published results. Runs are compared if their model, scene,
-data, training settings and evaluation settings are equal. Another machine or instruction set rounds floating-point
-numbers differently, and different rounding changes the result of a training as much as another seed does. Therefore the
-runs of one model on one scene form two samples, one for each folder. Student's t compares the two means, and Holm's
-method adjusts the p-values for all models and scenes.
+data, training settings and evaluation settings are equal. Equal code with equal seeds gives equal bits. If all runs of
+a model on a scene whose seed both folders have are bit-equal, quality and size agree, and no statistics are needed.
+
+Other code or another device rounds floating-point numbers differently, and different rounding changes the result of a
+training as much as another seed does. Therefore the other runs of one model on one scene form two samples, one for each
+folder. Student's t compares the two means, and Holm's method adjusts the p-values for all models and scenes.
 
 A few seeds do not give a reliable variance. Therefore the variance over seeds is pooled over the models and scenes of
 an experiment. If the variance of the compared runs themselves is larger, it is used instead. With the pooled variance,
-even one run in one folder can be compared with three runs in the other.
+even one run in one folder can be compared with three runs in the other: the interval of the difference is then the
+prediction interval, in which one more run of the other folder would lie.
 """
 
 import math
@@ -25,6 +28,7 @@ from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
 # Settings of a run's evaluation.
 MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale", "resize")
+OF_THE_BITS = ("psnr", "gaussians", "mb")  # quantities that are equal if the trained Gaussians are bit-equal
 SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not compared
 
 
@@ -33,8 +37,9 @@ class Limit:
     """Two limits for the comparison of two means: `equal` and `widest`.
 
     Means whose difference is at most `equal` count as equal. A larger difference that is not significant also counts as
-    equal, but only if the 95 % interval of the difference is no wider than ± `widest`. If `relative` is true, both
-    limits are fractions of the mean in the second folder.
+    equal, but only if the 95 % interval of the difference is no wider than ± `widest`. If one folder has a single run,
+    its difference must be at most `widest` instead. If `relative` is true, both limits are fractions of the mean in the
+    second folder.
     """
 
     equal: float
@@ -51,15 +56,17 @@ LIMITS = {  # by quantity; most are those of gsbench.report.configurations
 }
 RULE = (
     "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
-    "of one machine with one load (within 0.5). A row agrees where the means are within 0.01 dB, 25 % of seconds or "
-    "ms, 10 % of Gaussians or MB, or the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; "
-    "it differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled over "
-    "all rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where "
+    "of one machine with one load (within 0.5). PSNR, Gaussians and MB agree where every run is bit-equal with the "
+    "other folder's run of its seed. A row also agrees where the means are within 0.01 dB, 25 % of seconds or ms, 10 % "
+    "of Gaussians or MB; or where the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; or, "
+    "of a single run, where it is in the 95 % prediction interval of the other folder's runs and as near to their "
+    "mean. It differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled "
+    "over all rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where "
     "one row does, and agrees where all rows do."
 )
 
-
 NONE = Estimate(math.nan, 0, 0, "")
+EQUAL = Estimate(0.0, 1, 1, "")  # the difference of bit-equal runs
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,7 @@ class Judged:
     verdict: str = UNTOLD
     difference: Estimate = NONE
     p_holm: float = math.nan
+    is_bit_equal: bool = False  # whether all runs whose seed both folders have are bit-equal
 
 
 @dataclass(frozen=True)
@@ -84,7 +92,19 @@ class ComparedRuns:
     model: str
     ours: dict[int, Record]  # by seed
     theirs: dict[int, Record]
+    reason: str = ""  # why the runs cannot be compared at all
     judged: dict[str, Judged] = field(default_factory=dict)  # by quantity
+
+    @property
+    def shared(self) -> list[int]:
+        """Return the seeds of the runs that finished in both folders and can be compared."""
+        seeds = [] if self.reason else sorted(self.ours.keys() & self.theirs.keys())
+        return [seed for seed in seeds if self.ours[seed].status == self.theirs[seed].status == "ok"]
+
+    @property
+    def bit_equal(self) -> list[int]:
+        """Return those of the `shared` seeds whose two runs are bit-equal."""
+        return [seed for seed in self.shared if is_bit_equal(self.ours[seed], self.theirs[seed])]
 
 
 @dataclass(frozen=True)
@@ -96,6 +116,7 @@ class Comparison:
     rows: list[ComparedRuns]
     only_ours: list[str]  # models on scenes that the other folder lacks
     only_theirs: list[str]
+    otherwise: dict[str, list[str]]  # those of `only_ours` that the other folder trained otherwise, by the difference
 
     def of(self, quantity: str, verdict: str) -> list[ComparedRuns]:
         """List the compared models and scenes for which a quantity has the given verdict."""
@@ -113,32 +134,10 @@ class Comparison:
         return AGREES if self.rows and len(self.of("psnr", AGREES)) == len(self.rows) else UNTOLD
 
     @property
-    def line(self) -> str:
-        """Return a summary of the comparison in one line of text."""
-        head = f"{self.ours} against {self.theirs}: {self.verdict}."
-        if not self.rows:
-            return f"{head} No model and scene is in both."
-        said = [f"PSNR agrees in {len(self.of('psnr', AGREES))} of {len(self.rows)} models on scenes{self._largest()}"]
-        for quantity, name in (("psnr", "PSNR"), ("gaussians", "Gaussians"), ("mb", "bytes"), ("seconds", "seconds"),
-                               ("ms", "ms a frame")):  # fmt: skip
-            differing = self.of(quantity, DIFFERS)
-            said += [f"{name} differ{'s' * (name == 'PSNR')}: {_places(differing)}"] if differing else []
-        untold = self.of("psnr", UNTOLD)
-        said += [f"PSNR cannot be told: {_places(untold)} ({untold[0].judged['psnr'].reason})"] if untold else []
-        seconds = self.of("seconds", UNTOLD)
-        if len(seconds) == len(self.rows):
-            said.append(f"seconds cannot be told ({seconds[0].judged['seconds'].reason})")
-        return f"{head} {'; '.join(said)}."
-
-    def _largest(self) -> str:
+    def largest(self) -> ComparedRuns | None:
+        """Return the model and scene with the largest difference in PSNR; None if no difference is known."""
         known = [row for row in self.rows if not math.isnan(row.judged["psnr"].difference.mean)]
-        if not known:
-            return ""
-        most = max(known, key=lambda row: abs(row.judged["psnr"].difference.mean))
-        apart = f"largest difference {most.judged['psnr'].difference.mean:+.2f} dB, {_places([most])}"
-        shared = [(row.ours[seed], row.theirs[seed]) for row in known for seed in row.ours.keys() & row.theirs.keys()]
-        equal = sum(abs(value(a, "psnr") - value(b, "psnr")) <= LIMITS["psnr"].equal for a, b in shared)
-        return f" ({apart}; of {len(shared)} equal seeds {equal} end within 0.01 dB)" if shared else f" ({apart})"
+        return max(known, key=lambda row: abs(row.judged["psnr"].difference.mean), default=None)
 
 
 def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, str]) -> Comparison:
@@ -162,7 +161,7 @@ def compare(ours: Sequence[Record], theirs: Sequence[Record], names: tuple[str, 
         adjusted = holm([row.judged[quantity].difference.p for row in rows])
         for row, p in zip(rows, adjusted, strict=True):
             row.judged[quantity] = _judge(row.judged[quantity], limit, p)
-    return Comparison(*names, rows, _missing(here, there), _missing(there, here))
+    return Comparison(*names, rows, _missing(here, there), _missing(there, here), _otherwise(here, there))
 
 
 RunsByConfiguration = dict[tuple[str, str, str, str, str], dict[int, Record]]
@@ -177,23 +176,54 @@ def _by_configuration(records: Sequence[Record]) -> RunsByConfiguration:
 
 def _missing(of: RunsByConfiguration, other: RunsByConfiguration) -> list[str]:
     """List the models and scenes that only the first folder has."""
-    return [f"{model} {variant}".rstrip() + f" on {scene}" for _, _, scene, model, variant in sorted(of.keys() - other)]
+    return [_name(key) for key in sorted(of.keys() - other)]
+
+
+def _otherwise(ours: RunsByConfiguration, theirs: RunsByConfiguration) -> dict[str, list[str]]:
+    """List the models on scenes that the second folder has with other settings, by the smallest difference in these."""
+    found: dict[str, list[str]] = {}
+    for key in sorted(ours.keys() - theirs.keys()):
+        first = next(iter(ours[key].values()))
+        others = [next(iter(runs.values())) for other, runs in theirs.items() if other[:4] == key[:4]]
+        if others:
+            smallest = min((_differing(other, first) for other in others), key=len)
+            found.setdefault(printable(listed(smallest)) or "another variant", []).append(_name(key))
+    return found
+
+
+def _name(key: tuple[str, str, str, str, str]) -> str:
+    _, _, scene, model, variant = key
+    return f"{model} {variant}".rstrip() + f" on {scene}"
 
 
 def _row(ours: dict[int, Record], theirs: dict[int, Record]) -> ComparedRuns:
     """Collect the values of a model on a scene from both folders, and why some of these values are not comparable."""
     first = next(iter(ours.values()))
+    label = f"{first.model} {first.variant}".rstrip()
     mine, other = ([r for r in runs.values() if r.status == "ok"] for runs in (ours, theirs))
-    why = _incomparable(mine, other)
-    judged = {}
+    row = ComparedRuns(first.experiment, first.dataset, first.scene, label, ours, theirs, _incomparable(mine, other))
+    repeats = bool(row.shared) and row.bit_equal == row.shared
     for quantity in LIMITS:
         known = [[v for r in runs if not math.isnan(v := value(r, quantity))] for runs in (mine, other)]
-        reason = why or (_other_machine(mine, other) if quantity in OF_THE_MACHINE else "")
+        reason = row.reason or (_other_machine(mine, other) if quantity in OF_THE_MACHINE else "")
         if not reason and not all(known):
             reason = f"{'here' if not known[0] else 'there'} it was not measured"
-        judged[quantity] = Judged(known[0], known[1], reason)
-    label = f"{first.model} {first.variant}".rstrip()
-    return ComparedRuns(first.experiment, first.dataset, first.scene, label, ours, theirs, judged)
+        equal = repeats and not reason and quantity in OF_THE_BITS
+        row.judged[quantity] = Judged(known[0], known[1], reason, is_bit_equal=equal)
+    return row
+
+
+def is_bit_equal(one: Record, other: Record) -> bool:
+    """Tell whether two runs have the same PSNR of every view, to the last bit, and as many Gaussians and bytes.
+
+    A record does not hold the Gaussians. A training that differs in one bit ends with another PSNR of every view.
+    """
+    return _bits(one) == _bits(other)
+
+
+def _bits(record: Record) -> tuple[object, ...]:
+    views = [(view.name, view.psnr) for view in record.per_view]
+    return views, *(value(record, quantity) for quantity in OF_THE_BITS)
 
 
 def value(record: Record, quantity: str) -> float:
@@ -207,16 +237,19 @@ def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
     """Estimate the difference between the two folders' means for each model and scene, with an interval.
 
     The variance over seeds is pooled over all given models and scenes. The variance of a single model and scene is used
-    instead if it is larger.
+    instead if it is larger. Bit-equal runs count once, and their difference is zero.
     """
     units = [abs(fmean(row.theirs)) if limit.relative else 1.0 for row in rows]
     samples = [[[v / (unit or 1.0) for v in runs] for runs in (row.ours, row.theirs)]
                for row, unit in zip(rows, units, strict=True)]  # fmt: skip
-    own = [_squares(*of_row) for of_row in samples]
+    own = [_squares(*(of_row[1:] if row.is_bit_equal else of_row)) for row, of_row in zip(rows, samples, strict=True)]
     freedom = sum(free for _, free in own)
     pooled = sum(squares for squares, _ in own) / freedom if freedom else math.nan
     found = []
-    for (ours, theirs), (squares, free), unit in zip(samples, own, units, strict=True):
+    for row, (ours, theirs), (squares, free), unit in zip(rows, samples, own, units, strict=True):
+        if row.is_bit_equal:
+            found.append(EQUAL)
+            continue
         mean, count = (fmean(ours) - fmean(theirs)) * unit, min(len(ours), len(theirs))
         spread = max(pooled, squares / free if free else 0.0) * unit**2 * (1 / len(ours) + 1 / len(theirs))
         levels = (Spread(spread, freedom),) if freedom else ()
@@ -236,8 +269,7 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
         return f"no run finished {'here' if not ours else 'there'}"
     first = theirs[0]
     for r in (*ours, *theirs):
-        configs = ({**one.provenance.config, "seed": None} for one in (first, r))
-        if differing := training_differences(*configs):
+        if differing := _differing(first, r):
             return f"another training: {printable(listed(differing))}"
         if r.provenance.data_hash != first.provenance.data_hash:
             return "other data"
@@ -247,6 +279,12 @@ def _incomparable(ours: list[Record], theirs: list[Record]) -> str:
                     r.protocol.get(name)
                 )
     return ""
+
+
+def _differing(theirs: Record, ours: Record) -> list[str]:
+    """Describe the settings of two trainings that differ, except the seed."""
+    there, here = ({**one.provenance.config, "seed": None} for one in (theirs, ours))
+    return training_differences(there, here)
 
 
 def _other_machine(ours: list[Record], theirs: list[Record]) -> str:
@@ -272,18 +310,14 @@ def _judge(found: Judged, limit: Limit, p: float) -> Judged:
     if found.reason:
         return found
     unit = abs(fmean(found.theirs)) if limit.relative else 1.0
-    if abs(found.difference.mean) <= limit.equal * unit:
+    difference = found.difference
+    if found.is_bit_equal or abs(difference.mean) <= limit.equal * unit:
         return replace(found, verdict=AGREES, p_holm=p)
-    if not found.difference.over:
+    if not difference.over:
         return replace(found, reason="one run of each model on both sides: no spread over seeds is known")
     if p < 1 - LEVEL:
         return replace(found, verdict=DIFFERS, p_holm=p)
-    if found.difference.half > limit.widest * unit:
+    is_single = min(len(found.ours), len(found.theirs)) == 1
+    if (abs(difference.mean) if is_single else difference.half) > limit.widest * unit:
         return replace(found, reason="the interval is too wide: more seeds are needed", p_holm=p)
     return replace(found, verdict=AGREES, p_holm=p)
-
-
-def _places(rows: list[ComparedRuns]) -> str:
-    """Return a text that names the first three models with their scenes, and counts the others."""
-    named = [f"{printable(row.model)} on {printable(row.scene)}" for row in rows[:3]]
-    return ", ".join(named) + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")

@@ -5,6 +5,7 @@ from typing import Any
 
 from gsbench.errors import printable
 from gsbench.measure.record import Record
+from gsbench.report import against_lines
 from gsbench.report.against import LIMITS, RULE, ComparedRuns, Comparison, Judged, value
 from gsbench.report.layout import EMPTY, QuantityColumn, Row, Section, Table
 
@@ -31,6 +32,10 @@ def tables(of: Comparison) -> list[Table]:
         title = ", ".join(map(printable, scene)) if several else printable(scene[2])
         sections.append(Section(title, [line for row in rows for line in lines(row)], _reasons(rows)))
     footnotes = [RULE]
+    for difference, names in of.otherwise.items():
+        footnotes.append(
+            f"trained otherwise than in {of.theirs}, so not compared: {difference} ({len(names)} models on scenes)"
+        )
     for folder, missing in ((of.ours, of.only_ours), (of.theirs, of.only_theirs)):
         more = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
         footnotes += [f"only in {folder}: {printable(', '.join(missing[:10]))}{more}"] if missing else []
@@ -55,6 +60,8 @@ def _shown(record: Record | None, column: QuantityColumn) -> str:
 
 def _difference(found: Judged, column: QuantityColumn) -> str:
     """Format a difference of means, followed by half the width of its interval if this is known."""
+    if found.is_bit_equal:
+        return "bit-equal"
     mean, half = found.difference.mean, found.difference.half
     if math.isnan(mean):
         return EMPTY
@@ -84,11 +91,12 @@ def content(of: Comparison) -> dict[str, Any]:
         "ours": of.ours,
         "theirs": of.theirs,
         "verdict": of.verdict,
-        "line": of.line,
+        "lines": against_lines.compared(of),
         "rule": RULE,
         "rows": [_plain(row) for row in of.rows],
         "only_ours": of.only_ours,
         "only_theirs": of.only_theirs,
+        "otherwise": of.otherwise,
     }
 
 
@@ -102,6 +110,7 @@ def _plain(row: ComparedRuns) -> dict[str, Any]:
         quantity: {
             "verdict": found.verdict,
             "reason": found.reason or None,
+            "bit_equal": found.is_bit_equal,
             "difference": found.difference.mean,
             "low": found.difference.low,
             "high": found.difference.high,

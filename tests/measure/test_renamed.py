@@ -78,7 +78,7 @@ def test_a_new_name_is_no_other_training() -> None:
     other = with_present_keys(OLD)
     other["train"]["lambda_from"] = 7
     assert training_hash(other) != training_hash(OLD)
-    assert training_differences(with_present_keys(OLD), other) == ["train.lambda_from: 15000 there, 7 now"]
+    assert training_differences(with_present_keys(OLD), other) == ["train.lambda_from 7 instead of 15000"]
 
 
 def test_a_published_record_has_the_present_keys() -> None:

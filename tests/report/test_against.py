@@ -2,12 +2,14 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 import pytest
 from make_golden import make
-from many_records import frontier
+from many_records import frontier, on_demand
 
 from gsbench.errors import InputError
 from gsbench.measure import record as files
@@ -15,6 +17,8 @@ from gsbench.measure.machine import Hardware
 from gsbench.measure.record import Record
 from gsbench.report.__main__ import main
 from gsbench.report.against import AGREES, DIFFERS, LIMITS, UNTOLD, Comparison, compare
+from gsbench.report.against_lines import LONGEST, compared, lines, trained
+from gsbench.report.page.messages import duration
 from gsbench.report.publish import publish
 
 
@@ -39,6 +43,9 @@ def told(record: Record, **changes: object) -> Record:
     return dataclasses.replace(record, provenance=dataclasses.replace(record.provenance, **changes))
 
 
+LOST = {"status": "failed", "reason": "out of memory", "metrics": None, "missing": {}, "cost": None}
+
+
 def verdicts(of: Comparison, quantity: str) -> set[str]:
     return {row.judged[quantity].verdict for row in of.rows}
 
@@ -47,9 +54,57 @@ def test_the_same_numbers_agree():
     """Catches a comparison that cannot even tell that nothing differs."""
     of = held(runs(seeds=1), runs())
     assert of.verdict == AGREES
-    assert "PSNR agrees in 10 of 10 models on scenes" in of.line
-    assert "of 10 equal seeds 10 end within 0.01 dB" in of.line
+    assert compared(of) == [
+        "Bit-equal with the run of the same seed in published: 10 of 10 runs",
+        "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB",
+    ]
     assert verdicts(of, "gaussians") == verdicts(of, "mb") == {AGREES}
+
+
+def spread_out(seeds: int) -> list[Record]:
+    """Runs of models whose seeds differ by decibels and by a third of the Gaussians."""
+    apart = {0: 2.0, 1: -2.0, 2: 1.0}
+    return [moved(costing(r, num_gaussians=6000 + 2000 * r.seed), apart[r.seed]) for r in runs(seeds=seeds)]
+
+
+def test_bits_agree_whatever_the_spread_of_seeds():
+    """Catches equal bits that "cannot be told" because seeds differ by decibels, statistics of runs that are equal, and
+    equal bits of a few runs that speak for another."""
+    of = held(spread_out(1), spread_out(3))
+    assert [verdicts(of, quantity) for quantity in ("psnr", "gaussians", "mb")] == [{AGREES}] * 3
+    assert {row.judged["psnr"].difference.mean for row in of.rows} == {0.0}
+    assert all(row.bit_equal == row.shared == [0] for row in of.rows)
+    more = held(spread_out(3), spread_out(2))  # seed 2 is in one folder only
+    assert more.verdict == AGREES
+    assert compared(more)[0].endswith("20 of 20 runs")
+    ours = [moved(r, 0.001) if r.seed == 1 else r for r in spread_out(2)]
+    other = held(ours, spread_out(3))
+    assert compared(other)[0].endswith("10 of 20 runs")
+    assert other.verdict == UNTOLD
+
+
+@pytest.mark.parametrize("changes", [{"num_gaussians": 1}, {"bytes": 1}])
+def test_runs_of_equal_psnr_and_other_gaussians_are_not_bit_equal(changes):
+    """Catches bits that are told from PSNR alone, and views whose PSNR differs in the last digit."""
+    ours = [costing(r, **changes) for r in runs(seeds=1)]
+    assert not any(row.bit_equal for row in held(ours, runs()).rows)
+    views = [dataclasses.replace(r.per_view[0], psnr=math.nextafter(r.per_view[0].psnr, 99)) for r in runs(seeds=1)]
+    ours = [dataclasses.replace(r, per_view=[v, *r.per_view[1:]]) for r, v in zip(runs(seeds=1), views, strict=True)]
+    assert not any(row.bit_equal for row in held(ours, runs()).rows)
+
+
+def test_a_single_run_agrees_where_another_seed_would_lie():
+    """Catches one seed that can never agree with three as these are too far apart, and one that always does."""
+    noisy = {0: 0.6, 1: -0.7, 2: 0.1}
+    theirs = [moved(r, noisy[r.seed]) for r in runs()]
+    near, far, beyond = (held([moved(r, psnr) for r in runs(seeds=1)], theirs) for psnr in (0.7, 1.4, -5.0))
+    assert all(row.judged["psnr"].difference.half > LIMITS["psnr"].widest for row in near.rows)
+    assert near.verdict == AGREES
+    assert UNTOLD in verdicts(far, "psnr")
+    assert "more seeds are needed" in compared(far)[-1]
+    assert beyond.verdict == DIFFERS
+    pairs = [moved(r, 0.7 + noisy[r.seed]) for r in runs(seeds=2)]
+    assert held(pairs, theirs).verdict == UNTOLD  # two runs have a mean, whose interval is too wide
 
 
 def test_other_seeds_agree():
@@ -65,7 +120,9 @@ def test_one_model_that_differs_is_found(psnr):
     of = held(ours, runs())
     assert of.verdict == DIFFERS
     assert [(row.model, row.scene) for row in of.of("psnr", DIFFERS)] == [("7dgs", "suzanne")]
-    assert "PSNR differs: 7dgs on suzanne" in of.line
+    assert compared(of)[0].endswith("9 of 10 runs")
+    assert compared(of)[1].startswith("PSNR differs in 1 of 10 models on scenes, agrees in 9; largest difference ")
+    assert compared(of)[1].endswith(" dB, 7dgs on suzanne")
 
 
 @pytest.mark.parametrize("quantity", ["gaussians", "mb", "seconds", "ms"])
@@ -92,7 +149,7 @@ def test_one_run_on_each_side_cannot_be_told():
     ours = [moved(r, 0.3) for r in runs(seeds=1)]
     of = held(ours, runs(seeds=1))
     assert of.verdict == UNTOLD
-    assert "no spread over seeds is known" in of.line
+    assert "no spread over seeds is known (in 10)" in compared(of)[-1]
     assert held(runs(seeds=1), runs(seeds=1)).verdict == AGREES
 
 
@@ -110,7 +167,7 @@ def test_a_noisy_model_is_held_against_its_own_spread():
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"config": {"train": {"iterations": 500}}}, "another training: train.iterations: 1000 there, 500 now"),
+        ({"config": {"train": {"iterations": 500}}}, "another training: train.iterations 500 instead of 1000"),
         ({"data_hash": "77"}, "other data"),
     ],
 )
@@ -119,13 +176,22 @@ def test_other_trainings_and_data_are_not_compared(changes, why):
     of = held([told(r, **changes) for r in runs()], runs())
     assert of.verdict == UNTOLD
     assert all(verdicts(of, quantity) == {UNTOLD} for quantity in LIMITS)
-    assert why in of.line
+    assert compared(of)[-1] == f"Cannot be told: {why} (in 10)"
+
+
+def test_another_length_is_said_to_be_one():
+    """Catches a shorter training that is "not in both", and one that is not told beside runs that are compared."""
+    short = frontier(seeds=1, lengths=(250, 500))
+    why = "Cannot be compared: train.iterations 250 instead of 1000 (in 10, others in 10)"
+    assert compared(held(short, runs())) == [why]
+    assert compared(held([*short, *runs(seeds=1)], runs()))[2:] == [why]
+    assert held(runs(models=("3dgs",)), runs(models=("7dgs",))).otherwise == {}
 
 
 def test_measured_otherwise_is_not_compared():
     """Catches PSNR of renders through 8 bits beside that of floats."""
     ours = [dataclasses.replace(r, protocol=r.protocol | {"quantise": True}) for r in runs()]
-    assert "measured otherwise: quantise False there, True" in held(ours, runs()).line
+    assert "measured otherwise: quantise False there, True" in compared(held(ours, runs()))[-1]
 
 
 def test_seconds_are_compared_on_one_machine_alone():
@@ -134,12 +200,13 @@ def test_seconds_are_compared_on_one_machine_alone():
     of = held([told(r, hardware=here) for r in runs()], runs())
     assert of.verdict == AGREES
     assert verdicts(of, "seconds") == verdicts(of, "ms") == {UNTOLD}
-    assert "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads here" in of.line
+    named = "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads here"
+    assert named in of.rows[0].judged["seconds"].reason
     busy = held([costing(r, load=r.cost.load + 1) for r in runs()], runs())
-    assert "the machine had other work: load 4.0 here, 3.0 there" in busy.line
+    assert "the machine had other work: load 4.0 here, 3.0 there" in busy.rows[0].judged["seconds"].reason
     slow = held([costing(r, train_s=2 * r.cost.train_s) for r in runs()], runs())
     assert verdicts(slow, "seconds") == {DIFFERS}
-    assert "seconds differ: " in slow.line
+    assert compared(slow)[-1] == "Seconds differ in 10"
     assert slow.verdict == AGREES  # in PSNR
 
 
@@ -150,16 +217,66 @@ def test_what_is_not_in_both_is_named():
     assert of.only_ours == ["6dgs on moving-matte", "6dgs on suzanne"]
     none = held(runs(models=("3dgs",)), runs(models=("7dgs",)))
     assert none.verdict == UNTOLD
-    assert none.line == "mine against published: cannot be told. No model and scene is in both."
+    assert compared(none) == ["Cannot be compared: no model and scene is also in published"]
 
 
 def test_a_run_that_did_not_finish_is_said():
     """Catches a crash, and a failure here that is not said."""
-    lost = {"status": "failed", "reason": "out of memory", "metrics": None, "missing": {}, "cost": None}
-    ours = [dataclasses.replace(r, **lost) if r.model == "7dgs" else r for r in runs()]
+    ours = [dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs()]
     of = held(ours, runs())
     assert of.verdict == UNTOLD
-    assert "PSNR cannot be told: 7dgs on moving-matte, 7dgs on suzanne (no run finished here)" in of.line
+    assert compared(of)[0].endswith("24 of 24 runs")
+    assert compared(of)[1] == "PSNR agrees in 8 of 10 models on scenes; largest difference 0.00 dB"
+    assert compared(of)[2] == "Cannot be told: no run finished here (in 2)"
+
+
+@pytest.mark.parametrize(
+    ("records", "said"),
+    [
+        (runs(), "30 runs: 5 models on 2 scenes, seeds 0, 1, 2, 1,000 iterations, "),
+        (runs()[1:], "29 runs of 30 combinations: 5 models on 2 scenes, seeds 0, 1, 2, 1,000 iterations, "),
+        (runs(seeds=4, models=("7dgs",), scenes=("suzanne",)), "4 runs: 1 model on 1 scene, 4 seeds, 1,000 iterations"),
+        (frontier(("3dgs",), seeds=1, lengths=(250, 1000)), "4 runs: 1 model on 2 scenes, seed 0, 250 to 1,000 iter"),
+        ([dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs(seeds=1)],
+         "10 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, 2 failed, "),
+        ([told(r, config={}) for r in runs(seeds=1)], "10 runs: 5 models on 2 scenes, seed 0, "),
+        ([*runs(seeds=1), *(dataclasses.replace(r, experiment="b") for r in runs(seeds=1, models=("3dgs",)))],
+         "12 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, "),
+    ],
+)  # fmt: skip
+def test_what_was_trained(records, said):
+    """Catches a number that is not that of the runs, and seconds of runs that did not finish."""
+    seconds = sum(r.cost.train_s for r in records if r.cost)
+    assert trained(records).startswith(said)
+    assert trained(records).endswith(f", {duration(seconds)} of training in all")
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_last_lines_are_six_and_short(seed):
+    """Catches a seventh line, a long one, and numbers that do not add up, of any two folders."""
+    random = np.random.default_rng(seed)
+    pool = [
+        dataclasses.replace(r, **({"model": "a" * 90 + r.model} if seed % 3 == 0 else {}))
+        for r in (*frontier(seeds=3, lengths=(250, 1000)), *on_demand(runs(seeds=2)))
+    ]
+
+    def folder() -> list[Record]:
+        kept = [pool[i] for i in random.permutation(len(pool))[: random.integers(1, len(pool))]]
+        changed = [lambda r: moved(r, random.normal()), lambda r: dataclasses.replace(r, **LOST), lambda r: r,
+                   lambda r: costing(r, num_gaussians=9), lambda r: told(r, data_hash="7"), lambda r: r]  # fmt: skip
+        return [changed[random.integers(len(changed))](r) for r in kept]
+
+    ours, theirs = folder(), folder()
+    of = held(ours, theirs)
+    found = lines(of, ours, Path("results/mini/report.html"))
+    assert 3 <= len(found) <= 6
+    assert all(len(line) <= LONGEST and "\n" not in line for line in found)
+    assert found[0].startswith(f"{len(ours)} run")
+    shared = {r.path for r in ours} & {r.path for r in theirs}
+    assert sum(len(row.shared) for row in of.rows) <= len(shared)
+    told_of = [len(of.of("psnr", verdict)) for verdict in (AGREES, DIFFERS, UNTOLD)]
+    assert sum(told_of) == len(of.rows)
+    assert sum(map(len, of.otherwise.values())) <= len(of.only_ours)
 
 
 def write(records: list[Record], folder: Path) -> Path:
@@ -174,20 +291,27 @@ def test_the_command(tmp_path, capsys):
     before = {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()}
     assert main([str(ours), "--against", str(theirs), "--json", str(tmp_path / "a.json")]) == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[-1].startswith(f"{ours} against {theirs}: agrees. PSNR agrees in 10 of 10")
+    seconds = sum(r.cost.train_s for r in runs(seeds=1))
+    last = out.splitlines()[-4:]
+    assert last[0] == f"10 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, {duration(seconds)} of training in all"
+    assert last[1].endswith(": 10 of 10 runs")
+    assert last[2] == "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB"
+    assert last[3] == f"Report: {ours / 'report.html'}"
     assert "7dgs seed 2" in out
     told = json.loads((tmp_path / "a.json").read_text())
-    assert told["verdict"] == AGREES
+    assert (told["verdict"], told["lines"][1]) == (AGREES, last[2])
     row = next(r for r in told["rows"] if (r["model"], r["scene"]) == ("7dgs", "suzanne"))
     assert row["runs"][2]["ours"] is None
     assert row["runs"][0]["ours"] == row["runs"][0]["theirs"]
-    assert row["judged"]["psnr"]["low"] < row["judged"]["psnr"]["difference"] < row["judged"]["psnr"]["high"]
+    assert (row["judged"]["psnr"]["bit_equal"], row["judged"]["psnr"]["difference"]) == (True, 0.0)
     page = (ours / "report.html").read_text()
     assert f"Against {theirs}" in page
     assert "PSNR agrees in 10, differs in 0, cannot be told in 0 of 10 rows here." in page
     assert {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()} == before
     write([moved(r, 2.0) for r in runs(seeds=1)], ours)
-    assert main([str(ours), "--against", str(theirs)]) == 1
+    assert main([str(ours), "--against", str(theirs), "--json", str(tmp_path / "a.json")]) == 1
+    told = json.loads((tmp_path / "a.json").read_text())
+    assert all(r["judged"]["psnr"]["low"] < r["judged"]["psnr"]["difference"] for r in told["rows"])
     assert main([str(ours), "--against", str(tmp_path / "nowhere")]) == 2
     assert "expected a folder of results" in capsys.readouterr().err
 

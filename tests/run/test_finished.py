@@ -112,14 +112,14 @@ def test_a_release_trains_nothing_again(again, monkeypatch: pytest.MonkeyPatch) 
 def test_what_is_measured_otherwise_is_named(again) -> None:
     """Catches a user who is told that something differs and not what."""
     record, said = again("protocol.quantise=true")
-    assert "what is measured is another (protocol.quantise: False there, True now): measured again" in said
+    assert "what is measured is another (protocol.quantise True instead of False): measured again" in said
     assert record.protocol["quantise"] is True
 
 
 def test_a_checkpoint_that_is_gone_is_said(again) -> None:
     """Catches a training of hours that is announced as a measurement."""
     said = again("protocol.quantise=true", change=no_checkpoint, trains=True)[1]
-    assert "(protocol.quantise: False there, True now): its checkpoint is gone: running again" in said
+    assert "(protocol.quantise True instead of False): its checkpoint is gone: running again" in said
 
 
 def test_another_training_is_named(again) -> None:
@@ -133,7 +133,7 @@ def test_another_training_is_named(again) -> None:
         no_checkpoint(folder)
 
     said = again(change=older, trains=True)[1]
-    assert "the training is another (train.iterations: 1000 there, 4 now): running again" in said
+    assert "the training is another (train.iterations 4 instead of 1000): running again" in said
 
 
 def test_changed_data_are_named(again) -> None:

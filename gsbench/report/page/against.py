@@ -1,12 +1,11 @@
 """Write the section of the HTML report that compares the report's runs with runs of another folder."""
 
+from gsbench.report import against_lines
 from gsbench.report.against import AGREES, DIFFERS, RULE, UNTOLD, Comparison
 from gsbench.report.against_table import COLUMNS, lines
 from gsbench.report.configurations import Group
 from gsbench.report.page import messages
 from gsbench.report.page.content import Column, DataTable, PageSection, Value
-
-LONGEST = 400  # characters of the summary
 
 
 def against_section(comparison: Comparison, group: Group) -> PageSection:
@@ -19,7 +18,7 @@ def against_section(comparison: Comparison, group: Group) -> PageSection:
     rows: list[list[Value]] = [
         [row.scene, line.label, *(line.cells[c.key] for c in COLUMNS)] for row in own for line in lines(row)
     ]
-    said = [messages.shorten(comparison.line, LONGEST)]
+    said = [f"{'. '.join(against_lines.compared(comparison))}."]
     ours, theirs = (messages.shorten(name, 80) for name in (comparison.ours, comparison.theirs))
     if own:
         counts = [f"{v} in {sum(r.judged['psnr'].verdict == v for r in own)}" for v in (AGREES, DIFFERS, UNTOLD)]
