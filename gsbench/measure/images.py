@@ -88,16 +88,24 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
     Raises:
         InputError: OpenCV cannot encode the image.
     """
+    write_atomically(path, png(image))
+
+
+def png(image: Pixels) -> bytes:  # [H, W, 3] RGB
+    """Return an image as the bytes of a PNG file.
+
+    Raises:
+        InputError: OpenCV cannot encode the image.
+    """
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
-        raise InputError(f"{path}: expected an image that PNG can hold, got {image.shape} of {image.dtype}")
-    write_atomically(path, data.tobytes())
+        raise InputError(f"expected an image that PNG can hold, got {image.shape} of {image.dtype}")
+    return data.tobytes()
 
 
 def data_url(image: Pixels) -> str:  # [H, W, 3] RGB
     """Return an image as PNG in a `data:` URL, which HTML can hold."""
-    data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
 
 
 def _beside(images: list[Pixels], factor: int) -> Pixels:

@@ -67,7 +67,7 @@ def serve(options: argparse.Namespace) -> None:
 
     viewer = Viewer(runs, options.host, options.port, options.data_root)
     for renderer in viewer.renderers:
-        print(f"{renderer.run.folder}: {len(renderer.run.model)} Gaussians")
+        print(f"{renderer.name}: {', '.join(renderer.measured)} ({renderer.run.folder})")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
     host = f"[{options.host}]" if ":" in options.host else options.host

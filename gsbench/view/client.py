@@ -3,6 +3,7 @@
 import html
 import math
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -11,10 +12,12 @@ import torch
 import viser
 
 from gsbench.errors import InputError
+from gsbench.measure.images import png
 from gsbench.models.factors import rotation
 from gsbench.scenes import Camera, Scene
-from gsbench.view.controls import SIDE, Controls
-from gsbench.view.frame import FLOAT32, Frame, FrameRenderer, beside, wiped
+from gsbench.view.controls import SIDE, WIPE, Controls, ShownImage
+from gsbench.view.frame import FLOAT32, IMAGE, Frame, FrameRenderer, beside, wiped
+from gsbench.view.labels import Label, labelled
 from gsbench.view.nearest import TrainingViews, compare
 from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.resolution import ROUNDING_MS, Resolution
@@ -25,6 +28,7 @@ REST_S = 0.2  # seconds without a change after which a frame is rendered with al
 FRAME_S = 1 / 30  # seconds between two frames while the scene is played
 ROUNDING_FRAMES = 20  # the bound on the error of float32 takes about as long as so many frames (docs/stability.md)
 COMPUTED = "the bound is being computed; this is the image"
+SAVE_S = 2.0  # seconds between two files that are sent
 QUALITY = {True: 75, False: 95}  # JPEG quality while something moves (True) and at rest (False)
 
 
@@ -32,7 +36,12 @@ class Client:
     """One browser of the viewer. Each browser has its own controls; all browsers share the models."""
 
     def __init__(
-        self, client: viser.ClientHandle, renderers: Sequence[FrameRenderer], scene: Scene | str, most_cost: float
+        self,
+        client: viser.ClientHandle,
+        renderers: Sequence[FrameRenderer],
+        scene: Scene | str,
+        most_cost: float,
+        start: viser.InitialCameraConfig,
     ) -> None:
         """Show the controls in the browser and start the thread that renders.
 
@@ -41,9 +50,13 @@ class Client:
             renderers: the renderers of the models that can be shown, at least one, all of one scene.
             scene: the scene with its training views, or a text that says why there are none.
             most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
+            start: the camera to which the browser may return.
         """
         self.client = client
-        self.controls = Controls(client, renderers, scene)
+        self.controls = Controls(client, renderers, scene, start)
+        self.controls.save.on_click(self._save)
+        self._scene = renderers[0].run.scene
+        self._saving = threading.Lock()
         self._bounder = ThreadPoolExecutor(1)  # computes the bound on the error of float32
         self._bounding: Future[tuple[Frame | None, dict[str, Rounding | str]]] | None = None  # if something rests
         self.changed = self.controls.changed
@@ -104,8 +117,8 @@ class Client:
 
     def _show(self, moving: bool) -> None:
         """Render a frame, and send it to the browser with its time and the legend of its colours."""
-        camera, controls = self.client.camera, self.controls
-        width, height = self.resolution.size(max(1, camera.image_width), max(1, camera.image_height), moving)
+        controls = self.controls
+        width, height = self._size(self.resolution, moving)
         frame = self._combined(width, height, self._rendered)
         self.resolution.took(width * height, frame.ms(SLICE), frame.ms(RASTER))
         self._rounding_resolution.took(width * height, 0.0, ROUNDING_FRAMES * frame.ms(RASTER))
@@ -119,11 +132,9 @@ class Client:
         Another thread computes it, so that the browser is served if the user goes on.
         """
         if any(colours == FLOAT32 for _, colours in self.controls.shown()):
-            camera = self.client.camera
-            size = self._rounding_resolution.size(max(1, camera.image_width), max(1, camera.image_height), True)
-            self._bounding = self._bounder.submit(self._bounded, *size)
+            self._bounding = self._bounder.submit(self._bounded)
 
-    def _bounded(self, width: int, height: int) -> tuple[Frame | None, dict[str, Rounding | str]]:
+    def _bounded(self) -> tuple[Frame | None, dict[str, Rounding | str]]:
         """Render a frame with the bound on the error of float32, None if no shown model has one; and what to say."""
         said: dict[str, Rounding | str] = {}
 
@@ -136,7 +147,7 @@ class Client:
                     said[renderer.name] = f"no bound: {error}"
             return self._rendered(renderer, colours, camera)
 
-        frame = self._combined(width, height, render)
+        frame = self._combined(*self._size(self._rounding_resolution, True), render)
         return frame if any(isinstance(one, Rounding) for one in said.values()) else None, said
 
     def _end_rounding(self) -> None:
@@ -158,13 +169,14 @@ class Client:
         return renderer.render(camera, self.controls.request(colours))
 
     def _combined(self, width: int, height: int, render: Callable[[FrameRenderer, str, Camera], Frame]) -> Frame:
-        """Render the image of one model, or an image that combines two models, as the controls say."""
+        """Render the labelled image of one model, or one that combines two models, as the controls say."""
         shown, mode = self.controls.shown(), self.controls.layout
         camera = self._camera(max(1, width // 2) if mode == SIDE else width, height)
-        first, *others = [render(renderer, colours, camera) for renderer, colours in shown]
-        if not others:
-            return first
-        return beside(first, others[0]) if mode == SIDE else wiped(first, others[0], self.controls.wiped)
+        frame, *others = [render(renderer, colours, camera) for renderer, colours in shown]
+        edge = round(self.controls.wiped * width) if mode == WIPE else camera.width
+        if others:
+            frame = beside(frame, others[0]) if mode == SIDE else wiped(frame, others[0], edge)
+        return frame._replace(image=labelled(frame.image, edge, *map(_label, shown)))
 
     def _compare(self) -> None:
         """Show the training view nearest to the camera, and the models' renders of it, if the browser requests this."""
@@ -176,10 +188,48 @@ class Client:
         compared = [compare(renderer, nearest.view, request) for renderer in renderers]
         self.controls.comparison.content = comparison(nearest, compared)
 
+    def _size(self, resolution: Resolution, limited: bool) -> tuple[int, int]:
+        """Return the width and height in pixels at which to render a frame for the browser's window."""
+        camera = self.client.camera
+        return resolution.size(max(1, camera.image_width), max(1, camera.image_height), limited)
+
+    def _save(self, _: object) -> None:
+        """Send what the browser shows, with all pixels, as a PNG file that it stores; one file at a time.
+
+        A click is passed over for SAVE_S seconds after a file, so that files do not wait for a slow browser.
+        """
+        if not self._saving.acquire(blocking=False):
+            return
+        try:
+            frame = None
+            if any(colours == FLOAT32 for _, colours in self.controls.shown()):
+                frame, _ = self._bounded()
+            frame = frame or self._combined(*self._size(self.resolution, False), self._rendered)
+            names = dict.fromkeys(renderer.name for renderer, _ in self.controls.shown())
+            name = " ".join([self._scene.name, *names])
+            self.client.send_file_download(f"{name}.png", png(frame.image), save_immediately=True)
+            time.sleep(SAVE_S)
+        except InputError as error:
+            self.controls.costs.content = html.escape(str(error))
+        finally:
+            self._saving.release()
+
     def _camera(self, width: int, height: int) -> Camera:
-        """Return the browser's camera for an image of the given size; the browser's field of view is vertical."""
-        seen = self.client.camera
-        return camera_at(np.asarray(seen.position), np.asarray(seen.wxyz), seen.fov, width, height)
+        """Return the browser's camera for an image of the given size; the browser's field of view is vertical.
+
+        Side by side, each of two narrow images shows all that an image of the training's proportions does.
+        """
+        seen, fov = self.client.camera, self.client.camera.fov
+        if self.controls.layout == SIDE:
+            proportions = self._scene.width / self._scene.height
+            fov = 2 * math.atan(max(1.0, proportions * height / width) * math.tan(fov / 2))
+        return camera_at(np.asarray(seen.position), np.asarray(seen.wxyz), fov, width, height)
+
+
+def _label(shown: ShownImage) -> Label:
+    """Return the label of an image: its model, and its colours if they mean something else, and what was measured."""
+    renderer, colours = shown
+    return renderer.name + ("" if colours == IMAGE else f", {colours}"), *renderer.measured
 
 
 def camera_at(position: np.ndarray, wxyz: np.ndarray, fov: float, width: int, height: int) -> Camera:

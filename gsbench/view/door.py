@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 import websockets.asyncio.server as websockets_server
@@ -32,6 +32,17 @@ MOST_PORTS = 1000  # ports that are tried
 FURTHEST = 1e9  # world units from the origin
 MOST_PIXELS = 16384  # of a side of a browser's window
 FIELDS_OF_VIEW = 0.01, 3.1  # radians
+
+# viser's page draws fewer pixels for good after it was slow for some seconds, unless its address has their number.
+ENTRANCE = """\
+<!doctype html><meta charset="utf-8"><title>gsbench</title>
+<noscript>The viewer of gsbench needs JavaScript.</noscript>
+<script>
+const address = new URL(location);
+address.searchParams.set("fixedDpr", Math.min(devicePixelRatio, 2));
+location.replace(address);
+</script>
+"""
 
 Three = tuple[float, float, float]
 Answer = Response | None | Awaitable[Response | None]
@@ -64,7 +75,7 @@ class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
 class Values(msgspec.Struct, forbid_unknown_fields=True):
     """The property of a control that a browser may change: its value."""
 
-    value: bool | int | float | str
+    value: bool | int | float | str | tuple[int, int, int]  # three: a colour
 
 
 class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
@@ -74,8 +85,9 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     updates: Values
 
     def is_usable(self) -> bool:
-        """Tell whether the value is text or a finite number."""
-        return isinstance(self.updates.value, str) or math.isfinite(self.updates.value)
+        """Tell whether the value is text, a colour or a finite number."""
+        value = self.updates.value
+        return isinstance(value, str) or all(map(math.isfinite, value if isinstance(value, tuple) else (value,)))
 
 
 class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
@@ -158,7 +170,7 @@ class Door:
             options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent()}
 
             def check(connection: ServerConnection, request: Request) -> Answer:
-                return self._refusal(connection, request) or process_request(connection, request)
+                return self._refusal(connection, request) or _entrance(request) or process_request(connection, request)
 
             return original(*arguments, process_request=check, **options)
 
@@ -226,9 +238,18 @@ async def _free(host: str, port: int) -> tuple[list[str], int]:
     raise InputError(f"--port: expected a free one among the {MOST_PORTS} from {port} on, got none")
 
 
-def _answer(status: HTTPStatus, text: str) -> Response:
-    """Return an HTTP response with one line of text."""
-    return Response(status, status.phrase, Headers({"Content-Type": "text/plain"}), f"{text}\n".encode())
+def _entrance(request: Request) -> Response | None:
+    """Return the page that leads to viser's page with as many pixels as the screen has; None for all other requests."""
+    parts = urlsplit(request.path)
+    if parts.path != "/" or "fixedDpr" in parse_qs(parts.query) or request.headers.get_all("Upgrade"):
+        return None
+    return _answer(HTTPStatus.OK, ENTRANCE, "text/html")
+
+
+def _answer(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
+    """Return an HTTP response with some text."""
+    headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Cache-Control": "no-store"})
+    return Response(status, status.phrase, headers, f"{text}\n".encode())
 
 
 def _silent() -> logging.Logger:

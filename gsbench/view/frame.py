@@ -16,6 +16,7 @@ from gsbench.models.twins import doubled, exact_model
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
+from gsbench.view.labels import measured
 from gsbench.view.rounding import Rounding, check_exactness, rounding
 from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
 
@@ -27,13 +28,14 @@ EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
-    """The settings of a requested frame: time, viewpoint of the Gaussians, AGR (a network) on or off, SH, colours."""
+    """The settings of a requested frame: time, viewpoint of the Gaussians, AGR (a network) or not, SH, colours."""
 
     time: float | None  # in [0, 1]; None if the scene is static
     center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
     agr: bool = True  # whether AGR (neural refinement) is on, if the model has it
     sh_degree: int = EVERY_DEGREE  # highest SH degree of the colours
     colours: str = IMAGE  # one of PLAIN
+    background: torch.Tensor | None = None  # [3] RGB in [0, 1], of the colours IMAGE; None: that of the training
 
 
 class FrameCost(NamedTuple):
@@ -65,16 +67,18 @@ class FrameRenderer:
     render two frames at once.
     """
 
-    def __init__(self, run: LoadedRun, most_cost: float) -> None:
+    def __init__(self, run: LoadedRun, name: str, most_cost: float) -> None:
         """Prepare to render the model of a run; nothing is rendered yet.
 
         Args:
             run: the run with the model to render.
+            name: the name of the run, which no other one has.
             most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
                 The value is the same for all models that are compared.
         """
         self.run = run
-        self.name = f"{run.folder.parent.name} {run.folder.name}"  # such as "7dgs seed0"
+        self.name = name
+        self.measured = measured(run)
         self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
         self.counts = run.model.count_by_effects()  # number of Gaussians by the set of their effects
@@ -114,7 +118,7 @@ class FrameRenderer:
                 run.model.active = self._exact.active = self._active(request)
                 single = run.model.slice(Query.at(camera.center if center is None else center, request.time))
             query = Query.at(doubled(camera).center if center is None else center.double(), request.time)
-            return rounding(self._exact, single, query, camera, self._backgrounds[IMAGE], run.config.raster.antialias)
+            return rounding(self._exact, single, query, camera, self._background(request), run.config.raster.antialias)
 
     def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
         """Render the image of a camera, and return it with the milliseconds of each stage."""
@@ -128,10 +132,15 @@ class FrameRenderer:
             watch.end(SLICE)
             if request.colours in self._colors:
                 gaussians = gaussians._replace(colors=self._colors[request.colours])
-            background = self._backgrounds[request.colours]
+            background = self._background(request)
             image = rasterize_slice(gaussians, camera, background, run.model.backend, run.config.raster.antialias).image
             watch.end(RASTER)
             return image[0], watch.ms
+
+    def _background(self, request: FrameRequest) -> torch.Tensor:
+        """Return the background colour of a requested frame, [3]; a legend explains the colours on that of its own."""
+        usual = self._backgrounds[request.colours]
+        return usual if request.background is None or request.colours != IMAGE else request.background.to(usual)
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
         """Return the active parts of the model, such as AGR (a network), without those that the user switches off."""
@@ -147,9 +156,9 @@ def beside(left: Frame, right: Frame) -> Frame:
     return Frame(image, left.costs + right.costs)
 
 
-def wiped(left: Frame, right: Frame, part: float) -> Frame:
-    """Combine two frames of the same size: `left` up to the fraction `part` of the width, and `right` beyond it."""
-    image, edge = right.image.copy(), round(part * right.image.shape[1])
+def wiped(left: Frame, right: Frame, edge: int) -> Frame:
+    """Combine two frames of the same size: `left` up to the column `edge`, and `right` beyond it."""
+    image = right.image.copy()
     image[:, :edge] = left.image[:, :edge]
     if 0 < edge < image.shape[1]:
         image[:, edge] = DIVIDER

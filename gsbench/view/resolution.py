@@ -5,7 +5,7 @@ import math
 MOVING_MS = 40.0  # time limit of a frame while the camera moves
 ROUNDING_MS = 3000.0  # about what the bound on the error of float32 may take when the camera rests
 LEAST_PIXELS = 96 * 96
-MOST_PIXELS = 1280 * 960  # of a frame at rest; a larger window shows it enlarged
+MOST_PIXELS = 3840 * 2160  # of a frame at rest; a larger window shows it enlarged
 
 
 class Resolution:

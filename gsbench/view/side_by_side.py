@@ -14,6 +14,7 @@ from gsbench.run.checks import evaluated_views
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import View
 from gsbench.view.frame import FrameRenderer, FrameRequest
+from gsbench.view.labels import short_names
 from gsbench.view.nearest import ViewComparison, compare
 
 _PAGE = """<!doctype html>
@@ -54,10 +55,9 @@ def write_page(runs: list[LoadedRun], path: Path, data_root: str | None = None) 
 
 def page(runs: list[LoadedRun], views: Iterable[View]) -> str:
     """Return the HTML that compares two models on the given views."""
-    renderers = [FrameRenderer(run, most_cost(run.model)) for run in runs]
-    if renderers[0].name == renderers[1].name:
-        for renderer in renderers:
-            renderer.name = str(renderer.run.folder)
+    renderers = [
+        FrameRenderer(run, name, most_cost(run.model)) for run, name in zip(runs, short_names(runs), strict=True)
+    ]
     compared = [(view, [compare(one, view, FrameRequest(view.time)) for one in renderers]) for view in views]
     names = [html.escape(renderer.name) for renderer in renderers]
     means = [sum(pair[i].psnr for _, pair in compared) / len(compared) for i in (0, 1)]

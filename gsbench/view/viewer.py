@@ -17,6 +17,7 @@ from gsbench.view import paths
 from gsbench.view.client import Client
 from gsbench.view.door import Door
 from gsbench.view.frame import FrameRenderer
+from gsbench.view.labels import short_names
 
 
 class Viewer:
@@ -40,10 +41,9 @@ class Viewer:
                 raise InputError(f"expected runs of one scene to look at together, got {first.scene.name} in "
                                  f"{first.folder} and other data in {run.folder}")  # fmt: skip
         self._most_cost = max(most_cost(run.model) for run in runs)
-        self.renderers = [FrameRenderer(run, self._most_cost) for run in runs]
-        names = [renderer.name for renderer in self.renderers]
-        for renderer in (renderer for renderer in self.renderers if names.count(renderer.name) > 1):
-            renderer.name = str(renderer.run.folder)
+        self.renderers = [
+            FrameRenderer(run, name, self._most_cost) for run, name in zip(runs, short_names(runs), strict=True)
+        ]
         self.scene = scene_or_reason(first, data_root)
         self.clients: dict[int, Client] = {}
         self._porter = ThreadPoolExecutor(1)  # connects and disconnects browsers in turn; viser would use 32 threads
@@ -85,7 +85,8 @@ class Viewer:
         return waits
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        self.clients[client.client_id] = Client(client, self.renderers, self.scene, self._most_cost)
+        start = self.server.initial_camera
+        self.clients[client.client_id] = Client(client, self.renderers, self.scene, self._most_cost, start)
 
     def _forget(self, client: viser.ClientHandle) -> None:
         gone = self.clients.pop(client.client_id, None)

@@ -38,7 +38,7 @@ def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> 
     model.effect_sets = effect_sets
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
     return FrameRenderer(
-        LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), most_cost(model)
+        LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), "7dgs", most_cost(model)
     )
 
 
@@ -169,11 +169,11 @@ def test_two_models_share_an_image() -> None:
     assert (both.image[:, 8:] == 20).all()
     assert (both.ms(SLICE), both.ms(RASTER)) == (2, 4)
     assert [cost.name for cost in both.costs] == ["10", "20"]
-    part = wiped(left, right, 0.25).image
+    part = wiped(left, right, 2).image
     assert (part[:, :2] == 10).all()
     assert (part[:, 3:] == 20).all()
-    assert (wiped(left, right, 0.0).image == 20).all()
-    assert (wiped(left, right, 1.0).image == 10).all()
+    assert (wiped(left, right, 0).image == 20).all()
+    assert (wiped(left, right, 8).image == 10).all()
 
 
 def test_resolution_falls_while_the_camera_moves() -> None:

@@ -69,7 +69,7 @@ def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
     """Catches another PSNR than the run's own measure, swapped images, and a protocol's rounding that is left out."""
     run = load_run(folder)
     view = scene_of(run).train[1]
-    renderer = FrameRenderer(run, most_cost(run.model))
+    renderer = FrameRenderer(run, "7dgs", most_cost(run.model))
     image = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
     compared = compare(renderer, view, FrameRequest(view.time))
     assert compared.psnr == psnr(image, view.image)
@@ -88,6 +88,6 @@ def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> 
     wide = Camera(small.camera.viewmat, cameras.intrinsics(960, 32), 960, 32)
     truth = torch.rand(32, 960, 3, generator=torch.Generator().manual_seed(0))
     view = replace(small, camera=wide, pixels=truth)
-    compared = compare(FrameRenderer(run, most_cost(run.model)), view, FrameRequest(view.time))
+    compared = compare(FrameRenderer(run, "7dgs", most_cost(run.model)), view, FrameRequest(view.time))
     assert {image.shape for image in compared[1:4]} == {(16, MOST_WIDTH, 3)}
     assert compared.psnr == psnr(render(run.model, wide, view.time, torch.tensor(run.scene.background)), truth)

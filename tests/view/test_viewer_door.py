@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import gzip
 import http.client
 import socket
 import threading
@@ -126,13 +127,34 @@ def test_a_foreign_page_gets_no_frame(viewer: Viewer) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect("ws://evil.example/", sock=socket.create_connection(("127.0.0.1", port)))
     for host, status in (("evil.example", 403), (f"localhost:{port}", 200)):
-        page = http.client.HTTPConnection("127.0.0.1", port)
-        page.request("GET", "/", headers={"Host": host})
-        assert page.getresponse().status == status
-        page.close()
+        assert fetched(port, "/", host)[0] == status
     with joined(viewer, origin=f"http://localhost:{port}") as browser:
         browser.send(packed(CAMERA))
         assert browser.recv(timeout=20)
+
+
+def fetched(port: int, path: str, host: str) -> tuple[int, str]:
+    """The status and the text of a page."""
+    page = http.client.HTTPConnection("127.0.0.1", port)
+    page.request("GET", path, headers={"Host": host})
+    answer = page.getresponse()
+    text = answer.read()
+    page.close()
+    if answer.headers["Content-Encoding"] == "gzip":
+        text = gzip.decompress(text)
+    return answer.status, text.decode()
+
+
+def test_the_page_is_opened_with_all_pixels_of_the_screen(viewer: Viewer) -> None:
+    """Catches a page that stays coarse where the browser was slow, and one that leads to itself."""
+    port = viewer.server.get_port()
+    host = f"localhost:{port}"
+    for path in ("/", "/?initialCameraPosition=1,2,3"):
+        assert fetched(port, path, host) == (200, f"{door.ENTRANCE}\n")
+    assert 'searchParams.set("fixedDpr"' in door.ENTRANCE
+    for path in ("/?fixedDpr=1", "/?initialCameraPosition=1,2,3&fixedDpr=1.5"):
+        status, text = fetched(port, path, host)
+        assert (status, "fixedDpr" in text, "root" in text) == (200, False, True)
 
 
 BAD_CAMERAS: list[dict[str, Any]] = [
@@ -147,6 +169,8 @@ OTHERS: list[object] = [
     packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"update_cb": 1}}),
     packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": NAN}}),
     packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1]}}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1, 2, 3, 4]}}),
+    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1, 2, NAN]}}),
     packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": []}),
 ]  # fmt: skip
 
@@ -159,7 +183,7 @@ def test_what_the_page_never_sends_is_not_known() -> None:
     ray = {"ray_origin": [0, 0, 1.5], "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5]}
     click = {"type": "SceneNodeClickMessage", "name": "/training/1", "instance_index": None, "modifier": None}
     assert is_known(packed(click | ray, owner=""))
-    for value in (True, 3, 0.5, "wipe"):
+    for value in (True, 3, 0.5, "wipe", [255, 0, 0]):
         assert is_known(packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": value}}))
     assert is_known(packed(CAMERA))
 
@@ -182,8 +206,8 @@ def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, cap
         for message in OTHERS:
             browser.send(message)  # type: ignore[arg-type]
         for control in (client.controls.time, client.controls.mode, client.controls.degree, client.controls.wipe,
-                        client.controls.play, *client.controls._choices[0]):  # fmt: skip
-            for value in ("x" * 100, "1e9", -(2**60), INF, False):
+                        client.controls.play, client.controls.background, *client.controls._choices[0]):  # fmt: skip
+            for value in ("x" * 100, "1e9", "1" * 100, -(2**60), INF, [0, 300, -1], [2**60, 0, 0], False):
                 update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
                 browser.send(packed(update))
         browser.send(packed(CAMERA, position=[0, 0, -5], image_width=32))

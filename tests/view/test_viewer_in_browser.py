@@ -7,6 +7,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from chromium import launched
 
@@ -43,19 +45,21 @@ def viewer(folder, other_folder):
 
 @pytest.fixture
 def visit(browser, viewer):
-    """Opens the viewer and waits for its first picture at rest; returns the page with what it complained of."""
+    """Opens the viewer and waits for its picture at rest, of one model; returns the page with what it complained of."""
     contexts = []
 
-    def open_page(viewer=viewer):
+    def open_page(viewer=viewer, show="one image"):
         context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
         contexts.append(context)
         page = context.new_page()
         page.viewer, page.complaints, page.asked = viewer, [], []
         page.on("pageerror", lambda error: page.complaints.append(str(error)))
         page.on("request", lambda request: page.asked.append(request.url))
-        # viser gives a slow browser fewer pixels unless it is told not to, and pictures are compared here
-        page.goto(f"http://localhost:{viewer.server.get_port()}/?fixedDpr=1")
+        page.goto(f"http://localhost:{viewer.server.get_port()}")
         settle(page)
+        if show is not None:
+            choose(page, "show", show)
+            settle(page)
         return page
 
     yield open_page
@@ -130,7 +134,7 @@ def test_on_a_phone_the_panel_leaves_the_image_free(browser, viewer):
     """Catches a panel that hides the picture, and controls that a phone cannot reach."""
     context = browser.new_context(viewport={"width": 390, "height": 844})
     page = context.new_page()
-    page.goto(f"http://localhost:{viewer.server.get_port()}/?fixedDpr=1")
+    page.goto(f"http://localhost:{viewer.server.get_port()}")
     page.wait_for_selector("text=controls", timeout=60_000)
     assert page.locator("text=gsbench: square").bounding_box()["y"] > 0.7 * 844
     assert not page.locator("text=freeze direction").is_visible()
@@ -293,15 +297,92 @@ def test_two_models_are_compared(visit):
     assert settle(page) not in pictures
 
 
-def test_training_cameras_are_shown(visit):
-    """Catches frusta that are not there, or do not go away."""
+def test_two_runs_open_side_by_side(visit, viewer):
+    """Catches a second run that must be looked for, a half without its label, and halves that show one model."""
+    page = visit(show=None)
+    choice = page.locator("//label[normalize-space()='show']/following::input[@role='combobox'][1]")
+    assert choice.input_value() == "side by side"
+    names = page.locator("table").first.inner_text().splitlines()[0].split("\t")[1:]
+    assert [name.strip() for name in names] == [renderer.name for renderer in viewer.renderers]
+    image = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    width = page.evaluate("[...document.querySelectorAll('canvas')].at(-1).clientWidth")
+    left, right = image[:, : width // 2], image[:, width - width // 2 : width]
+    assert (left[HEIGHT // 4 :] != right[HEIGHT // 4 :]).any()
+    for label in (left[:40, -60:], right[:40, :60]):
+        assert label.min() < 100
+        assert label.max() > 200
+    assert page.complaints == []
+
+
+def test_a_sharp_screen_gets_all_its_pixels(browser, viewer):
+    """Catches an image of half the pixels of the screen, and an address whose words are lost or mean nothing."""
+    context = browser.new_context(viewport={"width": 900, "height": 500}, device_scale_factor=2)
+    page = context.new_page()
+    page.goto(f"http://localhost:{viewer.server.get_port()}/?initialCameraFov=0.5")
+    page.wait_for_selector("text=x 1000", timeout=60_000)
+    assert "fixedDpr=2" in page.url
+    assert "initialCameraFov=0.5" in page.url
+    page.goto(page.url.replace("fixedDpr=2", "fixedDpr=0.5"))
+    page.wait_for_selector("text=x 250", timeout=60_000)
+    context.close()
+
+
+def test_the_background_is_chosen_and_everything_is_brought_back(visit):
+    """Catches a background without effect, one that changes an error, and a reset that leaves something as it was."""
+    page = visit(show=None)
+    start = settle(page)
+    switch(page, "nearest training view")
+    view = nearest(page)
+    field = page.locator("//label[normalize-space()='background']/following::input[1]")
+    field.fill("rgb(0, 200, 0)")
+    field.press("Enter")
+    page.wait_for_timeout(300)
+    assert nearest(page) == view
+    switch(page, "nearest training view")
+    page.keyboard.press("Escape")
+    coloured = settle(page)
+    image = cv2.imdecode(np.frombuffer(coloured, np.uint8), cv2.IMREAD_COLOR)
+    assert (np.abs(image.astype(int) - (0, 200, 0)).max(-1) < 8).any()
+    slide(page, "time", 1)
+    turn(page)
+    choose(page, "show", "one image")
+    switch(page, "AGR")
+    assert settle(page) not in (start, coloured)
+    page.get_by_role("button", name="reset", exact=True).click()
+    assert settle(page) == start
+
+
+def test_the_image_is_saved_as_it_is_shown(visit, viewer):
+    """Catches a file of another size or of other colours, and one without a name."""
+    page = visit(show="wipe")
+    shown = cv2.imdecode(np.frombuffer(settle(page), np.uint8), cv2.IMREAD_COLOR)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="save image").click()
+    assert download.value.suggested_filename == f"square {' '.join(one.name for one in viewer.renderers)}.png"
+    image = cv2.imread(str(download.value.path()))
+    left, top, width, height = PICTURE.values()
+    width_of_window = page.evaluate("[...document.querySelectorAll('canvas')].at(-1).clientWidth")
+    assert image.shape == (HEIGHT, width_of_window, 3)
+    inside = image[top : top + height, left : left + width]
+    assert np.abs(inside.astype(int) - shown).mean() < 2  # of JPEG
+
+
+def test_training_cameras_are_shown_except_side_by_side(visit):
+    """Catches frusta that are not there, do not go away, or lie over two images whose cameras are others."""
     page = visit()
     start = settle(page)
     switch(page, "training cameras")
     page.wait_for_timeout(1000)
     shown = settle(page)
+    choose(page, "show", "side by side")
+    beside = settle(page)
+    assert control(page, "training cameras", "checkbox").is_disabled()
+    choose(page, "show", "one image")
+    assert settle(page) == shown
     switch(page, "training cameras")
     assert settle(page) == start != shown
+    choose(page, "show", "side by side")
+    assert settle(page) == beside
 
 
 def test_two_browsers_have_controls_of_their_own_and_one_may_leave(visit, viewer):
