@@ -5,6 +5,7 @@ import hashlib
 import json
 import platform
 import subprocess
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -21,6 +22,7 @@ def provenance(
     *,
     config: dict[str, Any],
     data_hash: str,
+    data_notes: Sequence[str] = (),
     threads: int,
     device: str | None = None,
     instruction_set: str | None = None,
@@ -30,6 +32,7 @@ def provenance(
     Args:
         config: all settings of the run with references resolved, as plain JSON.
         data_hash: the fingerprint of the scene.
+        data_notes: what was decided where the scene's files leave a choice.
         threads: the number of threads of torch and of the kernels.
         device: the name of the GPU; None if the run used the CPU.
         instruction_set: the instruction set that the CPU kernels use; None if they are not built.
@@ -43,6 +46,7 @@ def provenance(
         config=config,
         config_hash=config_hash(config),
         data_hash=data_hash,
+        data_notes=[*data_notes],
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         hardware=here,
     )

@@ -206,6 +206,7 @@ class Provenance:
     data_hash: str  # Scene.fingerprint
     time: str  # UTC, ISO 8601
     hardware: Hardware | None = None  # None in older records, which have only `device`
+    data_notes: list[str] = field(default_factory=list)  # Scene.notes; empty in older records
 
     @staticmethod
     def with_present_names(plain: dict[str, Any]) -> dict[str, Any]:

@@ -53,8 +53,6 @@ class Attempt:
         self.model = build(config)
         start = trained_start(config)
         self.scene = scene = load_scene(config)
-        for note in scene.notes:
-            print(f"{scene.name}: {note}", file=sys.stderr)
         if is_auto(self.this.config) and not scene.has_time:
             self.resolved = Resolved(config := with_candidate(self.this.config, "static"))
             self.model = build(config)
@@ -162,11 +160,11 @@ class Attempt:
                 "paper_dataset": config.data.paper_dataset,
                 **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
                 **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
-                **({"notes": list(scene.notes)} if scene and scene.notes else {}),
             },
             provenance=provenance(
                 config=this.plain,
                 data_hash=scene.fingerprint if scene else "not loaded",
+                data_notes=scene.notes if scene else (),
                 threads=torch.get_num_threads(),
                 instruction_set=kernels.instruction_set(),
                 device=torch.cuda.get_device_name(config.device) if on_gpu else None,

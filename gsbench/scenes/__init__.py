@@ -2,12 +2,13 @@
 
 import importlib
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, did_you_mean, printable
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
 
 RESIZES = ("pillow",)  # filters by which images can be reduced, besides the mean of blocks
@@ -42,6 +43,7 @@ _LAYOUTS = (
         "images (PNG or JPEG) beside a COLMAP model in sparse/0 (your own capture)",
         "captured",
     ),
+    _Layout("transforms.json", "nerfstudio's transforms.json beside the images it names", "nerfstudio"),
 )
 
 
@@ -54,14 +56,17 @@ def load(
     frames: Sequence[int] | None = None,
     repair: Sequence[str] | None = None,
 ) -> Scene:
-    """Load a scene from a folder in the layout of Blender (NeRF-synthetic, D-NeRF), Technicolor or COLMAP.
+    """Load a scene from a folder in the layout of Blender (NeRF-synthetic, D-NeRF), Technicolor, COLMAP or nerfstudio.
+
+    What was decided where the files leave a choice, such as which number of the names is the time, is printed and is
+    in `Scene.notes`.
 
     RGBA images are composited over the background, then reduced. Tensors are float32 on the CPU; cameras have OpenCV
     axes (x right, y down, z forward). The images of a large scene stay in 8 bits until they are used.
 
     Args:
         path: the folder of the scene.
-        downscale: the integer factor by which images are reduced; it must divide their size.
+        downscale: the integer factor by which images are reduced; sizes that it does not divide are rounded.
         resize: the filter by which they are reduced. None averages blocks of pixels; "pillow" truncates the composite
             to 8 bits and reduces it by Pillow's bicubic filter, as in the code of 3DGS.
         background: the background colour, RGB in [0, 1].
@@ -91,16 +96,19 @@ def load(
     if not numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")
     root = _folder(path)
-    for layout in _LAYOUTS:
-        if os.path.lexists(root / layout.marker):
-            more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
-            more |= {} if repair is None else {"repair": _repair(repair, layout)}
-            reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
-            scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
-            return scene
-    found = "a folder without a scene" if root.is_dir() else "no such folder"
-    layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
-    raise InputError(f"{root}: {found}: looked for {layouts}", docs="data.md#what-is-read")
+    present = [layout for layout in _LAYOUTS if os.path.lexists(root / layout.marker)]
+    if not present:
+        why = "a folder without a scene" if root.is_dir() else "no such folder"
+        layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
+        raise InputError(f"{root}: {why}: looked for {layouts}", docs="data.md#what-is-read")
+    layout = present[0]
+    more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
+    more |= {} if repair is None else {"repair": _repair(repair, layout)}
+    reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
+    scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
+    for note in scene.notes:
+        print(f"{scene.name}: {printable(note)}", file=sys.stderr)
+    return scene
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:

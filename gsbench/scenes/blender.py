@@ -1,9 +1,10 @@
-"""Load scenes in the Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_*.json and PNG images."""
+"""Load scenes in the Blender layout of NeRF-synthetic, D-NeRF and 7DGS-PBR: transforms_*.json and the images they name.
 
-import json
-import math
+`read_split` reads one such file; nerfstudio's transforms.json is of the same kind (`gsbench.scenes.nerfstudio`).
+"""
+
 import os
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,44 +16,20 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.reading import MAX_JSON, parse_json, read_file
-from gsbench.scenes import files, images
+from gsbench.scenes import files, intrinsics, shots, times
+from gsbench.scenes.files import ImageFinder
+from gsbench.scenes.intrinsics import Intrinsics, brief, number
 from gsbench.scenes.placement import standard_scene
-from gsbench.scenes.scene import Camera, Scene, View
+from gsbench.scenes.scene import Scene, View
+from gsbench.scenes.shots import MASKS, Shot
 
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
-_SMALLEST = 1e-6  # pixels; smaller lengths become zero in single precision
-_LARGEST = 1e30  # largest number in a file; its square in double and its sums in single precision are finite
-_MASKS = "masks"  # the folder beside the images with the object number of each pixel, in PNG files of the same names
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # as instant-ngp and nerfstudio write them
+_FRAME_KEYS = {"file_path", "transform_matrix", "time", "rotation"}  # NeRF-synthetic's rotation is not part of the pose
+_MOST_KEYS = 8  # named in a sentence
 
 
 @dataclass(frozen=True)
-class _Intrinsics:
-    """Hold the camera intrinsics of a JSON file, in pixels of the full image; missing ones follow from the size."""
-
-    angle_x: float | None  # horizontal field of view in radians; None if the focal length is given
-    focal: tuple[float, float] | None
-    principal: tuple[float | None, float | None]
-    size: tuple[float | None, float | None]  # width and height that the file states
-
-    def matrix(self, width: int, height: int, downscale: int) -> Tensor:  # [3, 3] float32
-        """Compute the intrinsics K of an image of width x height pixels after it was reduced by `downscale`.
-
-        The first two rows of K are divided by the factor, because pixel centres are at +0.5.
-        """
-        if self.focal is not None:
-            fx, fy = self.focal
-        else:
-            assert self.angle_x is not None
-            fx = fy = 0.5 * width / math.tan(0.5 * self.angle_x)
-        cx = width / 2 if self.principal[0] is None else self.principal[0]
-        cy = height / 2 if self.principal[1] is None else self.principal[1]
-        s = 1 / downscale
-        return torch.tensor([[fx * s, 0, cx * s], [0, fy * s, cy * s], [0, 0, 1]], dtype=torch.float32)
-
-
-@dataclass(frozen=True)
-class _Frame:
+class Frame:
     """Hold a checked entry of the list `frames` of a JSON file; its image is not read yet."""
 
     path: Path
@@ -61,16 +38,18 @@ class _Frame:
     where: str  # the image's path and the field that names it, for messages
     time: float | None
     viewmat: Tensor  # [4, 4] float64
+    intrinsics: Intrinsics
 
 
 @dataclass(frozen=True)
-class _Split:
-    """Hold the checked content of the file transforms_<split>.json."""
+class Split:
+    """Hold the checked content of a JSON file."""
 
     source: Path
-    intrinsics: _Intrinsics
-    frames: list[_Frame]
+    frames: list[Frame]
+    content: dict[str, Any]  # of the file
     digest: str
+    notes: list[str]
 
 
 def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
@@ -78,11 +57,13 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
 
     Each file transforms_{train,val,test}.json has
 
-    - `camera_angle_x` in radians, or `fl_x` and optionally `fl_y`, `cx`, `cy`, `w`, `h` in pixels of the full image;
-    - `frames`, a list of objects with `file_path` (relative to the folder), `transform_matrix` (camera to world, OpenGL
-      axes), and optionally `time` in [0, 1].
+    - `frames`, a list of objects with `file_path` (relative to the folder; the suffix may be missing),
+      `transform_matrix` (camera to world, OpenGL axes), and optionally `time`;
+    - `camera_angle_x` in radians and optionally `camera_angle_y`, or `fl_x` and optionally `fl_y`, `cx`, `cy`, `w`, `h`
+      in pixels of the full image. A frame may have its own.
 
-    transforms_val.json may be missing. A file points3d.ply is ignored, because in these data sets it has random points.
+    Times outside of [0, 1] are scaled over all splits together. transforms_val.json may be missing. A file points3d.ply
+    is ignored, because in these data sets it has random points.
 
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
     each pixel (`View.regions`). Masks are not used in training or measurement.
@@ -92,12 +73,23 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     """
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
-    splits = {"train": _read_split(root, "train"), "test": _read_split(root, "test")}
+    finder = ImageFinder(root)
+    splits = {split: read_split(root, f"transforms_{split}.json", finder) for split in ("train", "test")}
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
-        splits["val"] = _read_split(root, "val")
-    _check_times(splits)
-    views, digests = _read_views(root, splits, downscale, background, resize)
+        splits["val"] = read_split(root, "transforms_val.json", finder)
+    timed, notes = _times(splits)
+    size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)
+    listed = [shot for split in splits for shot in shots_of(splits[split].frames, timed[split], size)]
+    loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
+    views, parts, at = {}, {}, 0
+    for split in splits:
+        part = slice(at, at := at + len(splits[split].frames))
+        views[split], parts[split] = loaded.views[part], loaded.digests[part]
+    digests = {
+        frame.name: digest for split in splits for frame, digest in zip(splits[split].frames, parts[split], strict=True)
+    }
     digests |= {split.source.name: split.digest for split in splits.values()}
+    notes += [*(note for split in splits.values() for note in split.notes), *finder.notes(), *loaded.notes]
     return standard_scene(
         name=name,
         train=views["train"],
@@ -106,67 +98,73 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
         background=background,
         points=None,
         fingerprint=files.fingerprint(digests),
+        notes=(*notes, *_shared(views, parts)),
     )
 
 
-def _read_split(root: Path, name: str) -> _Split:
-    """Read and check the file transforms_<name>.json in the folder `root`."""
-    source = root / f"transforms_{name}.json"
+def read_split(root: Path, name: str, finder: ImageFinder, keys: frozenset[str] = frozenset()) -> Split:
+    """Read and check a file of cameras in the folder `root`.
+
+    Args:
+        root: the scene's folder, resolved.
+        name: the file, such as transforms_train.json.
+        finder: finds the images.
+        keys: keys of the whole file that the caller reads; others that are not known get a note.
+
+    Raises:
+        InputError: the file is missing, damaged, or has a value that is not read; the message names the field.
+    """
+    source = root / name
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
     if not isinstance(content, dict):
         raise InputError(f"{source}: expected a JSON object with 'frames', got a {type(content).__name__}")
     frames = content.get("frames")
     if not isinstance(frames, list):
-        raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")
+        raise InputError(f"{source}: frames: expected a list of frames, got {brief(frames)}")
     if not frames:
-        raise InputError(f"{source}: frames: expected at least one frame, the {name} split is empty")
-    return _Split(
-        source,
-        _read_intrinsics(content, source),
-        [_read_frame(root, frame, source, index) for index, frame in enumerate(frames)],
-        files.digest(data),
-    )
+        what = name.removeprefix("transforms_").removesuffix(".json")
+        raise InputError(f"{source}: frames: expected at least one frame, the {what} split is empty")
+    checked = [_read_frame(root, content, frame, source, index, finder) for index, frame in enumerate(frames)]
+    unread = sorted(content.keys() - intrinsics.KEYS - {"frames", *keys})
+    unread += sorted({key for frame in frames for key in frame} - intrinsics.KEYS - _FRAME_KEYS - set(unread))
+    listed = ", ".join(f"{key[:40]!a}" for key in unread[:_MOST_KEYS]) + (", .." if len(unread) > _MOST_KEYS else "")
+    notes = [f"{name}: keys that are not read: {listed}"] if unread else []
+    return Split(source, checked, content, files.digest(data), notes)
 
 
-def _read_intrinsics(content: dict[str, Any], source: Path) -> _Intrinsics:
-    """Read the intrinsics of a JSON file: focal length and principal point in pixels, or the field of view."""
-    given = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION)
-    values = {key: _number(content[key], f"{source}: {key}") for key in given if key in content}
-    for key in _DISTORTION:
-        if values.get(key, 0) != 0:
-            raise InputError(f"{source}: {key}: expected a pinhole camera, got {values[key]}: undistort the images")
-    for key in ("fl_x", "fl_y", "w", "h"):
-        if key in values and values[key] < _SMALLEST:
-            raise InputError(f"{source}: {key}: expected a positive number of pixels, got {values[key]}")
-    angle = values.get("camera_angle_x")
-    if angle is not None and not 1e-6 < angle < math.pi:
-        raise InputError(f"{source}: camera_angle_x: expected radians between 0 and pi, got {angle}")
-    focal = (values["fl_x"], values.get("fl_y", values["fl_x"])) if "fl_x" in values else None
-    if focal is None and angle is None:
-        raise InputError(f"{source}: expected intrinsics as 'camera_angle_x' or 'fl_x', found neither")
-    return _Intrinsics(angle, focal, (values.get("cx"), values.get("cy")), (values.get("w"), values.get("h")))
+def shots_of(frames: Sequence[Frame], timed: Sequence[float | None], size: tuple[int, int]) -> list[Shot]:
+    """Return what is needed to read the images of frames; `size` is the width and height of the first image."""
+    return [
+        Shot(frame.path, frame.mask, files.without_suffix(frame.name), frame.where, time, frame.viewmat,
+             frame.intrinsics.lens(size))
+        for frame, time in zip(frames, timed, strict=True)
+    ]  # fmt: skip
 
 
-def _read_frame(root: Path, frame: object, source: Path, index: int) -> _Frame:
-    """Check entry number `index` of the list `frames` of a JSON file: image path, time and camera pose."""
+def places_of(frames: Sequence[Frame]) -> list[Any]:
+    """Return a key of each frame that is equal for frames with the same pose and intrinsics."""
+    viewmats = np.stack([frame.viewmat.double().numpy() for frame in frames])
+    return list(times.places_of(viewmats, [(frame.intrinsics.focal, frame.intrinsics.angle) for frame in frames]))
+
+
+def _read_frame(
+    root: Path, content: dict[str, Any], frame: object, source: Path, index: int, finder: ImageFinder
+) -> Frame:
+    """Check entry number `index` of the list `frames` of a JSON file: image path, time, intrinsics and camera pose."""
     where = f"{source}: frames[{index}]"
     if not isinstance(frame, dict):
-        raise InputError(f"{where}: expected an object with 'file_path' and 'transform_matrix', got {_brief(frame)}")
+        raise InputError(f"{where}: expected an object with 'file_path' and 'transform_matrix', got {brief(frame)}")
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}.file_path: expected the image's path, got {_brief(name)}")
-    with_suffix = name if name.lower().endswith(".png") else f"{name}.png"
-    path = files.find_inside(root, with_suffix, f"{where}.file_path")
-    time = None
-    if "time" in frame:
-        time = _number(frame["time"], f"{where}.time")
-        if not 0 <= time <= 1:
-            raise InputError(f"{where}.time: expected a time in [0, 1], got {time}")
+        raise InputError(f"{where}.file_path: expected the image's path, got {brief(name)}")
+    path = finder.find(name, f"{where}.file_path")
+    time = number(frame["time"], f"{where}.time") if "time" in frame else None
     viewmat = _viewmat(frame.get("transform_matrix"), f"{where}.transform_matrix")
     named_by = f"{path} ({source.name}, frames[{index}].file_path)"
-    mask = path.parent / _MASKS / path.name if (path.parent / _MASKS).is_dir() else None
-    return _Frame(path, mask, path.relative_to(root).as_posix(), named_by, time, viewmat)
+    mask = path.parent / MASKS / f"{files.without_suffix(path.name)}.png" if (path.parent / MASKS).is_dir() else None
+    camera = intrinsics.read(content, frame, str(source), where)
+    return Frame(path, mask, path.relative_to(root).as_posix(), named_by, time, viewmat, camera)
 
 
 def _viewmat(
@@ -180,8 +178,8 @@ def _viewmat(
     """
     rows = matrix if isinstance(matrix, list) else []
     if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
-    c2w: NDArray[np.float64] = np.array([[_number(value, where) for value in row] for row in rows])
+        raise InputError(f"{where}: expected 4 rows of 4 numbers, got {brief(matrix)}")
+    c2w: NDArray[np.float64] = np.array([[number(value, where) for value in row] for row in rows])
     if not np.allclose(c2w[3], [0, 0, 0, 1], rtol=0, atol=_RIGID_TOLERANCE):
         raise InputError(f"{where}: expected the last row 0 0 0 1, got {c2w[3].tolist()}")
     rotation = c2w[:3, :3]
@@ -199,105 +197,50 @@ def _viewmat(
     return torch.from_numpy(viewmat)
 
 
-def _check_times(splits: dict[str, _Split]) -> None:
-    """Raise InputError if some frames of a data set have a time and others do not."""
-    first = splits["train"].frames[0].time
-    for split in splits.values():
-        for index, frame in enumerate(split.frames):
-            if (frame.time is None) != (first is None):
-                has, other = ("no time", "has one") if frame.time is None else ("a time", "has none")
-                raise InputError(
-                    f"{split.source}: frames[{index}].time: this frame has {has} and the first training frame {other}: "
-                    "give a time to all frames or to none"
-                )
+def _times(splits: dict[str, Split]) -> tuple[dict[str, list[float | None]], list[str]]:
+    """Return the times of each split's frames in [0, 1], or None for all, and sentences on how they were read.
 
-
-def _read_views(
-    root: Path,
-    splits: dict[str, _Split],
-    downscale: int,
-    background: tuple[float, float, float],
-    resize: str | None,
-) -> tuple[dict[str, list[View]], dict[str, str]]:
-    """Read all images by several threads.
-
-    Images of a small scene are stored as floats, those of a large scene in 8 bits. All images must have the same size.
-
-    Returns:
-        The views of each split, and the SHA-256 of each image file by name.
+    Raises:
+        InputError: only some frames have a time, or frames with equal pose, intrinsics and time have different images.
     """
-    listed = [(split, frame) for split in splits.values() for frame in split.frames]
-    first = listed[0][1]
-    data = images.read_image(first.path, first.where)
-    expected = images.png_size(data, first.where)
-    in_8_bits = resize is None and images.stays_in_8_bits(data, expected, len(listed), downscale)
-
-    def read(entry: tuple[_Split, _Frame]) -> tuple[View, str]:
-        split, frame = entry
-        data = images.read_image(frame.path, frame.where)
-        _check_size(images.png_size(data, frame.where), expected, split, frame)
-        decoded = images.decode_png(data, frame.where)
-        is_kept = in_8_bits and decoded.dtype.name == "uint8"
-        if is_kept:
-            image = torch.from_numpy(decoded)
-        else:
-            image = images.composite(decoded, background, downscale, frame.where, resize)
-        camera = Camera(frame.viewmat, split.intrinsics.matrix(*expected, downscale), image.shape[1], image.shape[0])
-        alpha = None if is_kept else images.alpha_of(decoded, downscale)
-        regions = None if frame.mask is None else _read_mask(root, frame, expected, downscale)
-        name = frame.name[: -len(".png")]
-        return View(name, camera, frame.time, image, background, alpha, regions), files.digest(data)
-
-    masked = any(frame.mask is not None for _, frame in listed)
-    kept = (4 if in_8_bits else 13) + masked  # bytes a pixel; alpha and object number have one byte each
-    threads = images.count_readers(expected, len(listed), downscale, first.where, kept)
-    with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
-        decoded = pool.map(read, listed)
-        digests = {}
-        views: dict[str, list[View]] = {name: [] for name in splits}
-        for name, split in splits.items():
-            for frame in split.frames:
-                view, digests[frame.name] = next(decoded)
-                views[name].append(view)
-    return views, digests
+    check_all_or_none(splits.values())
+    if splits["train"].frames[0].time is None:
+        return {name: [None] * len(split.frames) for name, split in splits.items()}, []
+    for split in splits.values():
+        times.check_distinct(
+            [frame.name for frame in split.frames], [frame.time for frame in split.frames], places_of(split.frames),
+            str(split.source),
+        )  # fmt: skip
+    fields = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits.values()}
+    timed, notes = times.of_fields(fields)
+    return {name: timed[str(split.source)] for name, split in splits.items()}, notes
 
 
-def _read_mask(root: Path, frame: _Frame, size: tuple[int, int], downscale: int) -> Tensor:  # [H, W] 8 bits
-    """Read the mask of an image: a PNG with the number of the object in each pixel. Raise InputError if this fails."""
-    assert frame.mask is not None
-    where = f"{frame.mask} (the mask of {frame.name}; without a folder '{_MASKS}' a scene has no regions)"
-    path = files.find_inside(root, frame.mask.relative_to(root).as_posix(), where)
-    return images.decode_regions(images.read_image(path, where), size, downscale, where)
-
-
-def _check_size(size: tuple[int, int], expected: tuple[int, int], split: _Split, frame: _Frame) -> None:
-    """Raise InputError if an image has another size than the first image, or than its JSON file states."""
-    if size != expected:
-        raise InputError(
-            f"{frame.where}: expected {expected[0]}x{expected[1]} as the first training image, got {size[0]}x{size[1]}"
-        )
-    for key, claimed, actual in zip(("w", "h"), split.intrinsics.size, size, strict=True):
-        if claimed is not None and claimed != actual:
+def check_all_or_none(splits: Iterable[Split]) -> None:
+    """Raise InputError if some frames of a data set have a time and others do not."""
+    listed = [(split, index, frame) for split in splits for index, frame in enumerate(split.frames)]
+    first = listed[0][2].time
+    for split, index, frame in listed:
+        if (frame.time is None) != (first is None):
+            has, other = ("no time", "has one") if frame.time is None else ("a time", "has none")
             raise InputError(
-                f"{split.source}: {key}: expected the images' own {actual}, got {claimed}: scale all intrinsics with it"
+                f"{split.source}: frames[{index}].time: this frame has {has} and the first frame {other}: "
+                "give a time to all frames or to none"
             )
 
 
-def _number(value: object, where: str) -> float:
-    """Convert a JSON value to a finite float; raise InputError for other values, also for true and false."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if abs(number) <= _LARGEST:
-            return number
-    raise InputError(f"{where}: expected a finite number, got {_brief(value)}")
-
-
-def _brief(value: object) -> str:
-    """Return a JSON value as a short text for an error message."""
-    if isinstance(value, list | dict):
-        return f"a {type(value).__name__} of {len(value)}"
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def _shared(views: dict[str, list[View]], digests: dict[str, list[str]]) -> list[str]:
+    """Return sentences on images that two splits share, with the same pose and time."""
+    seen = {
+        split: [(digest, view.camera.viewmat.numpy().tobytes(), view.time) for view, digest in
+                zip(views[split], digests[split], strict=True)]
+        for split in views
+    }  # fmt: skip
+    notes = []
+    for one, other in (("test", "train"), ("test", "val"), ("val", "train")):
+        if one in seen and other in seen:
+            shared = set(seen[other])
+            if count := sum(key in shared for key in seen[one]):
+                notes.append(f"{count} of {len(seen[one])} views of {one} are views of {other} too (image, pose and "
+                             f"time are equal): PSNR on {one} is not that of unseen views")  # fmt: skip
+    return notes

@@ -69,6 +69,30 @@ def read_part(folder: Path, part: str) -> ModelFile:
     )
 
 
+def largest_model(sparse: Path) -> tuple[Path, list[str]]:
+    """Return the folder of the model with the most images in `sparse` and its subfolders, and what was left out.
+
+    COLMAP writes a folder 0, 1, .. for each part of a capture that it could not join. Of equals, the first is taken,
+    and `sparse` itself last.
+
+    Raises:
+        InputError: the images of one of several models cannot be read.
+    """
+    parts = sorted(sparse.iterdir(), key=lambda path: (len(path.name), path.name)) if sparse.is_dir() else []
+    models = [
+        folder for folder in (*parts, sparse) if any((folder / f"images.{kind}").exists() for kind in ("bin", "txt"))
+    ]
+    if len(models) < 2:
+        return models[0] if models else sparse, []
+    counts = {folder: len(read_images(read_part(folder, "images"))) for folder in models}
+    largest = max(models, key=counts.__getitem__)
+    rest = ", ".join(
+        f"{folder.relative_to(sparse.parent)} has {counts[folder]}" for folder in models if folder != largest
+    )
+    return largest, [f"several COLMAP models: {largest.relative_to(sparse.parent)} with the most images, "
+                     f"{counts[largest]}, is read; {rest}"]  # fmt: skip
+
+
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
     """Return the cameras of a model by their numbers.
 
@@ -167,7 +191,7 @@ def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
 def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
     """Yield the cameras of cameras.txt, whose lines have an id, a model, width, height and the model's parameters."""
     for number, line in _lines(file):
-        if not line.strip() or line.startswith("#"):
+        if not line or line.startswith("#"):
             continue
         words = line.split()
         where = f"{file.path}: line {number}"
@@ -193,17 +217,33 @@ def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
 
 def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
     """Yield the images of images.txt, each of which has two lines: the second lists keypoints and may be empty."""
-    lines = _lines(file)
+    lines = ((number, line) for number, line in _lines(file) if not line.startswith("#"))
     for number, line in lines:
-        if not line.strip() or line.startswith("#"):
+        if not line:
             continue
         words = line.split(maxsplit=9)
         try:
-            yield words[9].strip(), tuple(float(word) for word in words[1:8]), int(words[8])
+            row = words[9], tuple(float(word) for word in words[1:8]), int(words[8])
         except (ValueError, IndexError):
             raise InputError(f"{file.path}: line {number}: expected an image's id, qw qx qy qz tx ty tz, camera and "
                              f"name, got {line[:60]!a}") from None  # fmt: skip
-        next(lines, None)
+        number, line = next(lines, (number + 1, ""))
+        if not _are_keypoints(line.split()):
+            raise InputError(f"{file.path}: line {number}: expected the keypoints (x y id ..) of image {row[0][:40]!a} "
+                             f"or an empty line, got {line[:60]!a}: write an empty line after each image",
+                             docs="data.md#your-own-capture")  # fmt: skip
+        yield row
+
+
+def _are_keypoints(words: list[str]) -> bool:
+    """Return whether words are x, y and the number of a point in turn."""
+    try:
+        for kind, column in zip((float, float, int), (words[::3], words[1::3], words[2::3]), strict=True):
+            for word in column:
+                kind(word)
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
 
 
 def _binary_points(file: ModelFile) -> list[tuple[float, ...]]:
@@ -240,8 +280,9 @@ def _text_points(file: ModelFile) -> list[tuple[float, ...]]:
 
 
 def _lines(file: ModelFile) -> Iterator[tuple[int, str]]:
-    """Return the lines of a text file with their numbers from 1."""
-    return iter(enumerate(file.data.decode("utf-8", "replace").split("\n"), 1))
+    """Yield the lines of a text file without spaces around them, with their numbers from 1."""
+    for number, line in enumerate(file.data.decode("utf-8-sig", "replace").split("\n"), 1):
+        yield number, line.strip()
 
 
 class _Reader:

@@ -1,10 +1,16 @@
-"""Find the files of a data set, which must be inside the scene's folder, and compute a hash of all of them."""
+"""Find the files of a data set inside the scene's folder, and compute a hash of all of them."""
 
 import hashlib
+import os
+import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
 from gsbench.errors import InputError
+
+_SUFFIXES = (".png", ".jpg", ".jpeg")  # of images, in any case; the first is preferred
+_DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")  # with which absolute paths begin on Windows
 
 
 def find_inside(
@@ -12,21 +18,90 @@ def find_inside(
     name: str,  # a path relative to `root`, as the data set writes it
     where: str,  # the file and field that hold `name`, for the message
 ) -> Path:
-    """Return the resolved path of a file; raise InputError if it is outside of the scene's folder `root`.
+    """Return the path of a file; raise InputError if `name` leaves the scene's folder `root`.
 
-    A path can leave the folder through "..", through a link, or as an absolute path.
+    `name` can leave the folder through ".." or as an absolute path. Links inside of the folder are followed, because
+    only its user can have made them; "a/.." is "." even if a is a link.
     """
     if not name.isprintable():  # a NUL byte, a lone surrogate, a line break that would break the message
         raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is not printable: rename it")
-    try:
-        path = (root / name).resolve()
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is a loop of links") from error
+    path = Path(os.path.normpath(root / name))
+    if _DRIVE.match(name) or (os.path.isabs(name) and not path.is_relative_to(root)):
+        raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is absolute: write it relative "
+                         "to that folder")  # fmt: skip
     if not path.is_relative_to(root):
         raise InputError(
-            f"{where}: expected a path inside {root}, got {name!r}, which leaves it: move the file into the folder"
+            f"{where}: expected a path inside {root}, got {name!r}, which leaves it: move the file into the folder, or "
+            "make a link to it there"
         )
     return path
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of an image without the suffix of a PNG or JPEG, if it has one; other suffixes stay."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in _SUFFIXES else name
+
+
+class ImageFinder:
+    """Finds the images of a scene by the names that a file of the data set gives to them."""
+
+    def __init__(self, root: Path) -> None:
+        """Store the scene's folder, which is resolved; no folder is read yet."""
+        self._root = root
+        self._listed: dict[Path, dict[str, list[str]]] = {}  # folder -> name without suffix -> names of images
+        self._replaced: Counter[str] = Counter()  # ".jpg for .png" -> images
+
+    def find(
+        self,
+        name: str,  # a path relative to the scene's folder, with or without suffix, with / or Windows' backslashes
+        where: str,  # the file and field that hold `name`, for the message
+    ) -> Path:
+        """Return the path of the image: `name` itself if it is a file, otherwise that of another suffix, or of case.
+
+        If there is neither, the path of the PNG or of what `name` says is returned, for a message that names it.
+
+        Raises:
+            InputError: `name` leaves the scene's folder.
+        """
+        path = find_inside(self._root, name, where)
+        if not os.path.isfile(path) and "\\" in name:
+            path = find_inside(self._root, name.replace("\\", "/"), where)
+        if os.path.isfile(path):
+            return path
+        stem = without_suffix(path.name)
+        suffix = path.name[len(stem) :]
+        names = self._images(path.parent).get(stem)
+        if not names:
+            return path if suffix else path.with_name(f"{path.name}{_SUFFIXES[0]}")
+        best = min(names, key=lambda other: (other.lower() != path.name.lower(), _order(other), other))
+        if suffix:
+            self._replaced[f"{best[len(stem) :]} for {suffix}"] += 1
+        return path.with_name(best)
+
+    def notes(self) -> list[str]:
+        """Return a sentence on images whose suffix is not the one that the data set says, if there are any."""
+        if not self._replaced:
+            return []
+        return [f"images of another suffix are read: {', '.join(f'{n} {of}' for of, n in self._replaced.items())}"]
+
+    def _images(self, folder: Path) -> dict[str, list[str]]:
+        """Return the names of the images in a folder by their names without suffix; the folder is listed once."""
+        if folder not in self._listed:
+            listed = self._listed.setdefault(folder, {})
+            try:
+                names = sorted(os.listdir(folder))
+            except (OSError, ValueError):  # the error of reading the image names the path
+                names = []
+            for name in names:
+                if (stem := without_suffix(name)) != name:
+                    listed.setdefault(stem, []).append(name)
+        return self._listed[folder]
+
+
+def _order(name: str) -> int:
+    """Return the place of an image's suffix in the order of preference."""
+    return _SUFFIXES.index(os.path.splitext(name)[1].lower())
 
 
 def digest(data: bytes) -> str:

@@ -74,6 +74,8 @@ def photo_size(
     Raises:
         InputError: the data is neither, has zero or too many pixels, or colours that are not RGB or RGBA.
     """
+    if not data.startswith((_JPEG, _SIGNATURE)):
+        raise DamagedError(f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it")
     if not data.startswith(_JPEG):
         return png_size(data, where)
     with _jpeg(data, where) as image:
@@ -111,6 +113,23 @@ def png_size(
         if name == b"IEND":
             return size
         at += 12 + length
+
+
+def reduced_size(
+    size: tuple[int, int],  # width and height
+    downscale: int,
+    where: str,  # the image's path, for the message
+) -> tuple[int, int]:
+    """Return the width and height of an image that is reduced `downscale` times, each rounded, halves up.
+
+    Raises:
+        InputError: no pixel would be left.
+    """
+    width, height = ((2 * side + downscale) // (2 * downscale) for side in size)
+    if not width or not height:
+        raise InputError(f"{where}: expected a downscale that leaves pixels, got downscale={downscale} for "
+                         f"{size[0]}x{size[1]}")  # fmt: skip
+    return width, height
 
 
 def stays_in_8_bits(
@@ -186,10 +205,9 @@ def decode_png(
 def decode_regions(
     data: bytes,
     size: tuple[int, int],  # width and height of the image that it belongs to
-    downscale: int,  # divides the size
     where: str,  # the file's path, for the message
-) -> Tensor:  # [H / downscale, W / downscale] 8 bits
-    """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel, and reduce it by subsampling.
+) -> NDArray[np.uint8]:  # [H, W]
+    """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel.
 
     Raises:
         InputError: the data is not such a PNG, is damaged, or has another size than the image of the mask.
@@ -197,56 +215,57 @@ def decode_regions(
     own = png_size(data, where, NUMBERS)
     if own != size:
         raise InputError(f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {own[0]}x{own[1]}")
-    numbers = _decode(data, where)  # [H, W]
-    return torch.from_numpy(numbers[downscale // 2 :: downscale, downscale // 2 :: downscale].copy())
+    return _decode(data, where)
+
+
+def subsample(
+    numbers: Pixels,  # [H, W] the number of the object in each pixel
+    size: tuple[int, int],  # width w and height h of the reduced image
+) -> Tensor:  # [h, w] 8 bits
+    """Reduce a mask: each pixel has the number at its centre."""
+    rows, columns = (
+        (2 * np.arange(after) + 1) * before // (2 * after)
+        for before, after in zip(numbers.shape, size[::-1], strict=True)
+    )
+    return torch.from_numpy(numbers[rows[:, None], columns])
 
 
 def alpha_of(
     pixels: Pixels,  # [H, W, 3|4] as stored
-    downscale: int,  # divides the size
-) -> Tensor | None:  # [H / downscale, W / downscale] 8 bits
+    size: tuple[int, int],  # width w and height h of the reduced image
+) -> Tensor | None:  # [h, w] 8 bits
     """Return the alpha channel of an image, reduced by averaging; None for an image without alpha."""
     if pixels.shape[2] == 3:
         return None
     alpha: NDArray[Any] = pixels[..., 3].astype(np.float32) * np.float32(255 / np.iinfo(pixels.dtype).max)
-    if downscale > 1:
-        height, width = alpha.shape
-        alpha = cv2.resize(alpha, (width // downscale, height // downscale), interpolation=cv2.INTER_AREA)
+    if size != alpha.shape[::-1]:
+        alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.rint(alpha).astype(np.uint8))
 
 
 def composite(
     pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
     background: tuple[float, float, float],
-    downscale: int,
-    where: str,  # the file's path, for the message
+    size: tuple[int, int],  # width w and height h of the reduced image
     resize: str | None = None,  # one of gsbench.scenes.RESIZES
-) -> Tensor:  # [H / downscale, W / downscale, 3] float32 in [0, 1]
-    """Composite an image with straight alpha over a background colour, then average blocks of downscale^2 pixels.
+) -> Tensor:  # [h, w, 3] float32 in [0, 1]
+    """Composite an image with straight alpha over a background colour, then reduce it: a pixel is the mean of its area.
 
     The order matters: if colours and alpha were averaged separately, the arbitrary colours of transparent pixels would
     show at silhouettes. With `resize="pillow"` the composite is truncated to 8 bits and reduced by Pillow's bicubic
     filter, as in the code of 3DGS and of methods derived from it.
-
-    Raises:
-        InputError: `downscale` does not divide the width and the height.
     """
-    height, width = pixels.shape[:2]
-    if height % downscale or width % downscale:
-        raise InputError(
-            f"{where}: expected a downscale that divides the image, got downscale={downscale} for {width}x{height}"
-        )
     if resize == "pillow":
         whole = Image.fromarray(_composite_8_bits(pixels, background))
-        reduced = whole.resize((width // downscale, height // downscale), Image.Resampling.BICUBIC)
+        reduced = whole.resize(size, Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(reduced)).float() / 255
     values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     image: NDArray[Any] = values[..., :3]
     if pixels.shape[2] == 4:
         alpha = values[..., 3:]
         image = image * alpha + np.asarray(background, np.float32) * (1 - alpha)
-    if downscale > 1:  # with an integer factor INTER_AREA is the mean of each block
-        image = cv2.resize(image, (width // downscale, height // downscale), interpolation=cv2.INTER_AREA)
+    if size != (image.shape[1], image.shape[0]):  # with an integer factor INTER_AREA is the mean of each block
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
 
 

@@ -1,6 +1,6 @@
 """Undo the distortion of a camera's lens with OpenCV, so that its image is that of a pinhole camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ from gsbench.errors import InputError
 from gsbench.scenes.images import Pixels
 
 _HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres are at +0.5 here, and at integers in OpenCV
+_LEAST_RATIO = 1.1  # below it, an image whose sides are not exactly in one ratio to the camera's may have been cropped
 _OUTSIDE = 2.0  # pixels that OpenCV's rectangle without blank pixels may exceed the image, as it samples the border
 
 
@@ -21,6 +22,29 @@ class Lens:
     height: int
     K: NDArray[np.float64]  # [3, 3] pixel centres at +0.5
     distortion: tuple[float, float, float, float]  # k1, k2 (radial), p1, p2 (tangential), as in OpenCV
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What is equal for equal lenses."""
+        return (self.width, self.height, *self.K.ravel().tolist(), *self.distortion)
+
+    def resized(self, width: int, height: int) -> "Lens | None":
+        """Return the lens of an image of width x height pixels that was reduced from the camera's by one ratio.
+
+        The sides of the image may be rounded. None: the image is larger, or its sides have two ratios, so that it was
+        cropped or is of another camera.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        ratio = self.width / width
+        is_exact = width * self.height == height * self.width
+        is_rounded = (
+            abs(self.height * width / self.width - height) < 1 or abs(self.width * height / self.height - width) < 1
+        )
+        if not (ratio > 1 and is_exact) and not (ratio > _LEAST_RATIO and is_rounded):
+            return None
+        scale = np.diag([width / self.width, height / self.height, 1])
+        return replace(self, width=width, height=height, K=scale @ self.K)
 
     def pinhole(self) -> NDArray[np.float64]:  # [3, 3]
         """Return the intrinsics of the undistorted image, which has the same size; without distortion K itself.

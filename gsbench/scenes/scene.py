@@ -148,9 +148,9 @@ class Scene:
     points: Points | None  # None: the data set has no points
     fingerprint: str  # SHA-256 of the files, by which record.json identifies the data
     repaired: tuple[str, ...] = ()  # names of damaged images that were replaced by the frame before
+    notes: tuple[str, ...] = ()  # what was decided where the files leave a choice, and what of them was not read
     up: tuple[float, float, float] = UP  # unit vector; orbits and the viewer turn about it, training does not read it
     placement: Placement = Placement()  # from the user's coordinates to those of `train`, `points` and `extent`
-    notes: tuple[str, ...] = ()  # what was read in a way that the user should know, a line each
 
     @property
     def has_time(self) -> bool:

@@ -127,15 +127,19 @@ def _number(text: str, where: str) -> float:
     return number
 
 
-def _camera(row: dict[str, float], width: int, height: int, downscale: int) -> Camera:
-    """Make a camera from a row of the table; width and height are those of the reduced image."""
+def _camera(
+    row: dict[str, float],
+    size: tuple[int, int],  # width and height of the image
+    reduced: tuple[int, int],  # those of the reduced image
+) -> Camera:
+    """Make a camera from a row of the table."""
     viewmat = torch.eye(4, dtype=torch.float64)
     rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])  # scipy has w last
     viewmat[:3, :3] = torch.from_numpy(rotation.as_matrix())
     viewmat[:3, 3] = torch.tensor([row["tx"], row["ty"], row["tz"]], dtype=torch.float64)
-    s = 1 / downscale
-    K = torch.tensor([[row["f"] * s, 0, row["cu"] * s], [0, row["f"] * row["ar"] * s, row["cv"] * s], [0, 0, 1]])
-    return Camera(viewmat, K, width, height)
+    sx, sy = reduced[0] / size[0], reduced[1] / size[1]
+    K = torch.tensor([[row["f"] * sx, 0, row["cu"] * sx], [0, row["f"] * row["ar"] * sy, row["cv"] * sy], [0, 0, 1]])
+    return Camera(viewmat, K, *reduced)
 
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
@@ -201,7 +205,8 @@ def _read_views(
     first, last = listed[0].frame, listed[-1].frame
     where = str(listed[0].path)
     size = images.png_size(images.read_image(listed[0].path, where), where)
-    cameras = [_camera(row, size[0] // downscale, size[1] // downscale, downscale) for row in rows]
+    reduced = images.reduced_size(size, downscale, where)
+    cameras = [_camera(row, size, reduced) for row in rows]
 
     def read(image: _Image) -> tuple[View, str]:
         where = str(image.path)
@@ -213,10 +218,7 @@ def _read_views(
         else:
             decoded = _decode_or_advise(data, image, size)
         is_kept = downscale == 1 and decoded.dtype.name == "uint8"
-        if is_kept:
-            pixels = torch.from_numpy(decoded)
-        else:
-            pixels = images.composite(decoded, (0, 0, 0), downscale, where, resize)
+        pixels = torch.from_numpy(decoded) if is_kept else images.composite(decoded, (0, 0, 0), reduced, resize)
         time = (image.frame - first) / max(1, last - first)
         return View(image.path.stem, cameras[image.camera], time, pixels), files.digest(data)
 

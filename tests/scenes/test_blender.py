@@ -210,6 +210,8 @@ def test_an_unknown_filter_is_told(tiny: Path) -> None:
 
 def test_focal_length_and_principal_point_from_the_file(tiny: Path) -> None:
     """Catches fl_x and its companions ignored, swapped or not scaled, and a fl_y that does not fall back to fl_x."""
+    for split in ("train", "test"):
+        edit(tiny, lambda c: c.pop("camera_angle_x"), split)
     edit(tiny, lambda c: c.update(fl_x=10.0, fl_y=12.0, cx=3.0, cy=5.0, w=8, h=6))
     edit(tiny, lambda c: c.update(fl_x=10.0), "test")
     scene = scenes.load(tiny, downscale=2)

@@ -195,7 +195,7 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
     assert plain is not None
     assert moved is not None
     assert moved["psnr"] == pytest.approx(plain["psnr"], abs=0.01)
-    assert "trained in units of 100" in " ".join(records["moved"].protocol["notes"])
+    assert "trained in units of 100" in " ".join(records["moved"].provenance.data_notes)
     there = 100 * trained["plain"].means + torch.tensor(offset)
     torch.testing.assert_close(trained["moved"].means, there, rtol=0, atol=0.05)
     torch.testing.assert_close(

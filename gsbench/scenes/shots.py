@@ -1,0 +1,123 @@
+"""Read the images of a scene, undo the distortion of lenses and reduce the images: shots become views."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.scenes import files, images
+from gsbench.scenes.lens import Lens
+from gsbench.scenes.scene import Camera, View
+
+MASKS = "masks"  # the folder with the object number of each pixel, in PNG files
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Hold the checked description of an image; the image itself is not read yet."""
+
+    path: Path
+    mask: Path | None  # file of the object number of each pixel
+    name: str  # of the view: relative to the folder of the scene or of the images, without suffix
+    where: str  # the path and the file that names it, for messages
+    time: float | None
+    viewmat: Tensor  # [4, 4] float64
+    lens: Lens  # its size is that of the image, or larger by one ratio
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Hold the views of shots in their order, the SHA-256 of their image files, and what was decided about sizes."""
+
+    views: list[View]
+    digests: list[str]
+    notes: list[str]
+
+
+def size_of(path: Path, where: str) -> tuple[int, int]:
+    """Return the width and height of an image file in pixels; raise InputError if it is not a whole PNG or JPEG."""
+    return images.photo_size(images.read_image(path, where), where)
+
+
+def read(
+    shots: Sequence[Shot],  # at least one
+    *,
+    downscale: int,
+    background: tuple[float, float, float],
+    resize: str | None,
+) -> Shots:
+    """Read all images by several threads.
+
+    Images of a small scene are stored as floats, those of a large scene in 8 bits. K is scaled as the image is, by the
+    ratio of the sizes along each axis.
+
+    Raises:
+        InputError: an image is damaged, its size is not its camera's nor smaller by one ratio, the images differ in
+            size, or an image with alpha has a lens with distortion; the message names the file.
+    """
+    first = shots[0]
+    data = images.read_image(first.path, first.where)
+    size = images.photo_size(data, first.where)
+    reduced = images.reduced_size(size, downscale, first.where)
+    in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
+
+    def read_one(shot: Shot) -> tuple[View, str]:
+        data = images.read_image(shot.path, shot.where)
+        lens = _lens_of_image(images.photo_size(data, shot.where), size, shot)
+        decoded = images.decode_photo(data, shot.where)
+        if decoded.shape[2] == 4 and any(lens.distortion):
+            raise InputError(f"{shot.where}: expected an image without alpha, as its camera has distortion: undo it by "
+                             "`colmap image_undistorter`")  # fmt: skip
+        pixels = lens.undistort(decoded, shot.where)
+        is_kept = in_8_bits and pixels.dtype == np.uint8
+        image = torch.from_numpy(pixels) if is_kept else images.composite(pixels, background, reduced, resize)
+        K = np.diag([reduced[0] / size[0], reduced[1] / size[1], 1]) @ lens.pinhole()
+        camera = Camera(shot.viewmat, torch.from_numpy(K.astype(np.float32)), image.shape[1], image.shape[0])
+        alpha = None if is_kept else images.alpha_of(decoded, reduced)
+        regions = None if shot.mask is None else _read_mask(shot, shot.mask, lens, reduced)
+        return View(shot.name, camera, shot.time, image, background, alpha, regions), files.digest(data)
+
+    kept = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # bytes a pixel, alpha and mask too
+    threads = images.count_readers(size, len(shots), downscale, first.where, kept)
+    with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
+        views, digests = zip(*pool.map(read_one, shots), strict=True)
+    return Shots(list(views), list(digests), _notes(shots, size, reduced, downscale))
+
+
+def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot) -> Lens:
+    """Return the lens in pixels of the image; raise InputError if its size is not its camera's or the first image's."""
+    lens = shot.lens.resized(*size)
+    if lens is None:
+        stated = f"{shot.lens.width}x{shot.lens.height}"
+        raise InputError(f"{shot.where}: expected {stated} as its camera, or smaller by one ratio, got {size[0]}x{size[1]}: "
+                         "use the images that the camera was computed from, and scene.downscale")  # fmt: skip
+    if size != expected:
+        raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
+                         f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip
+    return lens
+
+
+def _notes(shots: Sequence[Shot], size: tuple[int, int], reduced: tuple[int, int], downscale: int) -> list[str]:
+    """Return sentences on images that are smaller than their cameras, and on sizes that `downscale` does not divide."""
+    notes = []
+    cameras = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
+    if cameras:
+        notes.append(f"images of {size[0]}x{size[1]} are smaller than their camera of {cameras[0][0]}x{cameras[0][1]}, "
+                     "whose intrinsics are scaled to them")  # fmt: skip
+    if (reduced[0] * downscale, reduced[1] * downscale) != size:
+        notes.append(f"images of {size[0]}x{size[1]} are reduced to {reduced[0]}x{reduced[1]}, as {downscale} does not "
+                     "divide their size")  # fmt: skip
+    return notes
+
+
+def _read_mask(shot: Shot, path: Path, lens: Lens, size: tuple[int, int]) -> Tensor:  # [H, W] 8 bits
+    """Read and undistort the mask of an image: a PNG with the number of the object in each pixel."""
+    where = f"{path} (the mask of {shot.name}{shot.path.suffix}; without a folder '{MASKS}' a scene has no regions)"
+    numbers = images.decode_regions(images.read_image(path, where), (lens.width, lens.height), where)
+    return images.subsample(lens.undistort(numbers, where, cv2.INTER_NEAREST), size)

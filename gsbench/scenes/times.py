@@ -1,0 +1,414 @@
+"""Determine the times of views: from numbers in the names of images, from times.csv, or from fields of a file.
+
+Names have numbers of frames, of cameras, of takes and of pixels. Which one is the time follows from the cameras: images
+with the same pose and intrinsics are of one fixed camera, whose own number is constant there and whose time is not.
+"""
+
+import csv
+import re
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsbench.errors import InputError
+from gsbench.scenes.files import without_suffix
+
+TABLE = "times.csv"
+DOCS = "data.md#times"
+_LARGEST = 1e30  # the largest time, in any unit
+_LONGEST = 100  # digits of a number that is read exactly
+_SAME_PLACE = 6  # decimals, relative to the radius of the cameras: poses that agree to them are one place
+_CLEARLY = 10.0  # a camera moves this many times less between neighbouring times than between cameras
+_FEW = 0.1  # a file whose times lie in [0, 1], a smaller share of all times than this, has another unit than the others
+_NUMBER = re.compile(r"(?:(?<![^=/_])-)?[0-9]+(?:\.[0-9]+)?")  # "-" is a sign at the start and after = / _
+_CLOCK = (
+    r"(?P<H>[01]\d|2[0-3])(?P<c>{})(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d)(?:[-_.,]?(?P<f>\d{{3}}|\d{{6}}|\d{{9}}))?(?!\d)"
+)
+_DATE = r"(?<!\d)(?P<Y>(?:19|20)\d\d)(?P<d>[-_.]?)(?P<m>0[1-9]|1[0-2])(?P=d)(?P<D>0[1-9]|[12]\d|3[01])"
+_MOMENTS = (
+    re.compile(_DATE + r"(?:[-_ T]| at )?" + _CLOCK.format("[-_.:]?"), re.ASCII),  # 2023-05-01_12-30-59
+    re.compile(r"(?<!\d)" + _CLOCK.format("[-:]"), re.ASCII),  # 12-30-59
+)
+_CAMERA_WORDS = ("cam", "camera")
+_TIME_WORDS = ("frame", "time", "timestamp", "t")
+
+
+@dataclass(frozen=True)
+class Times:
+    """Hold the time of each view in [0, 1], or None for each, and sentences that say where they are from."""
+
+    values: list[float | None]
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class _Number:
+    """Hold a number in a name."""
+
+    value: Fraction
+    label: str  # the text before it, from the number before or from the folder on
+    is_moment: bool = False  # a date and time of day, or a time of day, in seconds
+
+    @property
+    def word(self) -> str:
+        """The last word before the number, in lower case."""
+        return (re.findall("[a-z]+", self.label.lower()) or [""])[-1]
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Hold the numbers at the same place of all names."""
+
+    numbers: tuple[_Number, ...]
+    place: int  # from 1
+    count: int  # of numbers in the first name
+
+    @property
+    def values(self) -> list[Fraction]:
+        """The numbers."""
+        return [number.value for number in self.numbers]
+
+    @property
+    def words(self) -> set[str]:
+        """The words before the numbers."""
+        return {number.word for number in self.numbers}
+
+
+def places_of(
+    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
+    lenses: Sequence[Hashable],  # what is equal for equal intrinsics
+) -> list[Hashable]:
+    """Return a key of each view that is equal for views with the same pose and intrinsics: those of a fixed camera."""
+    poses = np.round(_relative(viewmats), _SAME_PLACE) + 0.0  # -0 becomes 0
+    return [(pose.tobytes(), lens) for pose, lens in zip(poses, lenses, strict=True)]
+
+
+def of_names(
+    names: Sequence[str],  # of images, with folders
+    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
+    places: Sequence[Hashable],  # from `places_of`
+    source: Path,  # the file that names the images, for messages
+) -> Times:
+    """Return the time of each image from a number in its name, scaled to [0, 1]; None for all without such numbers.
+
+    Raises:
+        InputError: only some names have numbers, it cannot be told which number is the time, or two images of a fixed
+            camera have the same time.
+    """
+    columns = _columns(names, source)
+    changing = [column for column in columns if len(set(column.values)) > 1]
+    if not changing:
+        if columns:
+            _check_distinct(names, [Fraction(0)] * len(names), places, f"{source}: ")
+        why = "the numbers in the names do not change" if columns else "the names have no numbers"
+        return Times([None] * len(names), [f"times: none, as {why} and there is no {TABLE}"])
+    column = _time_among(changing, names, viewmats, places, source)
+    if column is None:
+        note = f"times: none, as the names have only the number of the camera; write {TABLE} if the scene moves"
+        return Times([None] * len(names), [note])
+    _check_distinct(names, column.values, places, f"{source}: ")
+    return Times([*_scaled(column.values)], [_described(column, names)])
+
+
+def of_table(
+    data: bytes,  # of times.csv
+    path: Path,
+    names: Sequence[str],  # of images, with folders
+    places: Sequence[Hashable],  # from `places_of`
+) -> Times:
+    """Return the time of each image from times.csv, scaled to [0, 1]; None for all if all times are equal.
+
+    The table has a first line with `name` and `time`, in any case and order. Columns are separated by commas,
+    semicolons or tabs. Blank lines, other columns and rows of other images are left out. Names may lack their suffix.
+
+    Raises:
+        InputError: the table is not such a table, lacks an image, or gives two images of a fixed camera the same time.
+    """
+    try:
+        lines = data.decode("utf-8-sig").splitlines()
+        head = next((line for line in lines if line.strip()), "")
+        separator = next((mark for mark in ",;\t" if mark in head), ",")
+        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, strict=True)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: expected a table name,time: {error}", docs=DOCS) from None
+    filled = [(number, row) for number, row in enumerate(rows, 1) if any(row)]
+    columns = [cell.lower() for cell in filled[0][1]] if filled else []
+    if any(columns.count(key) != 1 for key in ("name", "time")):
+        raise InputError(f"{path}: expected the first line name,time, got {','.join(columns)[:60]!a}", docs=DOCS)
+    table: dict[str, float] = {}
+    for number, row in filled[1:]:
+        cells = dict(zip(columns, row, strict=False))
+        name, text = cells.get("name", ""), cells.get("time", "")
+        if len(row) < len(columns) or any(row[len(columns) :]) or not name or name in table:
+            raise InputError(f"{path}: line {number}: expected a name, once, and its time, got {','.join(row)[:60]!a}")
+        table[name] = _number(text.replace(",", ".") if separator == ";" else text, f"{path}: line {number}")
+    loose: dict[str, list[str]] = defaultdict(list)
+    for name in table:
+        loose[_loose(name)].append(name)
+    used = [name if name in table else next(iter(loose.get(_loose(name), [""]))) for name in names]
+    missing = next((name for name, row in zip(names, used, strict=True) if not row), None)
+    if missing is not None:
+        raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
+                         docs=DOCS)  # fmt: skip
+    values = [Fraction(table[name]) for name in used]
+    spare = len(table) - len(set(used))
+    rest = f"; {spare} rows of other images are left out" if spare else ""
+    others = [name for name in columns if name not in ("name", "time")]
+    rest += f"; columns that are not read: {', '.join(others)[:60]!a}" if any(others) else ""
+    if len(set(values)) == 1:
+        return Times([None] * len(names), [f"times: none, as all times of {TABLE} are equal{rest}"])
+    _check_distinct(names, values, places, f"{path}: ")
+    first, last = float(min(values)), float(max(values))
+    return Times([*_scaled(values)], [f"times: {TABLE}, {first:.10g} to {last:.10g}, scaled to [0, 1]{rest}"])
+
+
+def of_fields(
+    values: Mapping[str, Sequence[float]],  # the field `time` of each frame, by the file that has it
+) -> tuple[dict[str, list[float | None]], list[str]]:
+    """Return the times of each file's frames in [0, 1], and sentences on what was done.
+
+    Times in [0, 1] stay as they are. Others, such as seconds or numbers of frames, are scaled over all files together.
+    If all are equal, the scene has no times.
+
+    Raises:
+        InputError: the files have times in different units.
+    """
+    listed = [value for times in values.values() for value in times]
+    first, last = min(listed), max(listed)
+    if first == last and len(listed) > 1:
+        none: dict[str, list[float | None]] = {file: [None] * len(times) for file, times in values.items()}
+        return none, [f"times: none, as all times are {first:.10g}"]
+    if first >= 0 and last <= 1:
+        return {file: [*times] for file, times in values.items()}, []
+    for file, times in values.items():
+        is_small = 0 <= min(times) < max(times) <= 1
+        if is_small and max(times) - min(times) < _FEW * (last - first):
+            raise InputError(f"{file}: time: expected the unit of the other files, got {min(times):.10g} to "
+                             f"{max(times):.10g}, and over all files {first:.10g} to {last:.10g}: scale all to [0, 1]",
+                             docs=DOCS)  # fmt: skip
+    scaled = iter(_scaled([Fraction(value) for value in listed]))
+    note = f"times: the field 'time', {first:.10g} to {last:.10g}, scaled to [0, 1] over all splits"
+    return {file: [next(scaled) for _ in times] for file, times in values.items()}, [note]
+
+
+def check_distinct(
+    names: Sequence[str],  # of images
+    times: Sequence[float | None],
+    places: Sequence[Hashable],  # from `places_of`
+    where: str,  # the file, for the message
+) -> None:
+    """Raise InputError if two images of a fixed camera have the same time."""
+    if all(time is not None for time in times):
+        _check_distinct(
+            names, [Fraction(time or 0.0) for time in times], places, f"{where}: ", "give them their own times"
+        )
+
+
+def _check_distinct(
+    names: Sequence[str],
+    values: Sequence[Fraction],
+    places: Sequence[Hashable],
+    where: str,
+    cure: str = f"write {TABLE}, or correct it",
+) -> None:
+    seen: dict[tuple[Hashable, Fraction], str] = {}
+    for name, value, place in zip(names, values, places, strict=True):
+        other = seen.setdefault((place, value), name)
+        if other != name:
+            raise InputError(f"{where}images {other[:80]!a} and {name[:80]!a}: expected different times, as their pose "
+                             f"and intrinsics are equal, got the same: {cure}", docs=DOCS)  # fmt: skip
+
+
+def _columns(names: Sequence[str], source: Path) -> list[_Column]:
+    """Return the numbers that all names have, place by place from the right."""
+    numbers = _numbers(names, source)
+    least = min(len(one) for one in numbers)
+    if not least and any(numbers):
+        name = next(name for name, one in zip(names, numbers, strict=True) if not one)
+        raise InputError(f"{source}: image {name[:80]!a}: expected a number in its name, as others have: rename it, or "
+                         f"write {TABLE}", docs=DOCS)  # fmt: skip
+    columns = [_Column(tuple(one[at] for one in numbers), len(numbers[0]) + at + 1, len(numbers[0]))
+               for at in range(-least, 0)]  # fmt: skip
+    if len({len(one) for one in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
+        few, many = (next(name for name, one in zip(names, numbers, strict=True) if len(one) == count)
+                     for count in (least, max(map(len, numbers))))  # fmt: skip
+        raise InputError(f"{source}: images {few[:60]!a} and {many[:60]!a}: expected names of one form, the first has "
+                         f"fewer numbers: rename them, or write {TABLE}", docs=DOCS)  # fmt: skip
+    return columns
+
+
+def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
+    """Return the numbers of each name; a date and time of day that every name has once is one number."""
+    plain = [without_suffix(name.replace("\\", "/")) for name in names]
+    moments: list[re.Match[str] | None] = [None] * len(names)
+    for pattern in _MOMENTS:
+        matches = [list(pattern.finditer(name)) for name in plain]
+        if all(len(one) == 1 for one in matches):
+            moments = [one[0] for one in matches]
+            break
+    found = []
+    for name, moment in zip(plain, moments, strict=True):
+        numbers, at = [], 0
+        inside = moment.span() if moment else (-1, -1)
+        spans = [match.span() for match in _NUMBER.finditer(name)]
+        spans = [(a, b) for a, b in spans if b <= inside[0] or a >= inside[1]] if moment else spans
+        for start, end in sorted([*spans, *([inside] if moment else [])]):
+            label = name[at:start].rpartition("/")[2]
+            is_moment = moment is not None and (start, end) == inside
+            value = _seconds(moment, source) if is_moment and moment else _exact(name[start:end], source)
+            numbers.append(_Number(value, label, is_moment))
+            at = end
+        found.append(numbers)
+    return found
+
+
+def _seconds(moment: re.Match[str], source: Path) -> Fraction:
+    """Return a date and time of day, or a time of day, in seconds."""
+    parts = moment.groupdict()
+    fraction = Fraction(int(parts["f"] or 0), 10 ** len(parts["f"] or ""))
+    try:
+        year, month, day = (int(parts.get(key) or 1) for key in "YmD")
+        days = date(year, month, day).toordinal()
+    except ValueError:
+        raise InputError(f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
+                         docs=DOCS) from None  # fmt: skip
+    return days * 86400 + int(parts["H"]) * 3600 + int(parts["M"]) * 60 + int(parts["S"]) + fraction
+
+
+def _exact(text: str, source: Path) -> Fraction:
+    """Convert a number in a name exactly: nanoseconds of a clock have more digits than a float."""
+    number = _number(text, f"{source}: image {text[:40]}")
+    return Fraction(text) if len(text) < _LONGEST else Fraction(number)
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        number = float(text) if "_" not in text else np.nan
+    except ValueError:
+        number = np.nan
+    if not abs(number) <= _LARGEST:
+        raise InputError(f"{where}: expected a time, got {text[:40]!a}", docs=DOCS)
+    return number
+
+
+def _time_among(
+    changing: list[_Column],
+    names: Sequence[str],
+    viewmats: NDArray[np.float64],  # [N, 4, 4]
+    places: Sequence[Hashable],
+    source: Path,
+) -> _Column | None:
+    """Return the column that is the time; None if the only one is the number of the camera.
+
+    The time changes while a camera stays where it is. Without fixed cameras, words before the numbers decide, then how
+    far cameras move from one number to the next.
+    """
+    candidates = [column for column in changing if _changes_at_a_place(column, places)]
+    if not candidates:
+        if max(Counter(places).values()) > 1:
+            first, second = _pair_at_a_place(names, places)
+            raise InputError(f"{source}: images {first[:60]!a} and {second[:60]!a}: expected a number that changes, as "
+                             f"their pose and intrinsics are equal: write {TABLE}", docs=DOCS)  # fmt: skip
+        candidates = [column for column in changing if not column.words & {*_CAMERA_WORDS}]
+        if not candidates:
+            if len(changing) == 1:
+                return None
+            candidates = changing
+    candidates = _without_copies(candidates)
+    if len(candidates) > 1:
+        named = [column for column in candidates if column.words <= {*_TIME_WORDS}]
+        candidates = named if len(named) == 1 else _steadiest(candidates, changing, names, viewmats)
+    if len(candidates) == 1:
+        return candidates[0]
+    listed = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
+    raise InputError(f"{source}: image {names[0][:80]!a}: expected one number that is the time, got {listed}, which "
+                     f"all change from image to image: write {TABLE}", docs=DOCS)  # fmt: skip
+
+
+def _changes_at_a_place(column: _Column, places: Sequence[Hashable]) -> bool:
+    """Return whether the number changes within the images of a fixed camera."""
+    first: dict[Hashable, Fraction] = {}
+    return any(first.setdefault(place, value) != value for place, value in zip(places, column.values, strict=True))
+
+
+def _pair_at_a_place(names: Sequence[str], places: Sequence[Hashable]) -> tuple[str, str]:
+    """Return the names of two images of a fixed camera."""
+    first: dict[Hashable, str] = {}
+    return next(pair for name, place in zip(names, places, strict=True)
+                if (pair := (first.setdefault(place, name), name))[0] != name)  # fmt: skip
+
+
+def _without_copies(columns: list[_Column]) -> list[_Column]:
+    """Leave out columns whose times would be those of a later one, such as frame_0003/0003.png."""
+    scaled = [_scaled(column.values) for column in columns]
+    return [column for i, column in enumerate(columns) if scaled[i] not in scaled[i + 1 :]]
+
+
+def _steadiest(
+    candidates: list[_Column], changing: list[_Column], names: Sequence[str], viewmats: NDArray[np.float64]
+) -> list[_Column]:
+    """Return the column from number to number of which cameras clearly move least; otherwise all candidates.
+
+    Numbers that only repeat the order of each other, such as a frame and its time stamp, leave the one with decimals.
+    """
+    poses = _relative(viewmats)
+    steps = [_step(column, [other for other in changing if other is not column], names, poses) for column in candidates]
+    moving = sorted((step, i) for i, step in enumerate(steps) if step is not None)
+    if moving and (len(moving) == 1 or moving[0][0] * _CLEARLY < moving[1][0]):
+        return [candidates[moving[0][1]]]
+    orders = [sorted(range(len(names)), key=column.values.__getitem__) for column in candidates]
+    decimal = [column for column in candidates if any(value.denominator > 1 for value in column.values)]
+    return decimal if not moving and len(decimal) == 1 and orders.count(orders[0]) == len(orders) else candidates
+
+
+def _step(column: _Column, others: list[_Column], names: Sequence[str], poses: NDArray[np.float64]) -> float | None:
+    """Return by how much poses change on average from one number to the next while the rest of the name stays."""
+    groups: dict[Hashable, list[int]] = defaultdict(list)
+    for i, name in enumerate(names):
+        groups[(re.sub("[0-9]+", "#", name), *(other.values[i] for other in others))].append(i)
+    values, lengths = column.values, []
+    for group in groups.values():
+        ordered = sorted(group, key=values.__getitem__)
+        lengths += [float(np.linalg.norm(poses[a] - poses[b])) for a, b in pairwise(ordered)]
+    return sum(lengths) / len(lengths) if lengths else None
+
+
+def _relative(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 4, 4] -> [N, 12]
+    """Return rotations, and positions relative to the radius of the cameras, so that a scene's unit does not matter."""
+    rotations = viewmats[:, :3, :3]
+    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
+    centers -= centers.mean(0)
+    radius = np.linalg.norm(centers, axis=1).max() or 1.0
+    return np.concatenate([rotations.reshape(-1, 9), centers / radius], 1)
+
+
+def _scaled(values: Sequence[Fraction]) -> list[float]:
+    """Map the first time to 0 and the last, which differs, to 1."""
+    first = min(values)
+    length = max(values) - first
+    return [float((value - first) / length) for value in values]
+
+
+def _described(column: _Column, names: Sequence[str]) -> str:
+    """Return a sentence that says which number of the names is the time, its range and its unit."""
+    first, last = float(min(column.values)), float(max(column.values))
+    if column.numbers[0].is_moment:
+        what, unit = "the clock time", "seconds"
+    else:
+        what = "the number" if column.count == 1 else f"number {column.place} of {column.count}"
+        unit = "decimals" if any(value.denominator > 1 for value in column.values) else "whole numbers"
+    ends = f"{last - first:.10g} seconds" if column.numbers[0].is_moment else f"{first:.16g} to {last:.16g} ({unit})"
+    at = min(range(len(names)), key=column.values.__getitem__)
+    return f"times: {what} in each name, {ends}, scaled to [0, 1]; {names[at][:80]!a} is the first"
+
+
+def _loose(name: str) -> str:
+    """Return the name of an image without suffix, without the folder of the images, and with / for backslashes."""
+    return without_suffix(name.replace("\\", "/").removeprefix("./").removeprefix("images/"))

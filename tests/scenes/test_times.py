@@ -1,0 +1,229 @@
+"""Which number of a name is the time: the kinds of names that captures have, fixed and moving cameras, and tables."""
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture import circle
+
+from gsbench.errors import InputError
+from gsbench.scenes import times
+
+SOURCE = Path("images.txt")
+CAMERAS, FRAMES = 4, 5
+
+
+def fixed(names: Callable[[int, int], str], seed: int = 0) -> tuple[list[str], np.ndarray, list[float]]:
+    """Names and poses of a rig of fixed cameras in random order, and the true times."""
+    listed = [(camera, frame) for camera in range(CAMERAS) for frame in range(FRAMES)]
+    listed = [listed[i] for i in np.random.default_rng(seed).permutation(len(listed))]
+    poses = circle(CAMERAS)
+    return (
+        [names(*one) for one in listed],
+        np.stack([poses[camera] for camera, _ in listed]),
+        [f / (FRAMES - 1) for _, f in listed],
+    )
+
+
+def nudged(viewmats: np.ndarray) -> np.ndarray:
+    """Poses that differ a little for each image, as COLMAP estimates them."""
+    moved = viewmats.copy()
+    moved[:, :3, 3] += 1e-3 * np.random.default_rng(1).standard_normal((len(moved), 3))
+    return moved
+
+
+def of_names(names: Sequence[str], viewmats: np.ndarray) -> times.Times:
+    return times.of_names(names, viewmats, times.places_of(viewmats, [0] * len(names)), SOURCE)
+
+
+FORMS: dict[str, Callable[[int, int], str]] = {
+    "frame_0003/cam01": lambda c, f: f"frame_{f:04d}/cam{c:02d}.png",
+    "cam01/frame_0003": lambda c, f: f"cam{c:02d}/frame_{f:04d}.png",
+    "frame_0003_cam01": lambda c, f: f"frame_{f:04d}_cam{c:02d}.png",
+    "cam01_0003": lambda c, f: f"cam{c:02d}_{f:04d}.jpg",
+    "3/1": lambda c, f: f"{f}/{c}.png",
+    "1/3": lambda c, f: f"{c}/{f}.png",
+    "0003_cam01_1080p": lambda c, f: f"{f:04d}_cam{c:02d}_1080p.png",
+    "00003_left": lambda c, f: f"{f:05d}_{'abcd'[c]}.png",
+    "left/00003": lambda c, f: f"{'abcd'[c]}/{f:05d}.png",
+    "cam01/t=0.75": lambda c, f: f"cam{c}/t={f / 4}.png",
+    "cam01/1305031102.175304": lambda c, f: f"cam{c}/13050311{f:02d}.000000.png",
+    "cam1/2023-05-01_12-30-59": lambda c, f: f"cam{c}/2023-05-01_12-{29 + (f + 57) // 60}-{(f + 57) % 60:02d}.png",
+    "frame_0003/0003_cam01": lambda c, f: f"frame_{f:04d}/{f:04d}_cam{c:02d}.png",
+    "frame-000003.color": lambda c, f: f"view{c}/frame-{f:06d}.color.png",
+    r"cam01\0003": lambda c, f: f"cam{c:02d}\\{f:04d}.PNG",
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_time_of_a_rig(form: str, moves: bool) -> None:
+    """Catches the number of the camera taken for the time, in any order of folders, where poses repeat and nearly do."""
+    names, viewmats, expected = fixed(FORMS[form])
+    found = of_names(names, nudged(viewmats) if moves else viewmats)
+    assert found.values == pytest.approx(expected)
+    (note,) = found.notes
+    assert note.startswith("times: ")
+    assert "scaled to [0, 1]" in note
+
+
+MOVING: dict[str, Callable[[int], str]] = {
+    "IMG_0003": lambda i: f"IMG_{i:04d}.JPG",
+    "clip_0003_1080p": lambda i: f"clip_{i:04d}_1080p.png",
+    "4k_0003": lambda i: f"video_4k_{i:04d}.png",
+    "r_3": lambda i: f"r_{i}.png",
+    "1305031102.175304": lambda i: f"{1305031102.95 + i / 10:.6f}.png",
+    "nanoseconds": lambda i: f"{1403636579763555584 + 100 * i}.png",
+    "IMG_20230501_235958": lambda i: f"IMG_202305{1 + (i > 1):02d}_{'2359' if i < 2 else '0000'}{(58 + i) % 60:02d}.jpg",
+    "20230501_123059_500": lambda i: f"20230501_{'123059' if i < 2 else '123100'}_{500 * (i % 2):03d}.png"
+    if i < 4
+    else f"20230501_{123100 + (i - 2) // 2}_{500 * (i % 2):03d}.png",
+    "PXL_20230501_123059500": lambda i: f"PXL_20230501_1230{40 + i:02d}500.jpg",
+    "2023-05-01 at 12.30.59": lambda i: f"Shot 2023-05-01 at 12.{29 + (i + 55) // 60}.{(i + 55) % 60:02d}.png",
+    "12-30-59": lambda i: f"12-{29 + (i + 55) // 60}-{(i + 55) % 60:02d}.png",
+    "negative": lambda i: f"t={i - 4}.png",
+    "signs": lambda i: f"frame_{i - 4}.png",
+    "a dash": lambda i: f"video-{i:03d}.png",
+    "index and stamp": lambda i: f"{i:04d}_{100 + i / 10:.3f}.png",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", MOVING)
+def test_the_time_of_a_moving_camera(form: str) -> None:
+    """Catches the size of the picture, the digits after the point, and the seconds of a clock taken for the time."""
+    count = 10
+    names = [MOVING[form](i) for i in range(count)]
+    assert len(set(names)) == count
+    order = np.random.default_rng(0).permutation(count)
+    found = of_names([names[i] for i in order], circle(count)[order])
+    assert found.values == pytest.approx([i / (count - 1) for i in order])
+
+
+@pytest.mark.parametrize("form", ["frame_0003/cam01", "0003/1"])
+def test_two_cameras_that_move(form: str) -> None:
+    """Catches the last number, that of the camera, where no pose repeats: words decide, or else the shorter steps."""
+    listed = [(f, c) for f in range(8) for c in range(2)]
+    path = circle(200)
+    viewmats = np.stack([path[f + 100 * c] for f, c in listed])
+    write = (lambda f, c: f"frame_{f:04d}/cam{c:02d}.png") if "cam" in form else (lambda f, c: f"{f:04d}/{c}.png")
+    assert of_names([write(*one) for one in listed], viewmats).values == pytest.approx([f / 7 for f, _ in listed])
+
+
+def test_no_time() -> None:
+    """Catches times from numbers that do not change, from those of a still rig, and from nowhere."""
+    for names in ([f"{letter}_1080p.png" for letter in "abcde"], [*"abcde"], [f"cam{i:02d}.png" for i in range(5)]):
+        found = of_names(names, circle(5))
+        assert found.values == [None] * 5
+        assert "times: none" in found.notes[0]
+
+
+REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
+    "a camera's number alone": ([f"cam{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.repeat(circle(4), 2, 0),
+                                "'cam0_a.png' and 'cam0_b.png'.*a number that changes"),
+    "equal": ([f"{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.tile(circle(1), (8, 1, 1)),
+              "'0_a.png' and '0_b.png'.*expected different times"),
+    "constant": ([f"{'abcd'[i]}_1080p.png" for i in range(4)], np.tile(circle(1), (4, 1, 1)), "expected different times"),
+    "two that contradict": ([f"{i}_{(3 * i) % 7}.png" for i in range(7)], circle(7), "one number that is the time, got 0, 0"),
+    "of takes": ([f"{i // 5}_{i % 5}.png" for i in range(10)], np.tile(circle(1), (10, 1, 1)), "one number that is"),
+    "some without": (["a.png", "b_1.png"], circle(2), "'a.png': expected a number in its name"),
+    "of two forms": (["IMG_20230501_123059.jpg", "IMG_20230501_123059_1.jpg"], circle(2), "expected names of one form"),
+    "endless": (["9" * 5000, "1"], circle(2), "expected a time"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_contradictory_names_are_refused(kind: str) -> None:
+    """Catches views of one camera at one time, and a guess where several numbers change."""
+    names, viewmats, words = REFUSED[kind]
+    with pytest.raises(InputError, match=words) as caught:
+        of_names(names, viewmats)
+    assert "\n" not in str(caught.value)
+    assert "times.csv" in str(caught.value) or kind == "endless"
+
+
+def test_digits_beyond_a_float_count() -> None:
+    """Catches nanoseconds of a clock that are rounded, and a number of thousands of decimals that stops Python."""
+    names = [f"{10**18 + i}.png" for i in range(3)]
+    assert of_names(names, circle(3)).values == [0, 0.5, 1]
+    assert of_names(["0." + "1" * 5000, "1.0", "0.0"], circle(3)).values[1:] == [1, 0]
+
+
+TABLES = {
+    "plain": "name,time\na.png,1\nb.png,2\nc.png,4\n",
+    "case": "Name,TIME\na.png,1\nb.png,2\nc.png,4",
+    "blank lines": "\nname,time\n\na.png,1\nb.png,2\n  \nc.png,4\n\n,\n",
+    "spaces": " name , time \n a.png , 1 \nb.png, 2\nc.png,4 ",
+    "another column": "frame,name,time,note\n0,a.png,1,x\n1,b.png,2,\n2,c.png,4,y\n",
+    "byte order mark": "\ufeffname,time\na.png,1\nb.png,2\nc.png,4\n",
+    "semicolons": "name;time\na.png;1,0\nb.png;2,0\nc.png;4,0\n",
+    "tabs": "name\ttime\na.png\t1\nb.png\t2\nc.png\t4\n",
+    "carriage returns": "name,time\r\na.png,1\r\nb.png,2\r\nc.png,4\r\n",
+    "without suffix": "name,time\na,1\nb,2\nc,4\n",
+    "with the folder": "name,time\nimages/a.png,1\n./b.png,2\nimages\\c.png,4\n",
+    "another suffix": "name,time\na.jpg,1\nb.JPG,2\nc.jpeg,4\n",
+    "quotes": '"name","time"\n"a.png","1"\n"b.png","2"\n"c.png","4"\n',
+    "rows of others": "name,time\na.png,1\nb.png,2\nc.png,4\nd.png,99\n",
+}
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_tables_as_programs_write_them(kind: str) -> None:
+    """Catches a table that is refused for what a spreadsheet adds to it."""
+    names = ["a.png", "b.png", "c.png"]
+    found = times.of_table(TABLES[kind].encode(), Path("times.csv"), names, names)
+    assert found.values == pytest.approx([0, 1 / 3, 1])
+    assert ("left out" in found.notes[0]) == (kind == "rows of others")
+    assert ("'frame, note'" in found.notes[0]) == (kind == "another column")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("name,time,time\na,1,1\n", "first line name,time"),
+        ("name;time\na;1\nb\n", "line 3: expected a name"),
+        ("name,time\na,1_0\nb,2\n", "line 2: expected a time"),
+        ("name,time\na,1\nb,1\nc,2\n", "'a' and 'b': expected different times"),
+        ("name,time\na,1\nb,2\n", "got none of 'c'"),
+    ],
+)
+def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) -> None:
+    """Catches two images of one camera at one time, and a row of another length."""
+    with pytest.raises(InputError, match=words):
+        times.of_table(content.encode(), Path("times.csv"), ["a", "b", "c"], [0, 0, 0])
+
+
+def test_a_table_of_equal_times_is_a_still_scene() -> None:
+    """Catches a division by zero, and a scene of many cameras at one moment that is called moving."""
+    found = times.of_table(b"name,time\na,3\nb,3\n", Path("times.csv"), ["a", "b"], [0, 1])
+    assert found.values == [None, None]
+
+
+def test_fields_are_scaled_over_all_files() -> None:
+    """Catches splits that are scaled apart, times in [0, 1] that are changed, and seconds beside shares of the clip."""
+    assert times.of_fields({"a": [0.0, 0.3], "b": [0.1]}) == ({"a": [0.0, 0.3], "b": [0.1]}, [])
+    found, (note,) = times.of_fields({"a": [0.0, 30.0], "b": [15.0, 40.0]})
+    assert found == {"a": [0, 0.75], "b": [0.375, 1]}
+    assert "0 to 40" in note
+    assert times.of_fields({"a": [-1.0, 1.0]})[0] == {"a": [0, 1]}
+    assert times.of_fields({"a": [0.5, 0.5], "b": [0.5]})[0] == {"a": [None, None], "b": [None]}
+    with pytest.raises(InputError, match="b: time: expected the unit of the other files"):
+        times.of_fields({"a": [0.0, 59.0], "b": [0.0, 0.5, 1.0]})
+
+
+def test_places_do_not_depend_on_the_unit() -> None:
+    """Catches a tolerance in world units: one place for all cameras of a small scene, or many for one far away."""
+    for factor in (1e-4, 1, 1e5):
+        viewmats = np.repeat(circle(6), 2, 0)
+        viewmats[:, :3, 3] *= factor
+        viewmats[1::2, :3, 3] *= 1 + 1e-9
+        places = times.places_of(viewmats, [0] * 12)
+        assert len(set(places)) == 6
+        assert places[::2] == places[1::2]
+        assert len(set(times.places_of(viewmats, [0, 1] * 6))) == 12
+
+
+def test_exact_fractions() -> None:
+    """Catches 0.1 that is not a tenth: two time stamps that differ by it must be one step apart."""
+    assert times._exact("0.1", SOURCE) == Fraction(1, 10)
