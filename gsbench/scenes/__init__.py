@@ -4,7 +4,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ class _Layout:
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
     reader: str  # module of this package with load(root, *, downscale, background, resize); imported when it is needed
+    reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
 
 
 _LAYOUTS = (
@@ -37,6 +38,7 @@ _LAYOUTS = (
         "cameras_parameters.txt beside images <Scene>_undist_<frame>_<camera>.png (Technicolor: by request to the "
         "authors of Sabater et al. 2017)",
         "technicolor",
+        ("sparse",),
     ),
     _Layout(
         "sparse",
@@ -106,6 +108,8 @@ def load(
     more |= {} if repair is None else {"repair": _repair(repair, layout)}
     reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
     scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
+    if others := ", ".join(other.marker for other in present[1:] if other.marker not in layout.reads_too):
+        scene = replace(scene, notes=(f"{layout.marker} is read, and not {others}", *scene.notes))
     for note in scene.notes:
         print(f"{scene.name}: {printable(note)}", file=sys.stderr)
     return scene

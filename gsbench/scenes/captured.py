@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from gsbench.errors import InputError
-from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, shots, times
 from gsbench.scenes.files import ImageFinder
 from gsbench.scenes.lens import Lens
@@ -17,7 +16,6 @@ from gsbench.scenes.shots import MASKS, Shot
 
 HELD_OUT = 8  # every eighth view in the order of time is a test view
 IMAGES = "images"
-_MAX_TIMES = 1 << 26  # bytes of times.csv
 
 
 def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
@@ -74,14 +72,9 @@ def _list_shots(
         if image.camera not in lenses:
             raise InputError(f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number "
                              f"{image.camera}")  # fmt: skip
-    table = root / times.TABLE
-    data = read_file(table, str(table), _MAX_TIMES) if os.path.lexists(table) else None
     names, viewmats = [image.name for image in listed], np.stack([image.viewmat for image in listed])
     places = times.places_of(viewmats, [lenses[image.camera].key for image in listed])
-    if data is None:
-        timed = times.of_names(names, viewmats, places, posed.path)
-    else:
-        timed = times.of_table(data, table, names, places)
+    timed, digests = times.of_images(root, names, viewmats, places, posed.path)
     result, finder = [], ImageFinder(root)
     for image, time in zip(listed, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"
@@ -91,6 +84,5 @@ def _list_shots(
         viewmat = torch.from_numpy(image.viewmat)
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
         result.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
-    digests = {} if data is None else {times.TABLE: files.digest(data)}
     ordered = sorted(result, key=lambda shot: (shot.time or 0.0, shot.name))
     return ordered, digests, timed.notes + finder.notes()

@@ -84,6 +84,9 @@ def read(content: Mapping[str, Any], frame: Mapping[str, Any], source: str, wher
     of_frame = KEYS & frame.keys()
     replaced = {key for axis in _AXES if of_frame & {*axis} for key in axis} | of_frame
     merged = {key: content[key] for key in KEYS & content.keys() - replaced} | {key: frame[key] for key in of_frame}
+    if not any(key in merged for axis in _AXES for key in axis):
+        raise InputError(f"{where}: expected intrinsics as 'camera_angle_x' or 'fl_x' here or for the whole file, "
+                         "found neither")  # fmt: skip
     where = where if of_frame else source
     _check_pinhole(merged, where)
     values = {key: number(merged[key], f"{where}: {key}") for key in ("cx", "cy", "w", "h", *_AXES[0], *_AXES[1])
@@ -94,8 +97,6 @@ def read(content: Mapping[str, Any], frame: Mapping[str, Any], source: str, wher
     for _, key in _AXES:
         if key in values and not 1e-6 < values[key] < math.pi:
             raise InputError(f"{where}: {key}: expected radians between 0 and pi, got {values[key]}")
-    if not any(key in values for axis in _AXES for key in axis):
-        raise InputError(f"{where}: expected intrinsics as 'camera_angle_x' or 'fl_x', found neither")
     x, y = ({*axis} for axis in _AXES)
     return Intrinsics(
         where,

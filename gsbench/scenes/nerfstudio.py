@@ -26,8 +26,9 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
 
     The file has what `gsbench.scenes.blender` reads from each of its files. `train_filenames`, `val_filenames` and
     `test_filenames` may list the images of each split by their `file_path`. Otherwise every eighth image in the order
-    of time and then of name is a test view, from the eighth on. Without `time` in the frames, times come from the names
-    of the images (`gsbench.scenes.times`). The points of `ply_file_path` are the initial points.
+    of time and then of name is a test view, from the eighth on. Times come from times.csv, otherwise from `time` in the
+    frames, otherwise from the names of the images (`gsbench.scenes.times`). The points of
+    `ply_file_path` are the initial points.
 
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file and field.
@@ -36,11 +37,11 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     root = root.resolve()
     finder = ImageFinder(root)
     split = blender.read_split(root, SOURCE, finder, _KEYS)
-    timed = _times(split)
+    timed, digests = _times(root, split)
     size = shots.size_of(split.frames[0].path, split.frames[0].where)
     listed = blender.shots_of(split.frames, timed.values, size)
     loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
-    digests = dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
+    digests |= dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
     train, val, test, how = _split_views(split, finder, loaded.views)
     points = split.content.get("ply_file_path")
     initial = None
@@ -63,17 +64,20 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     )
 
 
-def _times(split: blender.Split) -> times.Times:
-    """Return the times of the frames in [0, 1], of the file or of the names of the images."""
+def _times(root: Path, split: blender.Split) -> tuple[times.Times, dict[str, str]]:
+    """Return the times of the frames in [0, 1], and the SHA-256 of times.csv by name, if there is one.
+
+    They are from times.csv, otherwise from the frames, otherwise from the names of the images.
+    """
     blender.check_all_or_none([split])
     places, names = blender.places_of(split.frames), [frame.name for frame in split.frames]
-    if split.frames[0].time is None:
+    if split.frames[0].time is None or os.path.lexists(root / times.TABLE):
         viewmats = np.stack([frame.viewmat.double().numpy() for frame in split.frames])
-        return times.of_names(names, viewmats, places, split.source)
+        return times.of_images(root, names, viewmats, places, split.source)
     fields = [frame.time or 0.0 for frame in split.frames]
     times.check_distinct(names, fields, places, str(split.source))
     timed, notes = times.of_fields({SOURCE: fields})
-    return times.Times(timed[SOURCE], notes)
+    return times.Times(timed[SOURCE], notes), {}
 
 
 def _split_views(

@@ -94,9 +94,9 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
     """Return the lens in pixels of the image; raise InputError if its size is not its camera's or the first image's."""
     lens = shot.lens.resized(*size)
     if lens is None:
-        stated = f"{shot.lens.width}x{shot.lens.height}"
-        raise InputError(f"{shot.where}: expected {stated} as its camera, or smaller by one ratio, got {size[0]}x{size[1]}: "
-                         "use the images that the camera was computed from, and scene.downscale")  # fmt: skip
+        stated, actual = f"{shot.lens.width}x{shot.lens.height}", f"{size[0]}x{size[1]}"
+        raise InputError(f"{shot.where}: expected {stated} as its camera, or smaller by one ratio, got {actual}: use "
+                         "the images that the camera was computed from, and scene.downscale")  # fmt: skip
     if size != expected:
         raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
                          f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip

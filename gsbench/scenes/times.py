@@ -5,6 +5,7 @@ with the same pose and intrinsics are of one fixed camera, whose own number is c
 """
 
 import csv
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Mapping, Sequence
@@ -18,16 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.errors import InputError
-from gsbench.scenes.files import without_suffix
+from gsbench.reading import read_file
+from gsbench.scenes.files import digest, without_suffix
 
 TABLE = "times.csv"
 DOCS = "data.md#times"
+_MAX_TABLE = 1 << 26  # bytes of times.csv
 _LARGEST = 1e30  # the largest time, in any unit
 _LONGEST = 100  # digits of a number that is read exactly
 _SAME_PLACE = 6  # decimals, relative to the radius of the cameras: poses that agree to them are one place
 _CLEARLY = 10.0  # a camera moves this many times less between neighbouring times than between cameras
+_SHORT = 0.5  # times in [0, 1] that cover less may be in another unit
 _FEW = 0.1  # a file whose times lie in [0, 1], a smaller share of all times than this, has another unit than the others
-_NUMBER = re.compile(r"(?:(?<![^=/_])-)?[0-9]+(?:\.[0-9]+)?")  # "-" is a sign at the start and after = / _
+_WHOLE = re.compile(r"(?:(?<![^=/_])-)?[0-9]+")  # "-" is a sign at the start and after = / _
+_DECIMAL = re.compile(_WHOLE.pattern + r"(?:\.[0-9]+)?")
 _CLOCK = (
     r"(?P<H>[01]\d|2[0-3])(?P<c>{})(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d)(?:[-_.,]?(?P<f>\d{{3}}|\d{{6}}|\d{{9}}))?(?!\d)"
 )
@@ -37,7 +42,7 @@ _MOMENTS = (
     re.compile(r"(?<!\d)" + _CLOCK.format("[-:]"), re.ASCII),  # 12-30-59
 )
 _CAMERA_WORDS = ("cam", "camera")
-_TIME_WORDS = ("frame", "time", "timestamp", "t")
+_TIME_WORDS = ("frame", "f", "time", "timestamp", "t")
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,25 @@ def places_of(
     """Return a key of each view that is equal for views with the same pose and intrinsics: those of a fixed camera."""
     poses = np.round(_relative(viewmats), _SAME_PLACE) + 0.0  # -0 becomes 0
     return [(pose.tobytes(), lens) for pose, lens in zip(poses, lenses, strict=True)]
+
+
+def of_images(
+    root: Path,  # the scene's folder
+    names: Sequence[str],  # of images, with folders
+    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
+    places: Sequence[Hashable],  # from `places_of`
+    source: Path,  # the file that names the images, for messages
+) -> tuple[Times, dict[str, str]]:
+    """Return the times from times.csv, if it exists, otherwise from names, and the SHA-256 of times.csv by name.
+
+    Raises:
+        InputError: as `of_table` and `of_names`.
+    """
+    path = root / TABLE
+    if not os.path.lexists(path):
+        return of_names(names, viewmats, places, source), {}
+    data = read_file(path, str(path), _MAX_TABLE)
+    return of_table(data, path, names, places), {TABLE: digest(data)}
 
 
 def of_names(
@@ -174,8 +198,8 @@ def of_fields(
 ) -> tuple[dict[str, list[float | None]], list[str]]:
     """Return the times of each file's frames in [0, 1], and sentences on what was done.
 
-    Times in [0, 1] stay as they are. Others, such as seconds or numbers of frames, are scaled over all files together.
-    If all are equal, the scene has no times.
+    Times in [0, 1] stay as they are; a sentence says so if they cover less than half of it. Others, such as seconds or
+    numbers of frames, are scaled over all files together. If all are equal, the scene has no times.
 
     Raises:
         InputError: the files have times in different units.
@@ -186,7 +210,8 @@ def of_fields(
         none: dict[str, list[float | None]] = {file: [None] * len(times) for file, times in values.items()}
         return none, [f"times: none, as all times are {first:.10g}"]
     if first >= 0 and last <= 1:
-        return {file: [*times] for file, times in values.items()}, []
+        short = f"times: the field 'time', {first:.10g} to {last:.10g}, as written, since they lie in [0, 1]"
+        return {file: [*times] for file, times in values.items()}, [short] if last - first < _SHORT else []
     for file, times in values.items():
         is_small = 0 <= min(times) < max(times) <= 1
         if is_small and max(times) - min(times) < _FEW * (last - first):
@@ -253,11 +278,12 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
         if all(len(one) == 1 for one in matches):
             moments = [one[0] for one in matches]
             break
+    number = _DECIMAL if _have_decimals(plain) else _WHOLE
     found = []
     for name, moment in zip(plain, moments, strict=True):
         numbers, at = [], 0
         inside = moment.span() if moment else (-1, -1)
-        spans = [match.span() for match in _NUMBER.finditer(name)]
+        spans = [match.span() for match in number.finditer(name)]
         spans = [(a, b) for a, b in spans if b <= inside[0] or a >= inside[1]] if moment else spans
         for start, end in sorted([*spans, *([inside] if moment else [])]):
             label = name[at:start].rpartition("/")[2]
@@ -267,6 +293,12 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
             at = end
         found.append(numbers)
     return found
+
+
+def _have_decimals(names: Sequence[str]) -> bool:
+    """Return whether a point between digits is a decimal point: 1.9 and 1.10 are numbers 9 and 10 of a take 1."""
+    decimals = [part for name in names for part in re.findall(r"[0-9]\.([0-9]+)", name)]
+    return len({len(part) for part in decimals}) < 2 or not any(len(part) > 1 and part[-1] == "0" for part in decimals)
 
 
 def _seconds(moment: re.Match[str], source: Path) -> Fraction:

@@ -125,7 +125,11 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "test missing": (lambda root: (root / "transforms_test.json").unlink(), "transforms_test.json", "found none"),
     "frame is a number": (change(frames=[7]), JSON, "frames[0]"),
     # the intrinsics
-    "intrinsics missing": (drop("camera_angle_x"), JSON, "'camera_angle_x' or 'fl_x'"),
+    "intrinsics missing": (
+        drop("camera_angle_x"),
+        JSON,
+        "frames[0]: expected intrinsics as 'camera_angle_x' or 'fl_x'",
+    ),
     "angle zero": (change(camera_angle_x=0), JSON, "camera_angle_x"),
     "angle of pi": (change(camera_angle_x=3.15), JSON, "camera_angle_x"),
     "angle not finite": (change(camera_angle_x=float("nan")), JSON, "camera_angle_x"),

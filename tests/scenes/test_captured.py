@@ -386,6 +386,147 @@ def test_fewer_images_than_the_split_needs(own: Path) -> None:
         scenes.load(own)
 
 
+def model(own: Path, where: str, count: int) -> None:
+    """Write a model of the first `count` images into another folder of the capture."""
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES[:count], circle(COUNT)[:count]).write(own, "txt")
+    target = own / where
+    target.mkdir(parents=True, exist_ok=True)
+    for path in (own / "sparse" / "0").iterdir():
+        if target != path.parent:
+            shutil.copy(path, target / path.name)
+
+
+@pytest.mark.parametrize(
+    ("models", "words"),
+    [
+        ({"sparse/0": 8, "sparse/1": 9}, "sparse/1 with the most images, 9, is read; sparse/0 has 8"),
+        ({"sparse/0": 8, "sparse/2": 9, "sparse/10": 8}, "sparse/2 with the most images, 9, is read; sparse/0 has 8"),
+        ({"sparse/0": 8, "sparse": 9}, "sparse with the most images, 9, is read; sparse/0 has 8"),
+        ({"sparse/0": 9, "sparse": 9}, "sparse/0 with the most images, 9, is read; sparse has 9"),
+    ],
+)
+def test_the_largest_model_is_read(
+    own: Path, models: dict[str, int], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches sparse/0 read in silence where COLMAP could not join the images, and another is larger."""
+    for where, count in sorted(models.items(), key=lambda one: one[0] == "sparse/0"):  # the others are copies of it
+        model(own, where, count)
+    scene = scenes.load(own)
+    assert len(scene.train) + len(scene.test) == max(models.values())
+    assert words in capsys.readouterr().err
+
+
+def test_one_model_needs_no_words(own: Path) -> None:
+    """Catches a line for every capture, and sparse/ itself or a folder 1 alone refused."""
+    for where in ("1", "."):
+        shutil.move(own / "sparse" / "0", own / "moved")
+        shutil.rmtree(own / "sparse")
+        shutil.copytree(own / "moved", own / "sparse" / where)
+        assert [note[:6] for note in scenes.load(own).notes] == ["times:"]
+        shutil.move(own / "moved", own / "sparse" / "0")
+        for path in (own / "sparse").glob("*.txt"):
+            path.unlink()
+
+
+LINES: dict[str, Callable[[str], str]] = {
+    "carriage returns": lambda text: text.replace("\n", "\r\n"),
+    "byte order mark": lambda text: "\ufeff" + text,
+    "comments": lambda text: text.replace("\n4 ", "\n# four\n  # and more\n4 "),
+    "blank lines before an image": lambda text: text.replace("\n5 ", "\n\n\n5 "),
+    "no last line": lambda text: text.rstrip("\n"),
+}
+
+
+@pytest.mark.parametrize("change", LINES)
+def test_images_txt_as_programs_write_it(own: Path, change: str) -> None:
+    """Catches what an editor on Windows adds, which changes no number."""
+    expected = scenes.load(own)
+    for part in ("images", "cameras", "points3D"):
+        path = own / "sparse/0" / f"{part}.txt"
+        if part == "images" or change in ("carriage returns", "byte order mark"):
+            path.write_bytes(LINES[change](path.read_text()).encode())
+    scene = scenes.load(own)
+    assert [view.name for view in scene.train] == [view.name for view in expected.train]
+    assert all((a.camera.viewmat == b.camera.viewmat).all() for a, b in zip(scene.train, expected.train, strict=True))
+
+
+@pytest.mark.parametrize("which", ["all", "second", "last but one", "numbers for a name", "name with spaces"])
+def test_images_txt_without_second_lines_is_refused(own: Path, which: str) -> None:
+    """Catches every second image dropped in silence."""
+    path = own / "sparse/0/images.txt"
+    head, *lines = path.read_text().split("\n")
+    pairs = [[lines[2 * i], lines[2 * i + 1]] for i in range(COUNT)]
+    if which == "numbers for a name":
+        pairs = [[line.replace("frame_", "").replace(".png", ""), ""] for line, _ in pairs]
+    if which == "name with spaces":
+        pairs = [[line.replace("frame_", "a frame "), ""] for line, _ in pairs]
+    for i in {"second": [1], "last but one": [COUNT - 2]}.get(which, range(COUNT - 1)):
+        pairs[i].pop()
+    path.write_text("\n".join([head, *(line for pair in pairs for line in pair)]))
+    with pytest.raises(InputError, match=r"expected the keypoints .* or an empty line, got .*after each image"):
+        scenes.load(own)
+
+
+def test_names_with_spaces(own: Path) -> None:
+    """Catches a name that is cut at its first space."""
+    rename(own, [f"my shot {i}.png" for i in range(COUNT)])
+    assert scenes.load(own).train[2].name == "my shot 2"
+
+
+def test_images_of_half_the_size(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a folder images_2 refused with advice that does not help, or read with the full size's intrinsics."""
+    for path in (own / "images").iterdir():
+        write_image(path, np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
+    view = scenes.load(own).train[0]
+    assert view.camera.K.tolist() == [[10, 0, 1.625], [0, 10.5, 4.75], [0, 0, 1]]
+    assert "images of 8x6 are smaller than their camera of 16x12" in capsys.readouterr().err
+
+
+def test_images_of_half_the_size_are_undistorted(tmp_path: Path) -> None:
+    """Catches the lens of the full size used for a reduced image: both show the same rays in the middle."""
+    lens, names = (50.0, 54.0, 33.0, 23.0, -0.2, 0.03, 0.01, -0.02), NAMES
+    big = rays(np.array([[50.0, 0, 33], [0, 54, 23], [0, 0, 1]]))
+    seen = picture(ray_seen(big, *lens[4:]))
+    for root, pixels in ((tmp_path / "whole", seen), (tmp_path / "half", cv2.resize(seen, (32, 24), None, 0, 0, 3))):
+        for name in names:
+            write_image(root / "images" / name, np.rint(pixels * 255).astype(np.uint8))
+        Capture("OPENCV", WIDTH * 4, HEIGHT * 4, lens, names, circle(COUNT)).write(root, "bin")
+    whole, half = (scenes.load(tmp_path / name) for name in ("whole", "half"))
+    torch.testing.assert_close(half.train[0].camera.K[:2] * 2, whole.train[0].camera.K[:2], rtol=0.02, atol=0)
+    K = half.train[0].camera.K.double().numpy()
+    y, x = np.mgrid[:24, :32] + 0.5
+    expected = picture(np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], -1))
+    assert np.abs(half.train[0].image.numpy() - expected)[2:-2, 2:-2].max() < 0.02
+
+
+def test_a_rig_named_by_frames_first(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches the number of the camera taken for the time, and a choice that is not printed."""
+    names = [f"frame_{i // 3:04d}/cam{i % 3:02d}.png" for i in range(COUNT)]
+    for old, new in zip(NAMES, names, strict=True):
+        (own / "images" / new).parent.mkdir(exist_ok=True)
+        (own / "images" / old).rename(own / "images" / new)
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, np.tile(circle(3), (3, 1, 1))).write(own, "txt")
+    scene = scenes.load(own)
+    assert {view.name: view.time for view in scene.train}["frame_0001/cam02"] == 0.5
+    line = f"{own.name}: times: number 1 of 2 in each name, 0 to 2 (whole numbers), scaled to [0, 1]"
+    assert line in capsys.readouterr().err
+
+
+def test_notes_are_in_the_record(own: Path) -> None:
+    """Catches a choice that is printed and then forgotten, and a record of before that is refused."""
+    (own / "capture").mkdir()
+    for name in ("images", "sparse"):
+        shutil.move(own / name, own / "capture" / name)
+    assert main_here(
+        "+exp=colmap", "model=3dgs", f"data.root={own}", "scene=custom", "scene.name=capture",
+        "train.iterations=1", f"results={own / 'results'}",
+    ) == 0  # fmt: skip
+    (path,) = record.find(own / "results")
+    provenance = record.read(path).provenance
+    assert provenance.data_notes == list(scenes.load(own / "capture").notes)
+    assert "times: the number in each name, 0 to 8" in provenance.data_notes[0]
+
+
 READERS: dict[str, Callable[[colmap.ModelFile], Any]] = {
     "cameras": colmap.read_cameras,
     "images": colmap.read_images,

@@ -1,7 +1,7 @@
 """Which number of a name is the time: the kinds of names that captures have, fixed and moving cameras, and tables."""
 
 from collections.abc import Callable, Sequence
-from fractions import Fraction
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -60,13 +60,24 @@ FORMS: dict[str, Callable[[int, int], str]] = {
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("moves", [False, True])
 def test_the_time_of_a_rig(form: str, moves: bool) -> None:
-    """Catches the number of the camera taken for the time, in any order of folders, where poses repeat and nearly do."""
+    """Catches the number of the camera taken for the time, in any order of folders, where poses repeat or nearly do."""
     names, viewmats, expected = fixed(FORMS[form])
     found = of_names(names, nudged(viewmats) if moves else viewmats)
     assert found.values == pytest.approx(expected)
     (note,) = found.notes
     assert note.startswith("times: ")
     assert "scaled to [0, 1]" in note
+
+
+def clock(form: str, seconds: float = 1.0, cut: int = 0) -> Callable[[int], str]:
+    """Names with a date or time of day that pass midnight; `cut`: decimals to leave out."""
+    start = datetime(2023, 4, 30, 23, 59, 55)
+
+    def write(i: int) -> str:
+        text = (start + timedelta(seconds=seconds * i)).strftime(form)
+        return f"{text[: len(text) - cut]}.jpg"
+
+    return write
 
 
 MOVING: dict[str, Callable[[int], str]] = {
@@ -76,18 +87,20 @@ MOVING: dict[str, Callable[[int], str]] = {
     "r_3": lambda i: f"r_{i}.png",
     "1305031102.175304": lambda i: f"{1305031102.95 + i / 10:.6f}.png",
     "nanoseconds": lambda i: f"{1403636579763555584 + 100 * i}.png",
-    "IMG_20230501_235958": lambda i: f"IMG_202305{1 + (i > 1):02d}_{'2359' if i < 2 else '0000'}{(58 + i) % 60:02d}.jpg",
-    "20230501_123059_500": lambda i: f"20230501_{'123059' if i < 2 else '123100'}_{500 * (i % 2):03d}.png"
-    if i < 4
-    else f"20230501_{123100 + (i - 2) // 2}_{500 * (i % 2):03d}.png",
-    "PXL_20230501_123059500": lambda i: f"PXL_20230501_1230{40 + i:02d}500.jpg",
-    "2023-05-01 at 12.30.59": lambda i: f"Shot 2023-05-01 at 12.{29 + (i + 55) // 60}.{(i + 55) % 60:02d}.png",
+    "IMG_20230501_123059": clock("IMG_%Y%m%d_%H%M%S"),
+    "20230501123059": clock("%Y%m%d%H%M%S"),
+    "20230501_123059_500": clock("%Y%m%d_%H%M%S_%f", 0.5, cut=3),
+    "PXL_20230501_123059500": clock("PXL_%Y%m%d_%H%M%S%f", 0.75, cut=3),
+    "2023-05-01_12-30-59": clock("2k_%Y-%m-%d_%H-%M-%S"),
+    "2023-05-01T12:30:59.500000": clock("%Y-%m-%dT%H:%M:%S.%f", 0.25),
+    "at 12.30.59": clock("Shot %Y-%m-%d at %H.%M.%S"),
     "12-30-59": lambda i: f"12-{29 + (i + 55) // 60}-{(i + 55) % 60:02d}.png",
     "negative": lambda i: f"t={i - 4}.png",
     "signs": lambda i: f"frame_{i - 4}.png",
     "a dash": lambda i: f"video-{i:03d}.png",
+    "take 1.9": lambda i: f"scan_1.{i + 5}.png",
     "index and stamp": lambda i: f"{i:04d}_{100 + i / 10:.3f}.png",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("form", MOVING)
@@ -124,8 +137,10 @@ REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
                                 "'cam0_a.png' and 'cam0_b.png'.*a number that changes"),
     "equal": ([f"{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.tile(circle(1), (8, 1, 1)),
               "'0_a.png' and '0_b.png'.*expected different times"),
-    "constant": ([f"{'abcd'[i]}_1080p.png" for i in range(4)], np.tile(circle(1), (4, 1, 1)), "expected different times"),
-    "two that contradict": ([f"{i}_{(3 * i) % 7}.png" for i in range(7)], circle(7), "one number that is the time, got 0, 0"),
+    "constant": ([f"{'abcd'[i]}_1080p.png" for i in range(4)], np.tile(circle(1), (4, 1, 1)),
+                 "expected different times"),
+    "two that contradict": ([f"{i}_{(3 * i) % 7}.png" for i in range(7)], circle(7),
+                            "one number that is the time, got 0, 0"),
     "of takes": ([f"{i // 5}_{i % 5}.png" for i in range(10)], np.tile(circle(1), (10, 1, 1)), "one number that is"),
     "some without": (["a.png", "b_1.png"], circle(2), "'a.png': expected a number in its name"),
     "of two forms": (["IMG_20230501_123059.jpg", "IMG_20230501_123059_1.jpg"], circle(2), "expected names of one form"),
@@ -202,7 +217,10 @@ def test_a_table_of_equal_times_is_a_still_scene() -> None:
 
 def test_fields_are_scaled_over_all_files() -> None:
     """Catches splits that are scaled apart, times in [0, 1] that are changed, and seconds beside shares of the clip."""
-    assert times.of_fields({"a": [0.0, 0.3], "b": [0.1]}) == ({"a": [0.0, 0.3], "b": [0.1]}, [])
+    assert times.of_fields({"a": [0.0, 0.7], "b": [0.1]}) == ({"a": [0.0, 0.7], "b": [0.1]}, [])
+    found, (note,) = times.of_fields({"a": [0.0, 0.3], "b": [0.1]})
+    assert found == {"a": [0.0, 0.3], "b": [0.1]}
+    assert "0 to 0.3, as written" in note
     found, (note,) = times.of_fields({"a": [0.0, 30.0], "b": [15.0, 40.0]})
     assert found == {"a": [0, 0.75], "b": [0.375, 1]}
     assert "0 to 40" in note
@@ -222,8 +240,3 @@ def test_places_do_not_depend_on_the_unit() -> None:
         assert len(set(places)) == 6
         assert places[::2] == places[1::2]
         assert len(set(times.places_of(viewmats, [0, 1] * 6))) == 12
-
-
-def test_exact_fractions() -> None:
-    """Catches 0.1 that is not a tenth: two time stamps that differ by it must be one step apart."""
-    assert times._exact("0.1", SOURCE) == Fraction(1, 10)

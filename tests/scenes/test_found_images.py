@@ -1,0 +1,103 @@
+"""Images are found by the names that files give them: suffixes, backslashes, links, and what a suffix does not say."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+from tiny_scene import edit
+
+from gsbench import scenes
+from gsbench.errors import InputError
+from gsbench.scenes.files import ImageFinder
+
+IMAGES = ("train/r_0", "train/r_1", "val/r_0", "test/r_0")
+
+
+def as_jpegs(root: Path, suffix: str) -> None:
+    """Replace the PNGs of the tiny scene by JPEGs."""
+    for name in IMAGES:
+        image = cv2.imread(str(root / f"{name}.png"), cv2.IMREAD_COLOR)
+        (root / f"{name}.png").unlink()
+        (root / f"{name}{suffix}").write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPG", ".jpeg", ".Jpeg", ".png", ".PNG"])
+@pytest.mark.parametrize("named", ["", ".jpg", ".png"])
+def test_jpegs_of_a_blender_scene(tiny: Path, suffix: str, named: str) -> None:
+    """Catches r_0.jpg.png, a JPEG that is called .png refused, and a suffix left in the names of views."""
+    as_jpegs(tiny, suffix)
+    for split in ("train", "val", "test"):
+        edit(tiny, lambda c: [f.update(file_path=f["file_path"] + named) for f in c["frames"]], split)
+    scene = scenes.load(tiny)
+    assert [view.name for view in scene.train] == ["train/r_0", "train/r_1"]
+    differs = bool(named) and named != suffix
+    assert scene.notes == ((f"images of another suffix are read: 4 {suffix} for {named}",) if differs else ())
+
+
+def test_the_image_that_is_named_comes_first(tiny: Path) -> None:
+    """Catches another file of that name read in its place, and of two others not the PNG."""
+    finder, folder = ImageFinder(tiny), tiny / "train"
+    for name in ("x.jpg", "x.PNG", "x.y.jpeg", "z"):
+        (folder / name).write_bytes(b"")
+    expected = {
+        "train/x.jpg": "x.jpg", "train/x.PNG": "x.PNG", "train/x.png": "x.PNG", "train/x": "x.PNG",
+        "train/x.JPG": "x.jpg",
+        "train/x.y": "x.y.jpeg", "train\\x.jpg": "x.jpg", ".\\train\\x": "x.PNG", "./train/../train/x": "x.PNG",
+        "train/z": "z", "train/none": "none.png", "train/none.jpg": "none.jpg", f"{tiny}/train/x.jpg": "x.jpg",
+    }  # fmt: skip
+    assert {name: finder.find(name, "where").name for name in expected} == expected
+
+
+def test_links_of_the_user_are_followed(tiny: Path, tmp_path: Path) -> None:
+    """Catches images on another disk refused, by file or by folder, or told apart by the fingerprint."""
+    expected = scenes.load(tiny)
+    shutil.move(tiny / "train", tmp_path / "disk")
+    (tiny / "train").symlink_to(tmp_path / "disk")
+    shutil.move(tiny / "test" / "r_0.png", tmp_path / "elsewhere.png")
+    (tiny / "test" / "r_0.png").symlink_to(tmp_path / "elsewhere.png")
+    linked = scenes.load(tiny)
+    assert linked.fingerprint == expected.fingerprint
+    assert [view.name for view in linked.train] == [view.name for view in expected.train]
+    assert all((a.image == b.image).all() for a, b in zip(linked.train, expected.train, strict=True))
+
+
+def test_seconds_are_scaled_over_all_splits(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches seconds refused without a cure, or scaled apart in train and test."""
+    for split, seconds in (("train", [0.0, 10.0]), ("val", [2.0]), ("test", [5.0])):
+        edit(tiny, lambda c: [f.update(time=s) for f, s in zip(c["frames"], seconds, strict=True)], split)  # noqa: B023
+    scene = scenes.load(tiny)
+    assert [view.time for view in (*scene.train, *scene.val, *scene.test)] == [0, 1, 0.2, 0.5]
+    assert "times: the field 'time', 0 to 10, scaled to [0, 1] over all splits" in capsys.readouterr().err
+
+
+def test_views_that_splits_share_are_counted(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a test that is the training, in whole or in part, and images that are alike by chance called shared."""
+    assert scenes.load(tiny).notes == ()
+    shutil.copy(tiny / "train/r_1.png", tiny / "test/r_0.png")  # the image of another pose
+    assert scenes.load(tiny).notes == ()
+    shutil.copy(tiny / "transforms_train.json", tiny / "transforms_test.json")
+    edit(tiny, lambda c: c["frames"].pop(0), "test")
+    (note,) = scenes.load(tiny).notes
+    assert note.startswith("1 of 1 views of test are views of train too")
+    shutil.copy(tiny / "transforms_test.json", tiny / "transforms_val.json")
+    assert len(scenes.load(tiny).notes) == 3
+    assert capsys.readouterr().err.count("\n") == 4
+
+
+def test_two_images_of_one_camera_and_time_are_refused(tiny: Path) -> None:
+    """Catches contradictory times, and all times equal where the camera moves, which is a still scene."""
+    for split in ("train", "val", "test"):
+        edit(tiny, lambda c: [f.update(time=0.25) for f in c["frames"]], split)
+    scene = scenes.load(tiny)
+    assert not scene.has_time
+    assert scene.notes == ("times: none, as all times are 0.25",)
+    edit(tiny, lambda c: c["frames"][1].update(transform_matrix=c["frames"][0]["transform_matrix"]))
+    with pytest.raises(InputError, match=r"'train/r_0\.png' and 'train/r_1\.png': expected different times"):
+        scenes.load(tiny)
+
+
+def test_a_second_layout_is_not_read_in_silence(tiny: Path) -> None:
+    """Catches a folder of two layouts of which one is read without a word."""
+    (tiny / "transforms.json").write_text("{}")
+    assert scenes.load(tiny).notes == ("transforms_train.json is read, and not transforms.json",)

@@ -1,0 +1,143 @@
+"""A folder with nerfstudio's transforms.json: its cameras, split, times and points."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from capture import circle
+from tiny_scene import write_png
+
+from gsbench import scenes
+from gsbench.errors import InputError
+
+COUNT = 17
+PLY = "ply\nformat ascii 1.0\nelement vertex 2\n{}end_header\n0 0 1 255 0 0\n1 2 3 0 255 51\n".format(
+    "".join(f"property {kind} {name}\n" for kind, names in (("float", "xyz"), ("uchar", ("red", "green", "blue")))
+            for name in names)
+)  # fmt: skip
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A scene of 17 images without times, and a file that has its images in another order."""
+    frames = []
+    for i, viewmat in enumerate(circle(COUNT)):
+        write_png(tmp_path / "images" / f"frame_{i:05d}.png", np.full((6, 8, 3), 10 * i, np.uint8))
+        matrix = (np.linalg.inv(viewmat) @ np.diag([1, -1, -1, 1])).tolist()
+        frames.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix, "colmap_im_id": i})
+    order = np.random.default_rng(0).permutation(COUNT)
+    content = {
+        "w": 8, "h": 6, "fl_x": 9.0, "fl_y": 9.5, "cx": 4.25, "cy": 3.0, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        "camera_model": "OPENCV", "frames": [frames[i] for i in order],
+        "applied_transform": np.eye(4)[:3].tolist(), "ply_file_path": "sparse_pc.ply",
+    }  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (tmp_path / "sparse_pc.ply").write_text(PLY)
+    return tmp_path
+
+
+def change(root: Path, **values: Any) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps(content | values))
+
+
+def test_it_is_read(root: Path) -> None:
+    """Catches a message that names other files, cameras of other images, another split, and points left out."""
+    scene = scenes.load(root)
+    assert [len(scene.train), len(scene.val), len(scene.test)] == [15, 0, 2]
+    assert [view.name for view in scene.test] == ["images/frame_00007", "images/frame_00015"]
+    for view in (*scene.train, *scene.test):
+        i = int(view.name[-5:])
+        assert view.time == pytest.approx(i / 16)
+        assert float(view.image[0, 0, 0]) == pytest.approx(10 * i / 255)
+        torch.testing.assert_close(view.camera.viewmat.double(), torch.from_numpy(circle(COUNT)[i]), rtol=0, atol=1e-6)
+        assert view.camera.K.tolist() == [[9, 0, 4.25], [0, 9.5, 3], [0, 0, 1]]
+    assert scene.points is not None
+    torch.testing.assert_close(scene.points.means, torch.tensor([[0.0, 0, 1], [1, 2, 3]]))
+    torch.testing.assert_close(scene.points.colors, torch.tensor([[1.0, 0, 0], [0, 1, 0.2]]))
+    text = "\n".join(scene.notes)
+    assert "every 8th view in the order of time is a test view" in text
+    assert "times: the number in each name, 0 to 16" in text
+    assert "keys that are not read: 'colmap_im_id'" in text
+
+
+def test_its_own_split(root: Path) -> None:
+    """Catches a split that the file states and that is not used."""
+    names = [f"images/frame_{i:05d}.png" for i in range(COUNT)]
+    change(root, train_filenames=names[:10], val_filenames=names[10:12], test_filenames=[names[16]])
+    scene = scenes.load(root)
+    assert [len(scene.train), len(scene.val)] == [10, 2]
+    assert [view.name for view in scene.test] == ["images/frame_00016"]
+    assert scene.notes[0] == "split: as the file lists, 10, 2 and 1 of 17 views"
+
+
+def test_times_of_the_file(root: Path) -> None:
+    """Catches times of frames that give way to the numbers of names."""
+    content = json.loads((root / "transforms.json").read_text())
+    change(root, frames=[frame | {"time": -float(frame["file_path"][-9:-4])} for frame in content["frames"]])
+    assert [view.name for view in scenes.load(root).test] == ["images/frame_00009", "images/frame_00001"]
+
+
+def test_times_of_a_table(root: Path) -> None:
+    """Catches the cure of the messages, times.csv, that is not read here, or not part of the fingerprint."""
+    before = scenes.load(root).fingerprint
+    (root / "times.csv").write_text("name,time\n" + "".join(f"frame_{i:05d},{-i}\n" for i in range(COUNT)))
+    scene = scenes.load(root)
+    assert [view.name for view in scene.test] == ["images/frame_00009", "images/frame_00001"]
+    assert scene.fingerprint != before
+
+
+def test_fingerprint(root: Path) -> None:
+    """Catches other points, another file or another image under the same fingerprint."""
+    before = {scenes.load(root).fingerprint}
+    (root / "sparse_pc.ply").write_text(PLY.replace("1 2 3", "1 2 4"))
+    before.add(scenes.load(root).fingerprint)
+    change(root, fl_x=9.25)
+    before.add(scenes.load(root).fingerprint)
+    write_png(root / "images" / "frame_00003.png", np.full((6, 8, 3), 1, np.uint8))
+    assert scenes.load(root).fingerprint not in before
+    assert len(before) == 3
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "transforms.json: camera_model: expected a pinhole"),
+        ({"k1": 0.02}, "transforms.json: k1: .*undistort"),
+        ({"ply_file_path": "../x.ply"}, "ply_file_path: expected a path inside"),
+        ({"ply_file_path": 3}, "ply_file_path: expected the path of a PLY"),
+        ({"ply_file_path": "none.ply"}, "none.ply"),
+        ({"train_filenames": ["images/frame_00000.png"]}, "1 and 0: list them"),
+        ({"train_filenames": ["images/x.png"]}, "train_filenames: expected file_path of frames, got .*add its frame"),
+        ({"test_filenames": 3}, "test_filenames: expected file_path of frames, got 3"),
+        ({"frames": []}, "at least one frame"),
+        ({"w": math.inf}, "w: expected a finite number"),
+    ],
+)
+def test_what_is_wrong_is_one_line(root: Path, values: dict[str, Any], words: str) -> None:
+    """Catches a stack trace, and lists that name images of no frame."""
+    change(root, **values)
+    with pytest.raises(InputError, match=words) as caught:
+        scenes.load(root)
+    assert "\n" not in str(caught.value)
+
+
+def test_too_few_for_a_split(root: Path) -> None:
+    """Catches a scene without a test view."""
+    content = json.loads((root / "transforms.json").read_text())
+    change(root, frames=content["frames"][:7])
+    with pytest.raises(InputError, match=r"at least 8, .*list train_filenames and test_filenames"):
+        scenes.load(root)
+
+
+def test_a_time_for_some(root: Path) -> None:
+    """Catches frames without a time between frames that have one."""
+    content = json.loads((root / "transforms.json").read_text())
+    content["frames"][3]["time"] = 0.5
+    change(root, frames=content["frames"])
+    with pytest.raises(InputError, match=r"frames\[3\]\.time: this frame has a time and the first frame has none"):
+        scenes.load(root)
