@@ -35,7 +35,7 @@ class Intrinsics:
     y_of_file: bool  # whether the frame states a focal length or angle of x alone, and the file one of y
 
     def lens(self, size: tuple[int, int]) -> Lens:
-        """Return the camera of an image of width x height pixels; the camera is larger if the file states that it is.
+        """Return the camera of an image of width x height pixels; it has another size if the file states both sides.
 
         Raises:
             InputError: the file states a width or a height alone that is not the image's, or two focal lengths for the

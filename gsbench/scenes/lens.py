@@ -29,19 +29,17 @@ class Lens:
         return (self.width, self.height, *self.K.ravel().tolist(), *self.distortion)
 
     def resized(self, width: int, height: int) -> "Lens | None":
-        """Return the lens of an image of width x height pixels that was reduced from the camera's by one ratio.
+        """Return the lens of an image of width x height pixels, which was resized from the camera's by one ratio.
 
-        The sides of the image may be rounded. None: the image is larger, or its sides have two ratios, so that it was
-        cropped or is of another camera.
+        The sides of the image may be rounded. None: its sides have two ratios to the camera's, so that it was cropped
+        or is of another camera.
         """
         if (width, height) == (self.width, self.height):
             return self
-        ratio = self.width / width
+        ratio = max(self.width / width, width / self.width)
         is_exact = width * self.height == height * self.width
-        is_rounded = (
-            abs(self.height * width / self.width - height) < 1 or abs(self.width * height / self.height - width) < 1
-        )
-        if not (ratio > 1 and is_exact) and not (ratio > _LEAST_RATIO and is_rounded):
+        off = min(abs(self.height * width / self.width - height), abs(self.width * height / self.height - width))
+        if not is_exact and not (ratio > _LEAST_RATIO and off < 1):
             return None
         scale = np.diag([width / self.width, height / self.height, 1])
         return replace(self, width=width, height=height, K=scale @ self.K)

@@ -28,7 +28,7 @@ class Shot:
     where: str  # the path and the file that names it, for messages
     time: float | None
     viewmat: Tensor  # [4, 4] float64
-    lens: Lens  # its size is that of the image, or larger by one ratio
+    lens: Lens  # its size is that of the image, or another by one ratio
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def read(
     ratio of the sizes along each axis.
 
     Raises:
-        InputError: an image is damaged, its size is not its camera's nor smaller by one ratio, the images differ in
+        InputError: an image is damaged, its sides are not its camera's nor resized by one ratio, the images differ in
             size, or an image with alpha has a lens with distortion; the message names the file.
     """
     first = shots[0]
@@ -95,8 +95,8 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
     lens = shot.lens.resized(*size)
     if lens is None:
         stated, actual = f"{shot.lens.width}x{shot.lens.height}", f"{size[0]}x{size[1]}"
-        raise InputError(f"{shot.where}: expected {stated} as its camera, or smaller by one ratio, got {actual}: use "
-                         "the images that the camera was computed from, and scene.downscale")  # fmt: skip
+        raise InputError(f"{shot.where}: expected {stated} as its camera, or both sides resized by one ratio, "
+                         f"got {actual}: use the images that the camera was computed from, and scene.downscale")  # fmt: skip
     if size != expected:
         raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
                          f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip
@@ -104,12 +104,13 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
 
 
 def _notes(shots: Sequence[Shot], size: tuple[int, int], reduced: tuple[int, int], downscale: int) -> list[str]:
-    """Return sentences on images that are smaller than their cameras, and on sizes that `downscale` does not divide."""
+    """Return sentences on images that are resized, and on sizes that `downscale` does not divide."""
     notes = []
     cameras = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
     if cameras:
-        notes.append(f"images of {size[0]}x{size[1]} are smaller than their camera of {cameras[0][0]}x{cameras[0][1]}, "
-                     "whose intrinsics are scaled to them")  # fmt: skip
+        stated = f"{cameras[0][0]}x{cameras[0][1]}"
+        notes.append(f"images of {size[0]}x{size[1]} are resized from those of their camera, {stated}, "
+                     "whose intrinsics are scaled with them")  # fmt: skip
     if (reduced[0] * downscale, reduced[1] * downscale) != size:
         notes.append(f"images of {size[0]}x{size[1]} are reduced to {reduced[0]}x{reduced[1]}, as {downscale} does not "
                      "divide their size")  # fmt: skip

@@ -221,7 +221,7 @@ def grey(own: Path, name: str) -> None:
         (grey, "expected a JPEG of RGB, got one of L"),
         (
             lambda own, name: write_image(own / "images" / name, np.zeros((9, 9, 3), np.uint8)),
-            "expected 16x12 as its camera, or smaller by one ratio, got 9x9",
+            "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
         ),
         (
             lambda own, name: [(own / "images" / name).unlink(), (own / "images" / name).symlink_to("/etc/passwd")],
@@ -351,7 +351,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "image truncated": (lambda own: os.truncate(own / "images/frame_001.png", 40), "truncated PNG"),
     "another size": (
         lambda own: write_image(own / "images/frame_001.png", np.zeros((9, 9, 3), np.uint8)),
-        "expected 16x12 as its camera, or smaller by one ratio, got 9x9",
+        "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
     ),
     "folded": (text("cameras", "PINHOLE 16 12 20.0 21.0", "RADIAL 16 12 5 5 5 -9 9"), "PINHOLE|RADIAL with"),
     "too distorted": (
@@ -479,7 +479,7 @@ def test_images_of_half_the_size(own: Path, capsys: pytest.CaptureFixture[str]) 
         write_image(path, np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
     view = scenes.load(own).train[0]
     assert view.camera.K.tolist() == [[10, 0, 1.625], [0, 10.5, 4.75], [0, 0, 1]]
-    assert "images of 8x6 are smaller than their camera of 16x12" in capsys.readouterr().err
+    assert "images of 8x6 are resized from those of their camera, 16x12" in capsys.readouterr().err
 
 
 def test_images_of_half_the_size_are_undistorted(tmp_path: Path) -> None:

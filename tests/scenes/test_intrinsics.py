@@ -78,7 +78,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "fisheye in a frame": ({"is_fisheye": False}, {"is_fisheye": 1}, r"frames\[1\]: is_fisheye"),
     "no model": ({"camera_model": None}, {}, "camera_model: expected a pinhole camera"),
     "panorama": ({"equirectangular": True}, {}, "equirectangular"),
-    "size of a frame": ({}, {"w": 16, "h": 8}, "expected 16x8 as its camera, or smaller by one ratio, got 8x6"),
+    "size of a frame": ({}, {"w": 16, "h": 8}, "expected 16x8 as its camera, .*, got 8x6"),
     "width alone": ({}, {"w": 16}, r"frames\[1\]: w: expected the images' own 8, got 16"),
     "half a pixel": ({}, {"w": 16.5, "h": 12}, r"frames\[1\]: w: "),
 } | {
@@ -113,7 +113,9 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
     scene = scenes.load(tiny)
     expected = (20 * 8 / 17, 15, 4, 2.5)
     assert numbers(scene.train[0]) == pytest.approx(expected)
-    assert scene.notes == ("images of 8x6 are smaller than their camera of 17x12, whose intrinsics are scaled to them",)
+    assert scene.notes == (
+        "images of 8x6 are resized from those of their camera, 17x12, whose intrinsics are scaled with them",
+    )
     assert capsys.readouterr().err == f"tiny: {scene.notes[0]}\n"
     assert numbers(scenes.load(tiny, downscale=2).train[0]) == pytest.approx([value / 2 for value in expected])
 
@@ -122,8 +124,9 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
     ("image", "camera", "fits"),
     [
         ((8, 6), (16, 12), True), ((8, 6), (15, 11), True), ((8, 6), (32, 24), True), ((8, 6), (12, 9), True),
+        ((8, 6), (4, 3), True), ((65, 49), (33, 25), True),
         ((33, 25), (65, 49), True), ((32, 24), (65, 49), True), ((1600, 1037), (5187, 3361), True),
-        ((8, 6), (16, 16), False), ((8, 6), (8, 7), False), ((8, 6), (4, 3), False), ((640, 470), (640, 480), False),
+        ((8, 6), (16, 16), False), ((8, 6), (8, 7), False), ((8, 6), (4, 4), False), ((640, 470), (640, 480), False),
         ((638, 478), (640, 480), False), ((24, 24), (65, 49), False),
     ],
 )  # fmt: skip
