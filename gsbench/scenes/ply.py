@@ -32,18 +32,18 @@ _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 class _Element(NamedTuple):
     """An element of a PLY: the number of its rows, and their type with a field for each property."""
 
-    count: int
+    rows: int
     dtype: np.dtype[np.void]
 
     @property
     def values(self) -> int:
         """The number of values of all rows."""
-        return self.count * len(self.dtype.names or ())
+        return self.rows * len(self.dtype.names or ())
 
     @property
     def size(self) -> int:
         """The bytes of all rows in a binary file."""
-        return self.count * self.dtype.itemsize
+        return self.rows * self.dtype.itemsize
 
 
 def read_vertices(path: Path) -> NDArray[np.void]:
@@ -68,9 +68,9 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     start = end.end() + sum(element.size for element in before)
     found = max(len(data) - start, 0)
     if vertices.size > found:
-        raise InputError(f"{path}: element vertex: expected {vertices.count} x {vertices.dtype.itemsize} bytes, found "
+        raise InputError(f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
                          f"{found}: truncated")  # fmt: skip
-    return np.frombuffer(data, vertices.dtype, vertices.count, start)
+    return np.frombuffer(data, vertices.dtype, vertices.rows, start)
 
 
 def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _Element]:

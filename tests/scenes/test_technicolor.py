@@ -137,7 +137,7 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
         scenes.load(root)
     repaired = scenes.load(root, repair=["Tiny_undist_00101_09", "Other_undist_00101_03"])
     said = capsys.readouterr().err.splitlines()
-    assert said == [f"{root}/Tiny_undist_00101_09.png: damaged, replaced by Tiny_undist_00100_09.png (data.repair)"]
+    assert f"{root}/Tiny_undist_00101_09.png: damaged, replaced by Tiny_undist_00100_09.png (data.repair)" in said
     views = {view.name: view for view in repaired.train}
     replaced = views["Tiny_undist_00101_09"]
     torch.testing.assert_close(replaced.image[0, 0] * 255, torch.tensor([9.0, 100.0, 7.0]))
