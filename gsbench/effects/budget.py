@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsbench.effects.gate import apply, choose
 from gsbench.effects.sensitivity import Sensitivity
+from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
 from gsbench.models.color_order import order_of
@@ -44,7 +45,7 @@ def gate_within(
     A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
     removed. For each share in SHARES, from the largest, the function simplifies a copy of the model until the predicted
     errors add up to this share of the model's squared error. It returns the first copy whose measured loss of PSNR is
-    allowed, or None.
+    allowed, or None. PSNR cannot decide, and the result is None, if it is capped in every view or not a number.
 
     Args:
         model: the model, trained or in training; it does not change.
@@ -55,6 +56,8 @@ def gate_within(
             times.
     """
     before = measure(model)
+    if not decides(before):
+        return None
     for share in SHARES:
         if 10 * math.log10(1 + share) > MOST_PREDICTED * budget_db:
             continue

@@ -4,6 +4,7 @@ A simplified Gaussian is independent of time, direction or AGR (the neural refin
 This module does not import torch.
 """
 
+from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate, Direction, Gate, LengthChoice, ModelComparison, OnDemand, TimeScreen
 
 EFFECT_SETS = {  # the names of gsbench.models.effect_sets, in the same order, and their names in the legend
@@ -35,12 +36,21 @@ def of_screen(screen: TimeScreen) -> str:
 def of_comparison(found: ModelComparison) -> str:
     """Return a message: the PSNR on val of each candidate of model=auto, and which of them was chosen."""
     said = _of_candidates(found.candidates)
-    return f"PSNR on val after {found.iteration} iterations: {said}; {found.chosen} is trained to the end"
+    return (f"PSNR on val after {found.iteration} iterations: {said}; {found.chosen} is trained to the end"
+            f"{_tie(found.candidates)}")  # fmt: skip
 
 
 def of_lengths(found: LengthChoice) -> str:
     """Return a message: the PSNR on val of each length that was trained, and which of them is kept."""
-    return f"PSNR on val: {_of_candidates(found.tried)}; the training of {found.kept} iterations is kept"
+    said = _of_candidates(found.tried)
+    return f"PSNR on val: {said}; the training of {found.kept} iterations is kept{_tie(found.tried)}"
+
+
+def _tie(candidates: list[Candidate]) -> str:
+    """Return an addition to a message if PSNR on val does not decide between the best candidates; otherwise ""."""
+    ranks = {one.name: rank(one.psnr_val) for one in candidates if one.reason is None}
+    best = [name for name, value in ranks.items() if value == max(ranks.values())]
+    return f": PSNR cannot decide between {', '.join(best)}, so the last of them is taken" if len(best) > 1 else ""
 
 
 def _of_candidates(found: list[Candidate]) -> str:

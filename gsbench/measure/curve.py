@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gsbench.errors import InputError
+from gsbench.measure.exact_views import rank
 
 FALL = 0.1  # dB of PSNR; a smaller fall is not mentioned, because seeds differ by as much (docs/tuning.md)
 
@@ -51,9 +52,13 @@ class Curve:
 
     @property
     def best(self) -> Point | None:
-        """Return the evaluation with the highest PSNR (the first of several equal ones), or None if none is finite."""
-        finite = [(p.psnr_val, p) for p in self.points if p.psnr_val is not None]
-        return max(finite, key=lambda pair: pair[0])[1] if finite else None
+        """Return the evaluation with the highest PSNR, the last of equal ones; None if none is finite."""
+        return max((p for p in reversed(self.points) if p.psnr_val is not None), key=_rank, default=None)
+
+    def equal_to(self, iteration: int) -> list[Point]:
+        """Return the evaluations between which PSNR cannot decide: that of an iteration, and all with the same PSNR."""
+        ranks = {_rank(p) for p in self.points if p.iteration == iteration}
+        return [p for p in self.points if _rank(p) in ranks]
 
     @property
     def fall(self) -> float:
@@ -92,3 +97,7 @@ class Curve:
         self.points = []
         for iteration, seconds, psnr in state:
             self.add(iteration, float(seconds), math.nan if psnr is None else float(psnr))
+
+
+def _rank(point: Point) -> float:
+    return rank(point.psnr_val)

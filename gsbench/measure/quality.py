@@ -1,9 +1,11 @@
 """Measure image quality: PSNR, SSIM, LPIPS, and their means over the views of a split.
 
 Images are float tensors [H, W, 3] and are clamped to [0, 1]. If a pixel is NaN, the result is NaN. If published code
-uses several definitions of a metric, the docstring of our function says which one is computed.
+uses several definitions of a metric, the docstring of our function says which one is computed. A mean of PSNRs is of
+capped ones, so that a view that is rendered exactly leaves it finite (gsbench.measure.exact_views).
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +20,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.tensors import check_number, check_tensor
 from gsbench.measure import perceptual
+from gsbench.measure.exact_views import capped
 from gsbench.measure.perceptual import BACKBONES, BackboneMissing
 from gsbench.measure.record import ViewScore
 from gsbench.process.memory import require
@@ -62,12 +65,17 @@ def psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
     return _decibels(_squared_error(a, b).mean())
 
 
+def capped_psnr(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
+    """Compute the `psnr` with which a view counts in a mean, dB: finite for equal images (exact_views.MOST_PSNR)."""
+    return capped(psnr(a, b))
+
+
 def psnr_channel_mean(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each
     """Compute the mean over RGB of the PSNR of each channel in dB, as some published code does.
 
-    This is at least `psnr`, by Jensen's inequality.
+    This is at least `psnr`, by Jensen's inequality, below the cap of each channel (gsbench.measure.exact_views).
     """
-    return fmean(_decibels(error) for error in _squared_error(a, b).mean((0, 1)))
+    return fmean(capped(_decibels(error)) for error in _squared_error(a, b).mean((0, 1)))
 
 
 def ssim(a: Tensor, b: Tensor) -> float:  # [H, W, 3], each, H and W >= 11
@@ -169,8 +177,8 @@ def evaluate(
 ) -> Quality:
     """Compute all metrics of all views of a split, and their means.
 
-    If the weights of an LPIPS network are missing, or an image is too small for a metric, this metric is None, and the
-    reason is returned too.
+    PSNR of a view is capped (gsbench.measure.exact_views). A metric is None, and the reason is returned too, if the
+    weights of its LPIPS network are missing, an image is too small for it, or it is not a number in a view.
 
     Args:
         images: name, render and ground truth of each view.
@@ -183,10 +191,12 @@ def evaluate(
         InputError: there is no image, sizes differ, or a weights file is missing or has the wrong SHA-256.
     """
     measures: dict[str, Callable[[Tensor, Tensor], float]] = {
-        "psnr": psnr,
+        "psnr": capped_psnr,
         "psnr_channel_mean": psnr_channel_mean,
         "ssim": ssim,
-        "psnr_background_only": lambda _, truth: psnr(torch.tensor(background).to(truth).expand_as(truth), truth),
+        "psnr_background_only": lambda _, truth: capped_psnr(
+            torch.tensor(background).to(truth).expand_as(truth), truth
+        ),
     }
     least_side = {"ssim": SSIM_LEAST_SIDE}
     for backbone, known in BACKBONES.items():
@@ -214,6 +224,8 @@ def evaluate(
                 missing[metric] = str(reason)
         for metric, value in here.items():
             scores[metric].append(value)
+            if math.isnan(value):
+                missing.setdefault(metric, f"not a number in {name}")
         del here["psnr_background_only"]  # a property of the split and not of the render
         per_view.append(ViewScore(name, **here))
     if not per_view:

@@ -17,6 +17,7 @@ from typing import Any
 from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
+from gsbench.measure.exact_views import MOST_PSNR
 from gsbench.measure.machine import Hardware, named
 from gsbench.measure.renamed import with_present_keys
 from gsbench.measure.schema import parse
@@ -56,7 +57,10 @@ class Effects:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """The image metrics of one rendered view; a metric is None if it is missing or not finite."""
+    """The image metrics of one rendered view; a metric is None if it is missing or not a number.
+
+    PSNR is capped: gsbench.measure.exact_views.
+    """
 
     name: str
     psnr: float | None = None
@@ -66,6 +70,14 @@ class ViewScore:
     lpips_vgg: float | None = None
     psnr_moving: float | None = None  # over the pixels of `Record.regions`, if the view has such pixels
     psnr_object: float | None = None
+
+    @property
+    def exact(self) -> list[str]:
+        """List the view if its PSNR is at the cap, otherwise those of its regions for which this is true."""
+        if self.psnr == MOST_PSNR:
+            return [self.name]
+        regions = {"moving": self.psnr_moving, "object": self.psnr_object}
+        return [f"{self.name} ({region})" for region, psnr in regions.items() if psnr == MOST_PSNR]
 
 
 @dataclass(frozen=True)
@@ -152,7 +164,7 @@ class Candidate:
     """One training of a comparison: its PSNR on val, and the seconds until this was measured."""
 
     name: str  # the label of the model, such as "7dgs_noagr", or the length, such as "iterations=1000"
-    psnr_val: float | None  # dB; None: not finite, or the training failed
+    psnr_val: float | None  # dB; None: not a number, or the training failed
     seconds: float
     reason: str | None = None  # why the training failed: it diverged, or no Gaussian was left
 
@@ -250,6 +262,7 @@ class Record:
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
     length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`
+    exact: list[str] = field(default_factory=list)  # views that a measurement found exact: gsbench.measure.exact_views
 
     @property
     def path(self) -> Path:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from gsbench.measure.quality import psnr, quantise
+from gsbench.measure.quality import capped_psnr, quantise
 from gsbench.measure.record import Region, ViewScore
 from gsbench.scenes import View
 
@@ -94,9 +94,12 @@ def region_psnr(
     truth: Tensor,  # [H, W, 3]
     mask: Mask,
 ) -> float:
-    """Compute PSNR over the pixels of a region: -10 log10 of the mean squared error of pixels x 3 channels, dB."""
+    """Compute PSNR over the pixels of a region: -10 log10 of the mean squared error of pixels x 3 channels, dB.
+
+    It is capped as that of a whole view (gsbench.measure.exact_views).
+    """
     inside = torch.from_numpy(mask).to(render.device)
-    return psnr(render[inside][None], truth[inside][None])  # as an image of one row
+    return capped_psnr(render[inside][None], truth[inside][None])  # as an image of one row
 
 
 class RegionScores:

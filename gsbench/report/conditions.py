@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from gsbench.errors import printable
+from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
 from gsbench.report.configurations import without
 
@@ -73,7 +74,7 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     notes += _load(records)
     if any(_commit(r).endswith("-dirty") for r in records):
         notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
-    notes += [*_rounding(records), *_stops(records), *_averages(records), *_lengths(records)]
+    notes += [*_rounding(records), *_stops(records), *_averages(records), *_lengths(records), *_exact(records)]
     notes += [_seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
 
@@ -111,6 +112,14 @@ def _load(records: list[Record]) -> list[str]:
 def _silent(number: int, runs: int) -> str:
     """Return the end of a footnote that a number of the runs do not support, or "" if all do."""
     return f"; {number} of {runs} runs do not say" if number else ""
+
+
+def _exact(records: list[Record]) -> list[str]:
+    """List a footnote that names the views whose PSNR is capped; the list is empty if there is none."""
+    exact = [r.exact for r in records if r.exact]
+    if not exact:
+        return []
+    return [printable(f"{sentence(sorted(set().union(*exact)))}, in {len(exact)} of {len(records)} runs.")]
 
 
 def _rounding(records: list[Record]) -> list[str]:

@@ -238,10 +238,14 @@ class Group:
         return total
 
     def scores(self, record: Record, quantity: str) -> dict[str, float]:
-        """Return a quantity of a run for each view, or a single value if the quantity is not measured for each view."""
-        if quantity == "psnr" and record.per_view:
-            return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
+        """Return a quantity of a run for each view, or a single value if the quantity is not measured for each view.
+
+        A run without the quantity has no value; nor has one whose PSNR is not a number in some views, because it would
+        be compared without the views in which it failed.
+        """
         value = self.value(record, quantity)
+        if quantity == "psnr" and record.per_view and math.isfinite(value):
+            return {v.name: v.psnr for v in record.per_view if v.psnr is not None}
         return {"": value} if math.isfinite(value) else {}
 
 

@@ -107,6 +107,7 @@ class Attempt:
             missing=found.missing, per_view=found.per_view, regions=found.regions,
             cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
             averaged=trainer.average.kept, length_choice=trainer.length_choice,
+            exact=sorted(trainer.exact.union(*(view.exact for view in found.per_view))),
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:

@@ -1,6 +1,5 @@
 """Train several candidates for one run, one after another, each with a checkpoint in a folder of its own."""
 
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +7,7 @@ from typing import Any
 
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
+from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate
 from gsbench.measure.speed import Effort
 from gsbench.run import fitting, progress
@@ -133,13 +133,12 @@ class Result:
     @property
     def rank(self) -> tuple[bool, float]:
         """Return the value by which candidates are compared: none that failed is above one that did not."""
-        psnr = self.found.psnr_val
-        return self.error is None, -math.inf if psnr is None else psnr
+        return self.error is None, rank(self.found.psnr_val)
 
 
 def highest(results: Sequence[Result]) -> Result:
-    """Return the result with the highest PSNR on val, the first of equal ones, which may be one that failed."""
-    return max(results, key=lambda one: one.rank)
+    """Return the result with the highest PSNR on val, the last of equal ones, which may be one that failed."""
+    return max(reversed(results), key=lambda one: one.rank)
 
 
 def best(results: Sequence[Result]) -> Result:
@@ -148,7 +147,7 @@ def best(results: Sequence[Result]) -> Result:
     Raises:
         DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
     """
-    found = highest(results)
-    if found.error is not None:
-        raise type(found.error)(f"all {len(results)} candidates failed; {found.found.name}: {found.found.reason}")
-    return found
+    top, first = highest(results), results[0]
+    if top.error is not None and first.error is not None:
+        raise type(first.error)(f"all {len(results)} candidates failed; {first.found.name}: {first.found.reason}")
+    return top

@@ -128,7 +128,8 @@ def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[
         metrics["psnr_best_on_val"] = None
         missing["psnr_best_on_val"] = "measured on val, so no other split is left to choose an iteration by"
     elif metrics["psnr_best_on_val"] is None:
-        missing["psnr_best_on_val"] = "the scene has no val split"
+        has_val = bool(trainer.scene.val)
+        missing["psnr_best_on_val"] = "PSNR on val is not a number" if has_val else "the scene has no val split"
     if config.protocol.best_on_test:
         metrics["psnr_best_on_test"] = trainer.best.eval
     return metrics, missing

@@ -14,6 +14,7 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.curve import FALL, Curve
+from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
 from gsbench.process.memory import is_out_of_memory
 from gsbench.run import claim, trackers
@@ -163,14 +164,18 @@ def write(record: Record, folder: Path) -> None:
 
 
 def summary(record: Record) -> str:
-    """Return a record in one line: PSNR, size and speed, or the reason for a failure; and whether PSNR on val fell."""
+    """Return a record in one line: PSNR, size and speed, or the reason for a failure.
+
+    It also names views that are rendered exactly, and says whether PSNR on val fell.
+    """
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
     psnr, choice = record.metrics["psnr"], record.length_choice
     kept = f"{choice.kept} iterations kept, " if choice else ""
+    exact = f". {sentence(record.exact)}" if record.exact else ""
     return (
         f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {kept}"
-        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{too_long(record)}"
+        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{exact}{too_long(record)}"
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.raster import Viewport
 from gsbench.measure.images import STEPS
-from gsbench.measure.quality import psnr
+from gsbench.measure.quality import capped_psnr
 from gsbench.models import GaussianModel
 from gsbench.models.joint import JointModel
 from gsbench.models.sliced import Gaussians3D
@@ -128,12 +128,12 @@ def compare(shot: Shot, image: Tensor, found: ExactImage) -> ViewExactness:
     )
     if shot.truth is None:
         return plain
-    own = psnr(image, shot.truth)
+    own = capped_psnr(image, shot.truth)
     away = (found.image.clamp(0, 1) - shot.truth.double()).abs()
     bound = found.bound[..., None]
     share = float((2 * away * bound + bound.square()).mean() / away.square().mean().clamp(min=1e-300))
     most = -10 * math.log10(1 - share) if share < 1 else math.inf
-    return replace(plain, psnr=own, psnr_change=own - psnr(found.image, shot.truth), psnr_bound=most)
+    return replace(plain, psnr=own, psnr_change=own - capped_psnr(found.image, shot.truth), psnr_bound=most)
 
 
 def blame(model: GaussianModel, exact: Gaussians3D, shot: Shot, found: ExactImage) -> list[Culprit]:

@@ -4,13 +4,16 @@ Polyak and Juditsky 1992, "Acceleration of stochastic approximation by averaging
 costs the same to render.
 """
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from gsbench.errors import InputError
+from gsbench.measure.exact_views import rank
 from gsbench.models import GaussianModel
 from gsbench.train.checkpoint import tensor, whole_number
 
@@ -49,7 +52,8 @@ class Average:
         """Replace the model's parameters by their means if this raises PSNR, and delete the means.
 
         A long training can overfit: its means are then better than its last parameters. In a short training they are
-        worse, because the parameters still improve while they are averaged.
+        worse, because the parameters still improve while they are averaged. The last parameters are kept, and a line
+        is printed, if PSNR is equal, or a number with neither.
 
         Args:
             last: PSNR of the model on val, dB.
@@ -62,11 +66,14 @@ class Average:
         if self.count:
             self._swap()
             averaged = psnr()
-            if averaged > last:
+            if rank(averaged) > rank(last):
                 self.kept = iterations - self.first
                 last = averaged
             else:
                 self._swap()
+                if rank(averaged) == rank(last):
+                    tqdm.write(f"step {iterations}: PSNR on val is {last:.2f} dB with the last and with averaged "
+                               f"parameters: it cannot decide, and the last are kept", file=sys.stderr)  # fmt: skip
         self.forget()
         return last
 

@@ -18,6 +18,7 @@ from gsbench.effects.direction import share_with_direction, without_direction
 from gsbench.effects.sensitivity import MOST_VIEWS, probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.errors import InputError
+from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
@@ -183,8 +184,11 @@ class Gating:
             model, sensitivity, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), intervals
         )
         if found is None:
-            self.notes.append(f"{'at the end' if at_end else f'at step {step}'} no simplification cost at most "
-                              f"{budget_db} dB on {self.checked_on}")  # fmt: skip
+            when, before = "at the end" if at_end else f"at step {step}", self.renderer.psnr(model, self.checked)
+            self.notes.append(
+                f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}" if decides(before) else
+                f"{when} nothing was simplified: a PSNR of {before:.0f} dB on {self.checked_on} cannot show a loss"
+            )  # fmt: skip
             return False
         self._adopt(found)
         seconds = time.perf_counter() - started

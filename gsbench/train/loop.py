@@ -14,6 +14,7 @@ from tqdm import tqdm
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.measure.curve import Curve
+from gsbench.measure.exact_views import MOST_PSNR, rank
 from gsbench.measure.record import LengthChoice, ModelComparison
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import Effort, StageClock
@@ -64,9 +65,9 @@ class Trainer:
             config: the config of the run.
 
         Raises:
-            InputError: a training image has a value that is not finite.
+            InputError: an image of any of these views has a value that is not finite.
         """
-        for view in scene.train:
+        for view in (*scene.train, *scene.val, *views):
             if view.pixels.is_floating_point() and not view.pixels.isfinite().all():
                 raise InputError(f"{view.name}: expected an image of finite values, got NaN or inf: render it again")
         train = config.train
@@ -97,6 +98,7 @@ class Trainer:
             self.optimizer.skip = self.finite_check.skip
         self.curve = Curve()
         self.best = Best()
+        self.exact: set[str] = set()  # names of views that a measurement found exact (gsbench.measure.exact_views)
         self.early_stop = EarlyStop(self.schedule, train.patience)
         self.comparison: ModelComparison | None = None  # by which model=auto chose this model
         self.length_choice: LengthChoice | None = None  # by which `train.lengths` chose this training
@@ -179,9 +181,13 @@ class Trainer:
     def _keep_best(self) -> None:
         """End the training with the Gaussians of the iteration that had the best PSNR on val (`train.patience`)."""
         kept = self.early_stop.take(self.step)
+        stop = self.early_stop.stop
+        if stop is not None and len(equal := self.curve.equal_to(stop.kept)) > 1:
+            tqdm.write(f"step {stop.iteration}: PSNR on val is equal at {len(equal)} steps, {equal[0].iteration} to "
+                       f"{equal[-1].iteration}: it cannot decide, and the last of them is kept",
+                       file=sys.stderr)  # fmt: skip
         if kept is not None:
             self.load_state_dict(self.state_dict() | kept)
-            stop = self.early_stop.stop
             assert stop is not None
             tqdm.write(f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends with the "
                        f"Gaussians of that step", file=sys.stderr)  # fmt: skip
@@ -271,17 +277,20 @@ class Trainer:
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
         self.early_stop.see(self.step + 1, val, self._state_of_gaussians)
         leak = self.config.protocol.best_on_test
-        if not leak and not val > self.best.val:
+        is_best = val >= rank(self.best.val)  # of equal ones the last; a NaN is never the best
+        if not leak and not is_best:
             return
         now = self.psnr(self.views)
-        if val > self.best.val:
+        if is_best:
             self.best.val, self.best.eval_at_best_val = val, now
-        if leak and (self.best.eval is None or now > self.best.eval):
+        if leak and rank(now) >= rank(self.best.eval):
             self.best.eval = now
 
     def psnr(self, views: list[View]) -> float:
-        """Return the mean PSNR of the model over views, dB."""
-        return self.renderer.psnr(self.model, views)
+        """Return the mean PSNR of the model over views in dB, and add exact views to `exact`."""
+        scores = self.renderer.psnr_of_views(self.model, views)
+        self.exact |= {view.name for view, score in zip(views, scores, strict=True) if score == MOST_PSNR}
+        return sum(scores) / len(scores)
 
     def render(self, view: View) -> Tensor:
         """Render the image of the model for the camera and time of a view, [H, W, 3]."""
@@ -301,6 +310,7 @@ class Trainer:
             "effort": self.effort.state_dict(),
             "curve": self.curve.state_dict(),
             "best": vars(self.best).copy(),
+            "exact": sorted(self.exact),
             "early_stop": self.early_stop.state_dict(),
             "comparison": asdict(self.comparison) if self.comparison else None,
             "length_choice": asdict(self.length_choice) if self.length_choice else None,
@@ -337,6 +347,7 @@ class Trainer:
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
             self.best = Best(**state["best"])
+            self.exact = set(parse(list[str], state.get("exact", []), "checkpoint: exact"))
             self.early_stop.load_state_dict(state.get("early_stop", NOTHING_KEPT))
             self.comparison = comparison_of(state)
             self.length_choice = length_choice_of(state)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.measure.quality import psnr
+from gsbench.measure.quality import capped_psnr
 from gsbench.models import GaussianModel
 from gsbench.models.render import render
 from gsbench.process.workers import side_by_side
@@ -25,11 +25,18 @@ class Renderer:
         """Render the image [H, W, 3] of a model for the camera and the time of a view."""
         return render(model, view.camera, view.time, self.background, self.antialias)
 
-    @torch.no_grad()
     def psnr(self, model: GaussianModel, views: Sequence[View]) -> float:
-        """Return the mean PSNR of a model over views in dB; on a CPU several views are rendered in parallel."""
+        """Return the mean of `psnr_of_views`, dB."""
+        return sum(self.psnr_of_views(model, views)) / len(views)
+
+    @torch.no_grad()
+    def psnr_of_views(self, model: GaussianModel, views: Sequence[View]) -> list[float]:
+        """Return the PSNR of a model in each view in dB, capped (gsbench.measure.exact_views).
+
+        On a CPU several views are rendered in parallel.
+        """
 
         def of_view(view: View) -> float:
-            return psnr(self.image(model, view), view.image)
+            return capped_psnr(self.image(model, view), view.image)
 
-        return sum(side_by_side(of_view, views, model.backend.workers(model.splats["means"]))) / len(views)
+        return list(side_by_side(of_view, views, model.backend.workers(model.splats["means"])))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gsbench.errors import InputError
+from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Stop
 from gsbench.measure.schema import parse
 from gsbench.schedule import Schedule
@@ -16,8 +17,9 @@ class EarlyStop:
     """Early stopping: hold the state of a training at its best PSNR on val; do nothing if `train.patience` is None.
 
     The training stops at the first measurement on val at which `train.patience` of all iterations, counted from the end
-    of densification at the earliest, have had no better PSNR. Iterations before the final SH degree or before AGR are
-    not kept, because the state would be shown with parts that it was not trained with.
+    of densification at the earliest, have had no better PSNR. Of iterations with equal PSNR, the last is kept.
+    Iterations before the final SH degree or before AGR are not kept, because the state would be shown with parts that
+    it was not trained with.
     """
 
     def __init__(self, schedule: Schedule, patience: float | None) -> None:
@@ -38,14 +40,14 @@ class EarlyStop:
 
         Args:
             iteration: the number of finished iterations.
-            psnr: PSNR on val, dB; NaN if there is no val.
+            psnr: PSNR on val, dB; NaN is below every number.
             state: a function that returns the state of the training.
         """
         last = self.schedule.config.iterations
         now, end = self.schedule.active(iteration - 1), self.schedule.active(last - 1)
         if self.wait is None or (now.sh_degree, now.refine) != (end.sh_degree, end.refine):
             return
-        if self._best is None or psnr > self._best[1]:
+        if self._best is None or rank(psnr) >= rank(self._best[1]):
             self._best = iteration, psnr
             self._kept = None if iteration == last else copy.deepcopy(state())
 

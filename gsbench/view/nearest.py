@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from gsbench.measure.images import Pixels, error_image, to_bytes
-from gsbench.measure.quality import psnr, quantise
+from gsbench.measure.quality import capped_psnr, quantise
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
 
@@ -79,7 +79,7 @@ def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewC
         _small(to_bytes(view.image.cpu().numpy())),
         _small(to_bytes(shown.cpu().numpy())),
         _small(error),
-        psnr(shown, view.image),
+        capped_psnr(shown, view.image),
     )
 
 

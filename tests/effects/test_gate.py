@@ -16,6 +16,7 @@ from gsbench.effects.gate import apply, choose
 from gsbench.effects.sensitivity import Sensitivity, probe
 from gsbench.errors import InputError
 from gsbench.kernels.headers import LOG_SIZE_MAX
+from gsbench.measure.exact_views import capped
 from gsbench.measure.quality import psnr
 from gsbench.models import GaussianModel, Query
 from gsbench.models.effect_sets import DIRECTION, EffectSets
@@ -212,3 +213,5 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     assert model.effect_sets is None
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None
+    exact = [psnr(view.image, view.image) for view in views[:5]]
+    assert gate_within(model, sensitivity, 0.3, lambda _: sum(map(capped, exact)) / 5) is None, "nothing shows a loss"

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,8 +156,8 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
     probed: list[list[View]] = []
     checked: list[list[View]] = []
     monkeypatch.setattr(gating, "probe", lambda _, views, *__, **___: probed.append(views))
-    monkeypatch.setattr(Renderer, "psnr", lambda _, __, views: checked.append(views))
-    monkeypatch.setattr(gating, "gate_within", lambda model, _, __, measure, ___: measure(model))
+    monkeypatch.setattr(Renderer, "psnr", lambda _, __, views: 30.0 + len(checked.append(views) or views))
+    monkeypatch.setattr(gating, "gate_within", lambda model, _, __, measure, ___: measure(model) and None)
     one, square = trainer("effects.gate=end"), moving_square(views=17)
     views, every_eighth = square.train, square.train[::8]
     others = [view for i, view in enumerate(views) if i % 8]
@@ -172,6 +173,22 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
         names = [[view.name for view in asked] for asked in (probed.pop(), checked.pop())]
         assert names == [[view.name for view in asked] for asked in expected]
         assert len(of.gating.notes) == notes
+
+
+@pytest.mark.parametrize(
+    ("scores", "line"),
+    [([30.0, 20.0], "no simplification cost at most"), ([100.0, 100.0], "a PSNR of 100 dB on val cannot show a loss"),
+     ([math.nan], "a PSNR of nan dB on val cannot show a loss")],
+)  # fmt: skip
+def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
+    scores: list[float], line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches effects that are removed because all views are exact before and after, and a loss of inf - inf."""
+    one = trainer("effects.gate=end")
+    shown = iter([*scores, *[scores[-1]] * 20, scores[0]])
+    monkeypatch.setattr(Renderer, "psnr", lambda *_: scores[0] if len(scores) < 2 else next(shown))
+    assert not one.gating.at_end(by_halves=False)
+    assert line in one.gating.notes[-1]
 
 
 def fit(x: float) -> Gate:

@@ -244,7 +244,7 @@ def test_the_curve_answers_best_last_and_time_to_accuracy():
     assert curve.last is None
     for iteration, seconds, psnr in ((100, 1.0, 20.0), (200, 2.0, 24.0), (300, 3.0, float("nan")), (400, 4.0, 24.0)):
         curve.add(iteration, seconds, psnr)
-    assert curve.best == Point(200, 2.0, 24.0)
+    assert curve.best == Point(400, 4.0, 24.0)  # of equal ones the last
     assert curve.last == Point(400, 4.0, 24.0)
     assert curve.points[2].psnr_val is None
     assert curve.seconds_to(20.0) == 1.0

@@ -51,6 +51,16 @@ def test_a_pair_is_compared_on_common_seeds_and_views():
     assert not pair.differs
 
 
+def test_a_run_that_failed_in_a_view_has_no_pair():
+    """Catches a model whose PSNR is not a number in a view, compared without this view although its mean is empty."""
+    broken = run("a", 0, (20.0, 30.0))
+    scores = [dataclasses.replace(broken.per_view[0], psnr=None), broken.per_view[1]]
+    broken = dataclasses.replace(
+        broken, per_view=scores, metrics={"psnr": None}, missing={"psnr": "not a number in test/r_000"}
+    )
+    assert pairs(group(broken, run("b", 0, (22.0, 29.0)))) == []
+
+
 def test_only_the_common_variant_is_compared():
     """Catches a short run of one model that meets a long run of another."""
     runs = [run(m, s, (v, v + s / 10)) for m, v in (("a", 20.0), ("b", 21.0)) for s in range(3)]

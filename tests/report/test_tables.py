@@ -289,6 +289,16 @@ def test_runs_of_several_lengths_are_told():
     assert "train.lengths" not in page(make(seed=0), make(seed=1))
 
 
+def test_views_at_the_cap_are_told():
+    """Catches a mean with a view at the cap that a reader takes for one without, and a name read as Markdown."""
+    text = page(make(seed=0), make(seed=1, exact=["b", "a|"]), make(seed=2, exact=["b"]))
+    assert (
+        "- PSNR of a\\|, b is infinite or nearly so and counts as 100 dB (docs/protocol.md#exact-views), in 2 of 3"
+        in text
+    )
+    assert "counts as" not in page(make(seed=0), make(seed=1))
+
+
 def test_runs_that_end_with_averaged_parameters_are_told():
     """Catches parameters chosen on val that stand as those of the last iteration."""
     said = "- 2 of 3 runs ended with parameters averaged over the last 490 to 500 iterations, because PSNR on val was"

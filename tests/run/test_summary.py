@@ -23,3 +23,11 @@ def test_a_training_that_was_better_earlier_says_so(last: float | None, said: st
     assert (said in line) if said else "higher" not in line
     assert "higher" not in summary(replace(record, curve=curve, stop=Stop(iteration=900, kept=600)))
     assert "higher" not in summary(replace(record, curve=[]))
+
+
+def test_views_at_the_cap_are_named() -> None:
+    """Catches a PSNR that nobody can tell from one without a view that is rendered exactly."""
+    assert "counts as" not in summary(make())
+    assert ". PSNR of test/r_3 is infinite or nearly so and counts as 100 dB" in summary(
+        replace(make(), exact=["test/r_3"])
+    )
