@@ -172,7 +172,7 @@ def summary(record: Record) -> str:
         return f"{record.status}: {record.reason}"
     psnr, choice = record.metrics["psnr"], record.length_choice
     kept = f"{choice.kept} iterations kept, " if choice else ""
-    exact = f". {sentence(record.exact)}" if record.exact else ""
+    exact = f". {printable(sentence(record.exact))}" if record.exact else ""
     return (
         f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {kept}"
         f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{exact}{too_long(record)}"

@@ -10,6 +10,7 @@ from tiny_run import main_here, overrides, write_moving_square
 from gsbench import kernels
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.cameras import around
+from gsbench.run.load import load_run
 from gsbench.scenes import Points
 from gsbench.scenes.trained import TrainedGaussians, ply_of
 from gsbench.stability import frame, frame_report
@@ -49,6 +50,17 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
     assert 0 < len(found["worst"]) <= frame.WORST
     assert "decimal of the mean PSNR" in found["verdict"]
     assert (run / "exactness.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_an_exact_view_has_no_change(run: Path) -> None:
+    """Catches a mean PSNR whose change is NaN, infinity less infinity, as one view is the background alone."""
+    model = load_run(run).model
+    empty = frame.Shot("empty", around(model, 4.0, 32, 32, 0.0), 0.0, torch.zeros(32, 32, 3))
+    with torch.no_grad():
+        model.splats["opacities"].fill_(-50.0)
+    found = frame.measure(model, [empty], (0.0, 0.0, 0.0), "")
+    assert (found.views[0].psnr, found.views[0].psnr_change) == (100.0, 0.0)
+    assert "no decimal of the mean PSNR" in frame_report.verdict(found)
 
 
 def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -79,6 +79,8 @@ def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
     run.config.protocol.quantise = True
     assert compare(renderer, view, FrameRequest(view.time)).psnr == psnr(quantise(image), view.image) != compared.psnr
     assert compare(renderer, view, FrameRequest(view.time, agr=False)).psnr != compared.psnr
+    exact = replace(view, pixels=quantise(image))
+    assert compare(renderer, exact, FrameRequest(view.time)).psnr == 100.0, "a mean over views would be infinite"
 
 
 def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> None:
