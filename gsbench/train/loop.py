@@ -346,7 +346,8 @@ class Trainer:
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state.get("effort"))
             self.curve.load_state_dict(state["curve"])
-            self.best = Best(**state["best"])
+            best = Best(**state["best"])
+            self.best = Best() if best.val == math.inf else best  # older versions stored an infinite PSNR
             self.exact = set(parse(list[str], state.get("exact", []), "checkpoint: exact"))
             self.early_stop.load_state_dict(state.get("early_stop", NOTHING_KEPT))
             self.comparison = comparison_of(state)

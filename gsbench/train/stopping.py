@@ -1,6 +1,7 @@
 """Keep the iteration with the best PSNR on val, and stop a training whose PSNR on val no longer rises."""
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -80,5 +81,8 @@ class EarlyStop:
         best, self._kept = state["best"], state["kept"]
         if best is not None and not (len(best) == 2 and isinstance(best[0], int) and isinstance(best[1], float)):
             raise InputError(f"checkpoint: expected the best iteration and its PSNR, got {best!r:.80}")
-        self._best = None if best is None else (best[0], best[1])
+        if best is None or math.isinf(best[1]):  # older versions stored an infinite PSNR, which no step would exceed
+            self._best = self._kept = None
+        else:
+            self._best = best[0], best[1]
         self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")

@@ -84,6 +84,16 @@ def test_psnr_is_of_the_region_alone() -> None:
     assert region_psnr(render, truth, mask) == pytest.approx(20.0, abs=1e-4)
 
 
+def test_an_exact_region_leaves_the_mean_finite() -> None:
+    """Catches an infinite mean over regions, as the object of one view is rendered exactly."""
+    views = [view("0", (10, 10), alpha=True), view("1", (30, 30), alpha=True)]
+    scores = RegionScores(views, quantised=False)
+    assert list(scores.measured([("0", views[0].image, views[0].image), ("1", views[1].image + 0.1, views[1].image)]))
+    assert scores.metrics()["psnr_object"] == pytest.approx(60.0, abs=1e-3)
+    exact, other = scores.with_scores([ViewScore("0", 30.0), ViewScore("1", 31.0)])
+    assert (exact.exact, other.exact) == (["0 (object)"], [])
+
+
 def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     """Catches a view without a region that counts, a metric without a value or a reason, and another view's score."""
     views = [view("0", (10, 10), alpha=True), view("1", None, alpha=True)]

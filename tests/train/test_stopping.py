@@ -88,6 +88,21 @@ def test_a_killed_run_keeps_the_same_iteration() -> None:
     assert_same_bits([p.data for p in resumed.model.parameters()], [p.data for p in whole.model.parameters()])
 
 
+def test_an_infinite_psnr_of_an_older_checkpoint_decides_nothing() -> None:
+    """Catches a training that keeps an early step, and its test score, because val had an exact view there."""
+    fitted = with_val({}, "effects.gate=off")
+    state = fitted.state_dict()
+    state["early_stop"] |= {"best": (10, float("inf")), "kept": {"model": "of step 10"}}
+    state["best"] |= {"val": float("inf"), "eval_at_best_val": 12.0}
+    del state["exact"]
+    fitted.load_state_dict(state)
+    fitted.run(lambda _: None, "square")
+    assert fitted.early_stop.stop is not None
+    assert fitted.early_stop.stop.kept == 100
+    assert (fitted.best.val, fitted.exact) == (0.99, set())
+    assert fitted.best.eval_at_best_val != 12.0
+
+
 @pytest.mark.parametrize("changed", [{"best": 3}, {"best": ("a", 1.0)}, {"kept": 3}, {"stop": {"iteration": "x"}}, {}])
 def test_a_damaged_checkpoint_is_refused(changed: dict[str, Any]) -> None:
     """Catches a stack trace from what a checkpoint says was kept."""
