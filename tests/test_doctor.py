@@ -50,6 +50,15 @@ def test_a_part_that_is_broken_is_status_1_with_advice(name, capsys, monkeypatch
     assert found[name].todo
 
 
+def test_the_compiler_is_the_one_that_builds(capsys, monkeypatch, tmp_path):
+    """Catches the first compiler of a list in place of the one that CXX names, with which a build from source runs."""
+    compiler = tmp_path / "my-c++"
+    compiler.write_text("#!/bin/sh\necho my compiler 1.0\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    assert checks(capsys)["compiler"].found == "my compiler 1.0"
+
+
 def test_kernels_that_render_something_else_are_found(capsys, monkeypatch):
     """Catches kernels that are only looked for: a build for another machine may load and compute nonsense."""
     monkeypatch.setattr(doctor, "_difference", lambda: 0.5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from worlds import World, appearing, brightening, filmed, moving, rigged, small_mover, still
+from worlds import World, appearing, brightening, camera, filmed, moving, rigged, small_mover, still
 
 from gsbench.effects import rig
 from gsbench.effects.choose import screen
@@ -127,6 +127,22 @@ def test_cameras_that_are_held_are_never_off() -> None:
     assert len(find_places(scene.train, scene.extent).held) == 6
     assert screen(scene).decision != "off"
     assert screen(rigged(still, 6, 10, shake=0.005)).decision == "undecided"
+
+
+@pytest.mark.parametrize(("width", "height"), [(24, 48), (48, 24)])
+def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
+    """Catches shifts in units of the width alone: in a portrait image they would be twice as large, and no camera held.
+
+    A camera that turns around the scene by a moves by sqrt(2) a f / side in these units, here by 0.04 of at most 0.05.
+    """
+    scene, K = rigged(still, 4, 3), torch.tensor([[57.6, 0.0, width / 2], [0.0, 57.6, height / 2], [0.0, 0.0, 1.0]])
+    angle = 0.04 * 48 / 57.6 / math.sqrt(2)
+    turned = [
+        replace(view, camera=replace(camera(azimuth + angle * moment, 0.2), K=K, width=width, height=height),
+                time=moment)
+        for azimuth in (0.0, 1.5, 3.0, 4.5) for view, moment in zip(scene.train, (0.0, 0.5, 1.0), strict=False)
+    ]  # fmt: skip
+    assert [len(place) for place in find_places(turned, scene.extent).held] == [3] * 4
 
 
 def test_places_are_told_by_their_cameras() -> None:

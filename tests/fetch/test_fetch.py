@@ -13,7 +13,7 @@ from urllib.parse import quote, unquote
 import pytest
 
 from gsbench.errors import InputError
-from gsbench.fetch.__main__ import main
+from gsbench.fetch.__main__ import fetch, main
 from gsbench.fetch.download import download
 from gsbench.fetch.sources import MIRROR, Source
 
@@ -98,6 +98,13 @@ def test_a_file_arrives_whole_and_once(path: str, address: str, tmp_path: Path) 
         assert download(source(address + path, tmp_path, known[:8]), tmp_path).read_bytes() == PAYLOAD
     assert Handler.asked.count(path) == 1
     assert len([*tmp_path.iterdir()]) == 1
+
+
+def test_a_file_that_was_there_is_said_to_be(address: str, tmp_path: Path) -> None:
+    """Catches "is there: nothing fetched" for what was just fetched."""
+    weights = source(f"{address}/file.bin", tmp_path, hashlib.sha256(PAYLOAD).hexdigest()[:8])
+    assert fetch(weights) == f"file: {tmp_path}/file.bin fetched"
+    assert fetch(weights) == f"file: {tmp_path}/file.bin is there: nothing fetched"
 
 
 @pytest.mark.parametrize(

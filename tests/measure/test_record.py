@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from gsbench.measure import machine
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
-from gsbench.measure.provenance import git_commit, provenance
+from gsbench.measure.provenance import git_commit, provenance, versions
 from gsbench.measure.record import METRICS, Cost, Effects, Gate, OnDemand, Provenance, Record, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.sweep import traces
@@ -65,6 +66,20 @@ plain = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
     max_leaves=8,
 )
+
+
+def test_a_package_that_is_missing_hides_no_other(monkeypatch):
+    """Would catch versions that end at the first package that is not installed, such as LPIPS."""
+    known, version = versions(), metadata.version
+    assert {"python", "gsbench", "torch", "numpy", "lpips", "opencv-contrib-python-headless"} <= known.keys()
+
+    def without(package: str) -> str:
+        if package == "numpy":
+            raise metadata.PackageNotFoundError(package)
+        return version(package)
+
+    monkeypatch.setattr(metadata, "version", without)
+    assert versions() == {name: value for name, value in known.items() if name != "numpy"}
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -86,6 +86,25 @@ def test_wrong_options_are_refused(name: str) -> None:
             assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_every_number_among_the_options_matters(name: str) -> None:
+    """Catches an option that is checked and then forgotten: neither the start nor a slice depends on it."""
+
+    def numbers(options: dict[str, Any]) -> list[Tensor]:
+        model = started(build(name, **options))
+        start = [x.detach().clone() for x in model.splats.values()]
+        return [*start, *tensors_of(moved(model).slice(QUERY))]
+
+    options, static = awkward(name), "time" not in registry.find(name).observes
+    known = numbers(options)
+    for key in options:
+        if static and "time" in key:  # of a model that derives from one with time
+            continue
+        both = name == "ndgs" and key in ("lambda_d", "lambda_t")  # which a joint gate needs equal
+        changed = {"lambda_d": 0.25, "lambda_t": 0.25} if both else {key: 0.25}
+        assert any(not torch.equal(x, y) for x, y in zip(known, numbers(options | changed), strict=True)), key
+
+
 @EVERY
 @pytest.mark.parametrize("count", [0, 1, N])
 def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:

@@ -120,6 +120,19 @@ def test_what_comes_after_the_end_is_no_event():
     assert not any("A" in letters for _, letters in found)
 
 
+@pytest.mark.parametrize("most", [300.0, 4e5, 2e9])
+def test_a_logarithmic_axis_is_marked_to_its_end(most):
+    """Catches at most seven ticks of a long axis that all stand at its left, and an axis without a number."""
+    marks = [charts.Mark(x, 20.0, i) for i, x in enumerate((2e-3, 1.0, most))]
+    panel = charts.frontier([charts.FrontierCurve(Style(0, "o"), marks)], "s")
+    low, high = panel.axes.get_xlim()
+    ticks = np.array(panel.axes.get_xticks())
+    assert 3 <= len(ticks) <= 7
+    assert low <= ticks.min() <= ticks.max() <= high
+    gaps = np.diff(np.log10([low, *ticks, high]))
+    assert gaps.max() < 0.5 * np.log10(high / low)
+
+
 def test_a_profile_counts_what_is_reached_at_a_ratio():
     """Catches a share that leaves out the target at its own ratio: one of two at 1, both from 3 on, one never."""
     style = Style(0, "o")

@@ -38,6 +38,16 @@ def test_the_golden_page():
     assert layout.terminal(tables.build(records())) == GOLDEN_TERMINAL.read_text()
 
 
+def test_settings_of_every_run_are_said_once():
+    """Would catch a table whose runs are all shorter, or without a part, and that reads as the experiment's own."""
+    every = page(make("3dgs", variant="iterations=500"), make("7dgs", variant="iterations=500"))
+    assert "- every run with iterations=500, not the experiment's own." in every
+    assert "| 7dgs | " in every
+    some = page(make("3dgs"), make("7dgs", variant="iterations=500"))
+    assert "every run with" not in some
+    assert "| 7dgs iterations=500 | " in some
+
+
 def test_a_table_names_the_scenes_that_settings_were_chosen_on():
     """Would catch a page that reports as a finding what was chosen on its own scene."""
     text = page(make(scene="suzanne"), make(scene="nobodys"))

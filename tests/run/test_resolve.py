@@ -1,8 +1,10 @@
 """Which model model=auto becomes, for each answer of the screen."""
 
+import json
 from pathlib import Path
 
 import pytest
+from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.config import Config
 from gsbench.effects import choose
@@ -38,3 +40,19 @@ def test_other_models_are_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(choose, "screen", lambda *_: pytest.fail("the scene was screened"))
     config = compose("7dgs", 10)
     assert resolve(run_of(config), moving_square()).config is config
+
+
+def test_a_scene_without_times_is_static(tmp_path: Path) -> None:
+    """Catches model=auto that is refused, as AGR is, for a scene whose images have no times."""
+    data = write_moving_square(tmp_path / "data")
+    for path in data.glob("*/*.json"):
+        content = json.loads(path.read_text())
+        for frame in content["frames"]:
+            del frame["time"]
+        path.write_text(json.dumps(content))
+    record, _ = run_here(*overrides(data, tmp_path / "results", "model=auto", "effects.gate=off"))
+    assert (record.status, record.reason) == ("ok", None)
+    assert record.on_demand is not None
+    assert record.on_demand.screen is not None
+    assert (record.on_demand.screen.decision, record.on_demand.screen.reason) == ("off", "the views have no times")
+    assert (record.effects.time, record.effects.refinement) == (False, False)

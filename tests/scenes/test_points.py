@@ -10,9 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from gsbench.config import DataConfig
 from gsbench.errors import InputError
+from gsbench.run.fitting import initial_points
 from gsbench.scenes.points import frustum_points, nearest_distances, random_points, read_ply
-from gsbench.scenes.scene import Camera
+from gsbench.scenes.scene import Camera, Scene, View
 
 VERTEX = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
@@ -169,6 +171,19 @@ def test_cameras_that_face_each_other_see_points_in_between() -> None:
         x = points.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         assert (x[:, 2] > 0).all()
         assert ((x[:, :2] / x[:, 2:]).abs() <= torch.tensor([12 / 30, 20 / 30]) + 1e-5).all()
+
+
+def test_points_of_a_scene_are_seen_by_all_its_cameras() -> None:
+    """Catches initial points that only the first training camera looks at."""
+    cameras = opposed(8.0)
+    train = [View(f"train/{i}", camera, None, torch.zeros(40, 24, 3)) for i, camera in enumerate(cameras)]
+    scene = Scene("opposed", train, [], [], (0.0, 0.0, 0.0), 1.0, None, "made here")
+    points = initial_points(
+        DataConfig(initial_points=200, initial_half_width=None), scene, torch.Generator().manual_seed(0)
+    )
+    for camera in cameras:
+        depth = (points.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2]
+        assert (depth > 0).float().mean() > 0.95
 
 
 def test_cameras_back_to_back_see_nothing_in_common() -> None:

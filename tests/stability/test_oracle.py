@@ -1,6 +1,8 @@
 """The oracle itself: what it says of things known otherwise, and that its digits suffice."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +11,9 @@ from mpmath import mp
 
 from gsbench.models.appearance import sh_basis
 from gsbench.models.factors import KINDS
-from gsbench.stability import oracle, population, slicing_cases
+from gsbench.stability import moving_population, oracle, population, slicing_cases
 from gsbench.stability.cases import CASES, of_area
-from gsbench.stability.slices import exact
+from gsbench.stability.slices import SliceTruth, exact
 
 
 def row(observed: slicing_cases.Observed, i: int) -> list[float]:
@@ -62,6 +64,31 @@ def test_the_reference_of_the_million(order: str) -> None:
     """Catches a wrong covariance or gradient in float64, which a million slices are held to: mpmath agrees to 1e-6."""
     hard = population.draw(torch.Generator().manual_seed(7), 6, order)
     assert population.verify(hard, order, 6) < 1e-6
+
+
+@pytest.mark.parametrize("part", ["outputs", "gradient"])
+def test_the_reference_of_moving_slices(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a check of the float64 slices against mpmath that looks at their values or at their gradients alone."""
+    observed = moving_population.draw(torch.Generator().manual_seed(7), "freetime", 4)
+    assert moving_population.verify(observed) < 1e-6
+    truth = moving_population.truth
+
+    def wrong(*arguments: Any) -> SliceTruth:
+        right = truth(*arguments)
+        return replace(right, **{part: getattr(right, part) + 1e-2 * getattr(right, part).abs().amax()})
+
+    monkeypatch.setattr(moving_population, "truth", wrong)
+    assert moving_population.verify(observed) > 1e-4
+
+
+def test_a_seed_of_the_drift_is_one_of_the_points_too() -> None:
+    """Catches three seeds that all start from the same points."""
+    trainings = [CASES["single_against_double"](model="7dgs", run_seed=seed) for seed in (0, 1)]
+    assert [one.config.seed for one in trainings] == [0, 1]
+    first, second = (one.scene.points for one in trainings)
+    assert first is not None
+    assert second is not None
+    assert not torch.equal(first.means, second.means)
 
 
 def test_every_case_says_what_it_stresses() -> None:

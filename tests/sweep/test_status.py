@@ -17,6 +17,7 @@ from gsbench.run import progress
 from gsbench.run.progress import Progress, born
 from gsbench.sweep import plan, status
 from gsbench.sweep.__main__ import lines, main
+from gsbench.sweep.finish import see_through
 from gsbench.sweep.plan import Ended, Plan
 from gsbench.sweep.slurm import Queue
 from gsbench.sweep.status import RunStatus
@@ -285,6 +286,20 @@ def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
     plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
     run = only(tmp_path)
     assert (run.state, run.reason) == ("failed", "seed: expected >= 0, got -1")
+
+
+def test_a_sweep_ends_with_its_own_runs(tmp_path: Path) -> None:
+    """Catches a sweep that ends badly because of a run of another sweep in the same folder of results."""
+    plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
+    words = crowd.overrides("3dgs", "trex", 1)
+    later = planned(tmp_path, SECOND, runs=[words])
+    path = tmp_path / "trex" / "3dgs" / "seed1" / "record.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(crowd.record("3dgs", "trex", 1), default=str))
+    assert len(status.status(status.read(tmp_path))) == 2
+    assert see_through(lambda: None, [later]) == []
+    (broken,) = see_through(lambda: None, [tmp_path / plan.FOLDER / FIRST])
+    assert broken.reason == "seed: expected >= 0, got -1"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0"])
