@@ -80,7 +80,9 @@ def _stated(records: list[Record], spread: str) -> list[str]:
 
 
 def _protocol(record: Record, name: str) -> str:
-    return printable(record.protocol.get(name, _UNSAID.get(name, "not recorded")))
+    if (value := record.protocol.get(name)) is None:
+        value = _UNSAID.get(name, "none" if name in record.protocol else "not recorded")
+    return printable(value)
 
 
 def _iterations(record: Record) -> str:

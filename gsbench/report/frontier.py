@@ -10,11 +10,13 @@ from gsbench.report import paper
 from gsbench.report.configurations import Configuration, Group, Values
 from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
+from gsbench.report.paper_protocol import has_images_of_paper
 
 COSTS = ("seconds", "ms", "mb")
 BUDGETS = (("seconds", 10.0), ("seconds", 60.0), ("seconds", 600.0), ("ms", 1000 / 60))  # answered in each report
 STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
 FEWEST_TARGETS = 3  # for one scene
+WIDEST = 100.0  # dB from the lowest result, above which there is no target: more is no difference between models
 
 
 @dataclass(frozen=True)
@@ -179,12 +181,15 @@ def targets(group: Group) -> list[Target]:
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:
-    """Return a scene's PSNR targets: round values between the lowest and highest result, and the paper's 7dgs value."""
+    """Return a scene's PSNR targets: round values between the lowest and highest result, and the paper's 7dgs value.
+
+    The paper's value is no target for runs on other images than the paper's, such as images of another size.
+    """
     if not reached:
         return []
     rules = [(f"{psnr:g} dB", psnr) for psnr in round_numbers(min(reached), max(reached))]
-    run = next(r for r in group.records if r.scene == scene)
-    row = paper.paper_row(run.dataset, scene, "7dgs") if run.protocol.get("paper_dataset") == run.dataset else None
+    comparable = all(has_images_of_paper(r) for r in group.finished if r.scene == scene)
+    row = paper.paper_row(group.dataset, scene, "7dgs") if comparable else None
     return [*rules, *([("paper's 7dgs", row.psnr)] if row else [])]
 
 
@@ -196,6 +201,7 @@ def round_numbers(low: float, high: float) -> list[float]:
     own PSNR.
     """
     found: list[float] = []
+    high = min(high, low + WIDEST)
     for step in STEPS:
         found = [round(i * step, 1) for i in range(math.floor(low / step) + 1, math.floor(high / step) + 1)]
         if len(found) >= FEWEST_TARGETS:

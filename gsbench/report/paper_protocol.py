@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report.configurations import iterations, without
-from gsbench.report.paper import PROTOCOLS
+from gsbench.report.paper import PROTOCOLS, Protocol
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
 # Settings of a variant that do not belong to a model's training settings: they change what is measured, or the heading
@@ -104,19 +104,36 @@ def departure(record: Record) -> str:
     if record.scene not in protocol.scenes:
         return "scene"
     config = record.provenance.config
-    expected: dict[str, tuple[Any, Any]] = {
-        "size": (record.protocol.get("resolution"), protocol.sizes.get(record.scene, protocol.sizes["*"])),
-        "filter": (record.protocol.get("resize"), None),
+    expected: dict[str, tuple[Any, Any]] = _of_images(record, protocol) | {
         "iterations": (iterations(record), protocol.iterations),
         "batch size": (_part(config, "train").get("batch_size"), protocol.batch_size),
-        "split": (record.protocol.get("eval_split"), protocol.splits.get(record.scene, protocol.splits["*"])),
-        "background": (record.protocol.get("background"), "black"),
-        "quantisation": (record.protocol.get("quantise"), False),
         "frames": (_count(_part(config, "scene").get("frames")), protocol.frames),
     }
     if record.status != "ok" and record.protocol.get("resolution") == "not loaded":
         del expected["size"]  # a run that failed before it saw an image
     return ", ".join(name for name, (theirs, papers) in expected.items() if theirs != papers)
+
+
+def has_images_of_paper(record: Record) -> bool:
+    """Tell whether a run is measured on the images of the 7DGS paper, of the paper's size, split and background.
+
+    Only then can its PSNR be compared with the paper's. The training may be another one.
+    """
+    protocol = PROTOCOLS.get(record.dataset)
+    if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
+        return False
+    return all(theirs == papers for theirs, papers in _of_images(record, protocol).values())
+
+
+def _of_images(record: Record, protocol: Protocol) -> dict[str, tuple[Any, Any]]:
+    """Return the settings of the images on which a run is measured, by name, each beside that of the paper."""
+    return {
+        "size": (record.protocol.get("resolution"), protocol.sizes.get(record.scene, protocol.sizes["*"])),
+        "filter": (record.protocol.get("resize"), None),
+        "split": (record.protocol.get("eval_split"), protocol.splits.get(record.scene, protocol.splits["*"])),
+        "background": (record.protocol.get("background"), "black"),
+        "quantisation": (record.protocol.get("quantise"), False),
+    }
 
 
 def model_recipe(record: Record) -> ModelRecipe:

@@ -170,19 +170,22 @@ def test_no_target_is_the_winners_own_mean():
         (24.1, 25.3, [24.2, 24.4, 24.6, 24.8, 25.0, 25.2]),
         (24.11, 24.19, []),
         (-0.1, 0.05, [0]),
+        (0.0, 1e60, list(range(2, 101, 2))),
     ],
 )
 def test_targets_are_as_far_apart_as_gives_three(low, high, expected):
-    """Catches a target at or below the lowest run, one above the highest, and a dozen where three will do."""
+    """Catches a target at or below the lowest run, one above the highest, a dozen where three will do, and 1e60."""
     assert frontier.round_numbers(low, high) == expected
 
 
-def test_the_papers_number_is_a_target_only_on_its_own_data():
-    """Catches the paper's 30.72 dB of trex as a target of a stand-in that has the scene's name."""
-    theirs = {**make().protocol, "paper_dataset": "D-NeRF"}
-    for dataset, expected in (("D-NeRF", [30.72]), ("mini", [])):
+def test_the_papers_number_is_a_target_only_on_its_own_images():
+    """Catches the paper's 30.72 dB of trex as a target of a stand-in of that name, and of images of another size."""
+    for dataset, size, expected in (("D-NeRF", "400x400", [30.72]), ("mini", "400x400", []), ("D-NeRF", "80x80", [])):
+        of_paper = {"paper_dataset": "D-NeRF", "background": "black", "resolution": size}
+        protocol = {**make().protocol, **of_paper}
         runs = [
-            dataclasses.replace(r, dataset=dataset, protocol=theirs) for r in runs_of("a", "", 31.0, 10.0, scene="trex")
+            dataclasses.replace(r, dataset=dataset, protocol=protocol)
+            for r in runs_of("a", "", 31.0, 10.0, scene="trex")
         ]
         assert [t.psnr for t in frontier.targets(group(*runs)) if "paper" in t.rule] == expected
 

@@ -23,7 +23,7 @@ from gsbench.report import compare, live
 from gsbench.report.__main__ import main
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
-from gsbench.report.frontier import choose, points
+from gsbench.report.frontier import choose, points, targets
 from gsbench.report.page import build, charts, cost, evidence, gallery, messages, palette, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Column, DataTable, Runs
 from gsbench.report.page.events import of as events_of
@@ -599,9 +599,14 @@ def test_hostile_is_hostile():
 
 
 def test_the_papers_points_are_marked_as_other_hardware(tmp_path):
-    """Catches the paper's seconds among ours without a word, and on a stand-in of the same name."""
-    for dataset, expected in (("D-NeRF", True), ("mini", False)):
-        protocol = {**make().protocol, "paper_dataset": "D-NeRF"}
+    """Catches the paper's seconds among ours without a word, on a stand-in of the same name, and at another size."""
+    for dataset, size, expected in (
+        ("D-NeRF", "400x400", True),
+        ("mini", "400x400", False),
+        ("D-NeRF", "80x80", False),
+    ):
+        of_paper = {"paper_dataset": "D-NeRF", "background": "black", "resolution": size}
+        protocol = {**make().protocol, **of_paper}
         runs = [make(scene="trex", seed=s, psnr=31.0 + s, dataset=dataset, protocol=protocol) for s in range(2)]
         text = page(runs, tmp_path)
         assert ("the paper's own number, which was measured on other hardware" in Page(text).text) == expected
@@ -616,6 +621,19 @@ def test_many_experiments_share_one_page(tmp_path):
     text = page(records, tmp_path)
     assert len(text) < 2_000_000
     assert "none are drawn singly; the table has all" in Page(text).text
+
+
+def test_a_target_that_no_run_reached_has_no_profile(tmp_path):
+    """Catches a division by no target after a first short run on the paper's data, whose 7DGS no run here reached."""
+    protocol = {**make().protocol, "paper_dataset": "D-NeRF", "background": "black", "resolution": "400x400"}
+    short = make(scene="trex", psnr=21.0, dataset="D-NeRF", protocol=protocol)
+    section = time_to_quality.quality_section(group([short]), canvas())
+    assert section.sentences == ["No finished run reached the target."]
+    assert [row[1:] for row in section.table.rows] == [["paper's 7dgs", 30.72, math.inf]]
+    assert section.tabs[0].drawings == []
+    assert "never" in Page(page([short], tmp_path)).text
+    small = dataclasses.replace(short, protocol={**protocol, "resolution": "100x100"})
+    assert not any(target.rule == "paper's 7dgs" for target in targets(group([small])))
 
 
 def test_zeros_and_single_points_can_be_drawn(tmp_path):

@@ -12,6 +12,7 @@ from gsbench.report.frontier import FrontierPoint
 from gsbench.report.page import charts, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Runs, Tab, Value
 from gsbench.report.page.palette import Style
+from gsbench.report.paper_protocol import has_images_of_paper
 
 AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the model"))
 MOST_RUNS = 300  # single runs that are drawn in a figure
@@ -210,12 +211,12 @@ def _curve(
 
 
 def _paper(record: Record, cost: str) -> tuple[float, float] | None:
-    """Return the cost and the PSNR of a model in the 7DGS paper, or None if the run used other data.
+    """Return the cost and the PSNR of a model in the 7DGS paper, or None if the run used other data or image sizes.
 
     The paper measured the cost on other hardware.
     """
     row = paper.paper_row(record.dataset, record.scene, record.model)
-    if record.protocol.get("paper_dataset") != record.dataset or row is None:
+    if row is None or not has_images_of_paper(record):
         return None
     if cost == "seconds":
         return (row.train_min * 60, row.psnr) if row.train_min else None

@@ -16,9 +16,11 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
         return PageSection("quality", "Time to quality", [text])
     ratios = f.profile(targets)
-    problems = len(next(iter(ratios.values()), []))
-    panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
-    alt = f"Performance profile of {messages.listing(list(ratios))} over {problems} targets"
+    drawings = []
+    if problems := len(next(iter(ratios.values()))):
+        panel = charts.profile({m: (canvas.look[m], list(values)) for m, values in ratios.items()}, problems)
+        alt = f"Performance profile of {messages.listing(list(ratios))} over {problems} targets"
+        drawings = [PageFigure("Targets reached within a factor of the fastest", panel, f"{canvas.name}q", alt)]
     models = [m for m in canvas.look if any(m in t.seconds for t in targets)]
     columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
     rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
@@ -26,7 +28,7 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         "quality",
         "Time to quality",
         _quality_words(targets, models),
-        [Tab("", [PageFigure("Targets reached within a factor of the fastest", panel, f"{canvas.name}q", alt)])],
+        [Tab("", drawings)],
         DataTable("time_to_quality.csv", columns, rows),
         beside=True,
         legend=True,
@@ -45,6 +47,8 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     The text also says how many targets only one model reaches.
     """
     reached = {m: sum(math.isfinite(t.seconds.get(m, math.inf)) for t in targets) for m in models}
+    if not any(reached.values()):
+        return [f"No finished run reached {'the target' if len(targets) == 1 else 'a target'}."]
     fastest = {m: sum(t.seconds.get(m, math.inf) == min(t.seconds.values()) for t in targets) for m in models}
     most = [m for m in models if reached[m] == max(reached.values())]
     quick = [m for m in models if fastest[m] == max(fastest.values())]
