@@ -20,6 +20,7 @@ smartquotes_action = "D"  # dashes and no quotes: autodoc writes "name -- what i
 
 html_theme = "furo"
 html_title = f"gsbench {release}"
+html_static_path, html_css_files = ["static"], ["site.css"]
 html_show_sourcelink = html_copy_source = False
 pygments_style, pygments_dark_style = "default", "github-dark"
 

@@ -188,6 +188,7 @@ def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
     loaded = {one for path in site.rglob("*.html") for one in Page(path.read_text()).loaded}
     assert not [one for one in loaded if one.startswith(("http:", "https:", "//"))]
     assert "red ball" in (site / "api.html").read_text()
+    assert "site.css" in (site / "results.html").read_text(), "without it, a table of ten columns is cut"
 
 
 def test_broken_links_of_a_site_are_found(tmp_path: Path) -> None:

@@ -75,9 +75,9 @@ def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
     if not scene.has_time:
         return ScreenResult(OFF, "the views have no times")
     if len({view.time for view in views}) == 1:
-        return ScreenResult(UNDECIDED, "all training views are of one time")
+        return ScreenResult(UNDECIDED, "all training views have the same time")
     if len(views) < LEAST_VIEWS:
-        return ScreenResult(UNDECIDED, f"{len(views)} training views are too few to tell, {LEAST_VIEWS} are needed")
+        return ScreenResult(UNDECIDED, f"{len(views)} training views are too few; {LEAST_VIEWS} are needed")
     places = find_places(views, scene.extent)
     answers = []
     if places.fixed:
@@ -91,16 +91,16 @@ def _of_fixed(views: Sequence[View], places: Places, seed: int) -> ScreenResult:
     """Test for change with time by comparing the images that were taken from the same camera position."""
     found = compare_places(views, places.fixed, seed)
     count = len(places.fixed)
-    where = f"each of {count} camera places" if count > 1 else "the camera's place"
+    where = f"the images of each of {count} camera positions" if count > 1 else "the images of the camera's position"
     if not found.changed:
-        return ScreenResult(OFF, f"the images of {where} differ by exposure and noise only")
-    said = f"the images of {where} differ, in {_percent(found.changed)} of their blocks"
+        return ScreenResult(OFF, f"{where} differ by exposure and noise only")
+    blocks = f"{_percent(found.changed)} of their blocks"
     if found.p is None:
-        return ScreenResult(UNDECIDED, f"{said}, and are too few to tell whether with time")
+        return ScreenResult(UNDECIDED, f"{where} differ in {blocks}, but are too few to test for a change over time")
     if found.p <= LEVEL:
-        return ScreenResult(ON, f"{said}, and with time (p = {found.p:.3f}, z = {found.z:.1f})", found.p, found.z)
-    return ScreenResult(UNDECIDED, f"{said}, but not by slow waves of time (p = {found.p:.3f}, z = {found.z:.1f})",
-                  found.p, found.z)  # fmt: skip
+        return ScreenResult(ON, f"{where} change over time, in {blocks} (p = {found.p:.3f})", found.p, found.z)
+    said = f"{where} differ in {blocks}, but not clearly over time (p = {found.p:.3f})"
+    return ScreenResult(UNDECIDED, said, found.p, found.z)
 
 
 def _percent(share: float) -> str:
@@ -119,17 +119,17 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
     camera = _dummies(held) if held else camera_basis(views)
     found = evidence(leftovers(views, scene, seed, backend), times, camera, seed, held or None)
     if found.free < LEAST_FREE:
-        return ScreenResult(UNDECIDED, f"the camera moves along with time: it leaves {found.free:.0%} of time's slow "
-                                 f"waves free, {LEAST_FREE:.0%} are needed", found.p, found.z, found.free)  # fmt: skip
-    said = f"p = {found.p:.3f}, z = {found.z:.1f}, {found.free:.0%} of time's slow waves are free of the camera"
+        reason = (f"the camera moves along with time, so that only {found.free:.0%} of a slow change can be told from "
+                  f"its motion; {LEAST_FREE:.0%} are needed")  # fmt: skip
+        return ScreenResult(UNDECIDED, reason, found.p, found.z, found.free)
     if found.p <= LEVEL:
-        decision, reason = ON, f"what a static fit leaves over changes with time ({said})"
+        decision, reason = ON, f"a static model's error changes over time (p = {found.p:.3f})"
     elif held:
         decision = UNDECIDED
-        reason = (f"the cameras of {len(held)} places move a little, and what a static fit leaves over does not "
-                  f"clearly change with time ({said})")  # fmt: skip
+        reason = (f"the cameras of {len(held)} positions move a little, and a static model's error does not clearly "
+                  f"change over time (p = {found.p:.3f})")  # fmt: skip
     else:
-        decision, reason = OFF, f"what a static fit leaves over does not change with time ({said})"
+        decision, reason = OFF, f"a static model's error does not change over time (p = {found.p:.3f})"
     return ScreenResult(decision, reason, found.p, found.z, found.free)
 
 

@@ -4,6 +4,8 @@ A simplified Gaussian is independent of time, direction or AGR (the neural refin
 This module does not import torch.
 """
 
+import re
+
 from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate, Direction, Gate, LengthChoice, ModelComparison, OnDemand, TimeScreen
 
@@ -23,14 +25,30 @@ _KEEP = {
 }
 
 
-def of_decision(screen: TimeScreen) -> str:
-    """Return a message that says whether the test found that the scene changes with time."""
-    return f"time is {screen.decision}{', so it is simulated' if screen.decision == 'undecided' else ''}"
+_OLDER = (  # words of older records, and what is written now
+    (r"what a static fit leaves over changes with time", "a static model's error changes over time"),
+    (r"what a static fit leaves over does not( clearly)? change with time",
+     r"a static model's error does not\1 change over time"),
+    (r"differ, in (\S+) of their blocks, and with time", r"change over time, in \1 of their blocks"),
+    (r"differ, in (\S+) of their blocks, but not by slow waves of time",
+     r"differ in \1 of their blocks, but not clearly over time"),
+    (r", z = [-\d.]+(, \d+% of time's slow waves are free of the camera)?\)", ")"),
+    (r"camera place", "camera position"),
+)  # fmt: skip
 
 
 def of_screen(screen: TimeScreen) -> str:
     """Return a message with the answer of the test whether the scene changes with time, and why it is the answer."""
-    return f"{of_decision(screen)}: {screen.reason}"
+    kept = ", so time is kept" if screen.decision == "undecided" else ""
+    return f"time is {screen.decision}{kept}: {reason(screen)}"
+
+
+def reason(screen: TimeScreen) -> str:
+    """Return why a test decided that a scene changes with time, or that it does not, in present words."""
+    text = screen.reason
+    for words, now in _OLDER:
+        text = re.sub(words, now, text)
+    return text
 
 
 def of_comparison(found: ModelComparison) -> str:
@@ -61,23 +79,26 @@ def _of_candidates(found: list[Candidate]) -> str:
 def of_gate(gate: Gate) -> str:
     """Return a message on a simplified model: what its Gaussians still depend on, its PSNR, frame time and bytes."""
     left = sum(number for name, number in gate.rows.items() if name != "removed")
-    when = "at the end" if gate.step is None else f"after step {gate.step}"
+    when = "after training" if gate.step is None else f"after step {gate.step}"
     kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in _KEEP.items() if gate.rows.get(name))
-    text = (f"gated {when}: of {left + gate.rows.get('removed', 0)} Gaussians {left} are left, of which {kept}; "
-            f"PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB")  # fmt: skip
+    text = f"gate {when}: {left} of {left + gate.rows.get('removed', 0)} Gaussians are left"
+    text += f" ({kept})" if kept else ""
+    text += f"; PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB"
     if gate.eval_loss_db is not None:
-        text += f", evaluated {-gate.eval_loss_db:+.3f} dB"
+        text += f", on the evaluated views {-gate.eval_loss_db:+.3f} dB"
     if gate.frame_ms_before and gate.frame_ms:
         text += f", a frame {gate.frame_ms_before:.2f} -> {gate.frame_ms:.2f} ms"
     text += f", {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
     if gate.asleep:
-        text += f"; at any one time AGR moves {1 - gate.asleep:.0%} of its Gaussians, as the others cannot be seen then"
+        text += (
+            f"; AGR moves {1 - gate.asleep:.0%} of its Gaussians in a frame, as the others are invisible at its time"
+        )
     return text
 
 
 def of_direction(found: Direction) -> str:
     """Return a message: how many Gaussians depend on direction, and what would change if none did."""
-    return (f"direction: {found.kept:.0%} of the Gaussians keep it; freezing it in all would change PSNR by "
+    return (f"direction: {found.kept:.0%} of the Gaussians depend on it; if none did, PSNR would change by "
             f"{-found.loss_db:+.2f} dB and a frame from {found.frame_ms:.2f} to "
             f"{found.frame_ms_without:.2f} ms")  # fmt: skip
 

@@ -143,7 +143,7 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
     chosen = BACKBONES[backbone]
     package = importlib.util.find_spec("lpips")
     if package is None or package.origin is None:
-        raise BackboneMissing("the lpips package, which holds the linear weights, is not installed")
+        raise BackboneMissing("needs the lpips package, which holds the linear weights")
     linear_path = Path(package.origin).parent / "weights" / "v0.1" / f"{backbone}.pth"
     path = weights or _trunk(backbone)
     if not path.is_file():
@@ -151,9 +151,7 @@ def load(backbone: str = "alex", weights: Path | None = None, device: str = "cpu
             raise InputError(
                 f"{path}: expected the weights of LPIPS' {backbone} trunk, found no such file", docs="data.md#fetching"
             )
-        raise BackboneMissing(
-            f"no trunk weights: {chosen.file} is not in $TORCH_HOME/hub/checkpoints and no file is named"
-        )
+        raise BackboneMissing(f"needs weights: `python -m gsbench.fetch lpips-{backbone}`")
     trunk = {
         key.removeprefix("features."): value
         for key, value in _read_weights(path, chosen.trunk_sha256).items()

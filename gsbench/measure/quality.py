@@ -145,7 +145,7 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
         >>> lpips(image, image)
         Traceback (most recent call last):
         ...
-        gsbench.measure.perceptual.BackboneMissing: no trunk weights: alexnet-owt-7be5be79.pth is not in ...
+        gsbench.measure.perceptual.BackboneMissing: needs weights: `python -m gsbench.fetch lpips-alex`
     """
     network = perceptual.load(backbone, weights, str(a.device))
     a, b = (2 * x.float() - 1 for x in _images(a, b, BACKBONES[backbone].least_side, "lpips"))

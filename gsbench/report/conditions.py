@@ -7,7 +7,7 @@ from functools import partial
 from gsbench.errors import printable
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
-from gsbench.report.configurations import without
+from gsbench.report.configurations import is_beside_others, without
 
 WARNING = "WARNING"
 MOST_RUNS_NAMED = 3
@@ -19,13 +19,12 @@ TUNED = frozenset((
     "lego", "static-lego", "trex",
     "scene1_close_proximity", "scene4_occlusion", "scene7_deformation", "scene10_texture",
 ))  # fmt: skip
-SPREAD = (
-    "± is half the width of the 95 % interval over seeds (Student's t; of these scenes and views); one seed has none"
-)
+SPREAD = "± is half the width of the 95 % interval for other seeds on these scenes and views (Student's t)"
 DEFINITIONS = (
-    "PSNR: joint over H x W x 3, final iteration, mean over views. SSIM: scikit-image, Gaussian window, data_range 1.",
-    "FPS: 1000 / median ms of synchronised renders after warm-up, slicing and AGR included. "
-    "train min: the whole training loop less evaluation.",
+    "PSNR: over all pixels and channels of a view, after the final iteration, averaged over views. SSIM: scikit-image, "
+    "Gaussian window, data_range 1.",
+    "FPS: 1000 / the median milliseconds of a frame, with slicing and AGR. train min: minutes of the training loop, "
+    "without evaluation.",
 )
 
 Get = Callable[[Record], str]
@@ -67,13 +66,15 @@ def _stated(records: list[Record], spread: str) -> list[str]:
     tuned, others = sorted(scenes & TUNED), sorted(scenes - TUNED)
     if tuned:
         rest = f"; not on {', '.join(map(printable, others))}" if others else ""
-        notes.append(f"settings of gsbench were chosen on {', '.join(tuned)}{rest} (docs/tuning.md).")
-    for title, get in (("machine", _machine), ("commit", _commit), ("versions", _versions)):
+        notes.append(f"gsbench's own settings were tuned on {', '.join(tuned)}{rest} (docs/tuning.md).")
+    for title, get in (("machine", _machine), ("commit", commit), ("versions", _versions)):
         same = len({get(r) for r in records}) == 1
         notes.append(f"{title}: {get(records[0])}" if same else _differ(title, records, get))
     notes += _load(records)
-    if any(_commit(r).endswith("-dirty") for r in records):
-        notes.append(f"{WARNING}: files differed from their commit (-dirty): it does not reproduce these numbers.")
+    if any(commit(r).endswith("-dirty") for r in records):
+        notes.append(
+            f"{WARNING}: files were changed after the commit (-dirty), which does not reproduce these numbers."
+        )
     notes += [*_rounding(records), *_stops(records), *_averages(records), *_lengths(records), *_exact(records)]
     notes += [_seeds(records, spread), *DEFINITIONS]
     return sorted(notes, key=lambda note: not note.startswith(WARNING))
@@ -108,7 +109,9 @@ def _load(records: list[Record]) -> list[str]:
     if not loads:
         return []
     silent = _silent(len(costs) - len(loads), len(costs))
-    return [f"load of the machine during a training, these runs included: {_span(loads, '.1f')}{silent}"]
+    busy = sum(is_beside_others(r) for r in records if r.provenance.machine == machine)
+    beside = f"; {busy} of {len(costs)} runs were measured beside other work, which makes times longer" if busy else ""
+    return [f"load of the machine during training, with the run itself: {_span(loads, '.1f')}{silent}{beside}."]
 
 
 def _silent(number: int, runs: int) -> str:
@@ -131,7 +134,9 @@ def _rounding(records: list[Record]) -> list[str]:
     if not known:
         return []
     silent = _silent(len(changes) - len(known), len(changes))
-    return [f"float32 changes PSNR of a view by at most {max(known):.1e} dB (three views of each run{silent})."]
+    return [
+        f"Rounding to float32 changes PSNR of a view by at most {max(known):.1e} dB (three views of each run{silent})."
+    ]
 
 
 def _stops(records: list[Record]) -> list[str]:
@@ -168,9 +173,10 @@ def _span(numbers: Sequence[float], form: str) -> str:
     return " to ".join(dict.fromkeys(format(number, form) for number in (min(numbers), max(numbers))))
 
 
-def _commit(record: Record) -> str:
-    commit, *dirty = printable(record.provenance.git_commit or "not recorded").partition("-")
-    return commit[:12] + "".join(dirty)
+def commit(record: Record) -> str:
+    """Return the first digits of the commit of a run, with "-dirty" behind them if files were changed."""
+    digits, *dirty = printable(record.provenance.git_commit or "not recorded").partition("-")
+    return digits[:12] + "".join(dirty)
 
 
 def _versions(record: Record) -> str:
@@ -181,7 +187,7 @@ def _seeds(records: list[Record], spread: str) -> str:
     seeds = sorted({r.seed for r in records})
     listed = ", ".join(map(str, seeds))
     if len(seeds) == 1:
-        return f"seed: {listed}; from one seed no spread is known."
+        return f"seed: {listed}. An interval (±) needs several seeds, such as seed=0,1,2."
     return f"seeds: {listed}; {spread}."
 
 

@@ -43,6 +43,7 @@ QUANTITIES: dict[str, Callable[[Record], float]] = {
     "ms": lambda r: r.cost.render_ms.p50 if r.cost else math.nan,  # median of the milliseconds per frame
     "mb": lambda r: r.cost.bytes / 1e6 if r.cost else math.nan,  # of the model's parameters
 }
+BUSY = 0.5  # load by other work from which a run counts as measured beside it
 GATES = ("off", "end", "both")  # values of the setting effects.gate: when effects are removed from Gaussians
 OF_THE_MACHINE = ("seconds", "cpu_s", "ms")  # quantities that can be compared only between runs on one machine
 
@@ -267,6 +268,18 @@ def gating(record: Record) -> str:
     effects, model = (part if isinstance(part := config.get(name), dict) else {} for name in ("effects", "model"))
     gate = effects.get("gate", "off")
     return f"gate={gate}" if gate in GATES and gate != model.get("gate", "off") else ""
+
+
+def is_beside_others(record: Record) -> bool:
+    """Tell whether the machine had other work while a run was trained, so that a quiet machine may be faster.
+
+    The load of the run itself is subtracted: its CPU-seconds per second, or its threads if these are not recorded.
+    """
+    cost = record.cost
+    if cost is None or cost.load is None:
+        return False
+    known = cost.train_cpu_s is not None and cost.train_s > 0
+    return cost.load - ((cost.train_cpu_s or 0.0) / cost.train_s if known else record.provenance.threads) > BUSY
 
 
 def is_ablated(variant: str) -> bool:

@@ -112,7 +112,7 @@ def terminal(tables: list[Table], width: int = 120) -> str:
         for note in table.footnotes:
             lines += _wrapped(f"- {note}", width)
         if len(widths) < len(titles):
-            lines += _wrapped(f"- only in the files, for lack of width: {', '.join(titles[len(widths) :])}", width)
+            lines += _wrapped(f"- columns left out, for lack of width: {', '.join(titles[len(widths) :])}", width)
         lines.append("")
     return "\n".join(lines)
 

@@ -10,9 +10,9 @@ from gsbench.report.layout import QuantityColumn, Row
 
 BEST, SECOND = 1, 2
 RULE = (
-    "Bold: the best mean, and every mean that is not told apart from it. Underlined: the same for the second best. "
-    "Two means are told apart if the 95 % interval over seeds of their paired difference leaves out zero; with one "
-    "seed, if they differ as shown."
+    "Bold: the best mean, and every mean that does not differ from it. Underlined: the same for the second best. "
+    "Two means differ if the 95 % interval over seeds of their paired difference excludes zero; with one seed, if they "
+    "differ as shown."
 )
 Runs = Mapping[str, Mapping[int, float]]  # by scene and seed
 

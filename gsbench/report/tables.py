@@ -43,16 +43,16 @@ EXTRA_COLUMNS = (  # if a run has them
 CHOICES = {c.name: c for c in (COLUMNS[0], TRAIN, *REGIONS.values(), *COLUMNS[1:], *EXTRA_COLUMNS)}
 
 PAPER = (
-    "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full), PSNR is the best "
-    "on test seen during training (leaks), times are of a V100."
+    "Table 1 of the 7DGS paper (ICCV 2025): 30,000 iterations at half resolution (Technicolor: full). Its PSNR is the "
+    "best on test during training (leaks). Its times are of a V100."
 )
 PAPER_OTHER_DATA = (
     "OTHER DATA: Table 1 of the 7DGS paper for its scene of the same name. The scene measured here is a stand-in "
     "rendered for this project, so the two rows cannot be compared."
 )
 PAPER_LPIPS = (
-    "The paper does not name the backbone of Table 1: its 7DGS has 0.198 on Technicolor there, 0.101 with AlexNet in "
-    "Table 2."
+    "The paper does not name the LPIPS network of Table 1. Its 7DGS has 0.198 on Technicolor in Table 1, 0.101 with "
+    "AlexNet in Table 2."
 )
 
 
@@ -135,8 +135,8 @@ def of_one_machine(records: list[Record], machine: str) -> list[str]:
         return []
     named = "; ".join(f"{printable(other)} ({count} run{'s' * (count > 1)})" for other, count in sorted(others.items()))
     return [
-        f"train min and FPS are of one machine, {printable(machine)}; those of other machines are left out: {named}. "
-        "All other columns are means over every run."
+        f"train min and FPS are of one machine, {printable(machine)}. Those of other machines are left out: {named}. "
+        "All other columns are means over all runs."
     ]
 
 
@@ -187,15 +187,15 @@ class _TableBuilder:
         if len(sections) > 1:
             sections.append(self._average())
         title = f"experiment {first.experiment}, data {printable(first.dataset)}"
-        common = [f"every run with {self.common}, not the experiment's own."] if self.common else []
+        common = [f"All runs have {self.common}, which the experiment does not set."] if self.common else []
         said = [*common, *of_one_machine(self.records, self.machine), *conditions(self.records), *self._no_vgg()]
         return Table(title, self.columns, sections, self.marks, said)
 
     def _no_vgg(self) -> list[str]:
         """List a footnote that says why the table has no column for LPIPS-VGG; the list is empty if it has one."""
         shown = any(c.key == "lpips_vgg" for c in self.columns)
-        why = {printable(r.missing["lpips_vgg"]) for r in self.records if "lpips_vgg" in r.missing}
-        return [f"LPIPS-VGG has no column: {'; '.join(sorted(why))}."] if why and not shown else []
+        why = {r.missing["lpips_vgg"] for r in self.records if "lpips_vgg" in r.missing}
+        return [f"{_lacking(EXTRA_COLUMNS[0], why)}."] if why and not shown else []
 
     def _mark(self, text: str) -> str:
         """Return the number of a footnote as text, such as "(1)"; footnotes with equal texts share a number."""
@@ -230,13 +230,13 @@ class _TableBuilder:
         """
         said = []
         for name, column in REGIONS.items():
-            found = {f"{one.share:.1%} of the image, in {one.views} of {len(r.per_view)} views, found by {one.source}"
+            found = {f"{one.share:.1%} of the image, in {one.views} of {len(r.per_view)} views, by {one.source}"
                      for r in runs if (one := r.regions.get(name))}  # fmt: skip
             why = {r.missing[column.key] for r in runs if column.key in r.missing}
             if found:
-                said.append(f"{column.title} is over {' or over '.join(sorted(found))}")
+                said.append(f"{column.title} is measured on {' or on '.join(sorted(found))}")
             elif why and column not in self.columns:  # otherwise a mark in a cell says it
-                said.append(f"{column.title} is not measured: {'; '.join(sorted(why))}")
+                said.append(_lacking(column, why))
         return [printable(f"{'. '.join(said)}.")] if said else []
 
     def _cell(self, column: QuantityColumn, finished: list[Record]) -> str:
@@ -248,7 +248,7 @@ class _TableBuilder:
             return EMPTY  # a footnote of the table names the machines that are left out
         name = "psnr_best_on_test" if column.key == LEAKS else column.key
         why = {r.missing.get(name, "not measured") for r in finished if (r.metrics or {}).get(name) is None}
-        return f"{EMPTY} " + self._mark(printable(f"{column.title} is empty: {'; '.join(sorted(why))}"))
+        return f"{EMPTY} " + self._mark(f"{_lacking(column, why)}.")
 
     def _average(self) -> Section:
         """Make the rows of averages over the scenes that every model has finished.
@@ -263,7 +263,7 @@ class _TableBuilder:
             return Section(title, [], [*notes, "there is no scene that every model has finished"])
         averages = {model: self._of(covered, model) for model in models}
         if any(math.isnan(_mean(values, c.key)) for values in averages.values() for c in self.columns):
-            notes.append(f"{EMPTY} stands where a scene lacks the number")
+            notes.append(f"{EMPTY}: not measured on every scene")
         leader = self._leader(list(averages.values()))
         rows = []
         for model, values in averages.items():
@@ -306,6 +306,14 @@ class _TableBuilder:
             return None
         means = [mean for mean in (_mean(values, COLUMNS[0].key) for values in rows) if not math.isnan(mean)]
         return COLUMNS[0].show(max(means)) if means else None
+
+
+def _lacking(column: QuantityColumn, reasons: set[str]) -> str:
+    """Say why a column is empty, from the reasons in records, such as "needs masks" or "not measured"."""
+    fetched = f"needs weights: `python -m gsbench.fetch {column.key.replace('_', '-')}`"
+    why = sorted({fetched if reason.startswith("no trunk weights") else reason for reason in reasons})  # older records
+    is_verb = all(reason.startswith("needs ") for reason in why)
+    return printable(f"{column.title}{'' if is_verb else ' is empty:'} {'; '.join(why)}")
 
 
 def _mean(values: Values, key: str) -> float:

@@ -84,7 +84,7 @@ def test_what_is_too_little_to_tell() -> None:
     assert screen(few).decision == "undecided"
     assert "too few" in screen(few).reason
     assert screen(one).decision == "undecided"
-    assert "one time" in screen(one).reason
+    assert "the same time" in screen(one).reason
     timeless = Scene(**{**vars(one), "train": [type(v)(**{**vars(v), "time": None}) for v in one.train]})
     assert screen(timeless).decision == "off"
     with pytest.raises(InputError, match="expected training views"):

@@ -229,7 +229,7 @@ def test_auto_and_a_gate_after_the_fact(
     """
     done = gsbench(*overrides(square, tmp_path, "model=auto", "train.iterations=60"))
     assert done.returncode == 0, done.stderr
-    assert "too few to tell" in done.stderr + done.stdout
+    assert "too few; 12 are needed" in done.stderr + done.stdout
     (folder,) = tmp_path.glob("dnerf/square/auto,*/seed0")
     found = record.read(folder / record.FILE_NAME)
     assert found.model == "auto"

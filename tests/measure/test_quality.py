@@ -141,13 +141,13 @@ def test_lpips_agrees_with_the_lpips_package():
 def test_a_missing_backbone_leaves_its_column_empty_with_the_reason():
     """Would catch a run that stops, or an empty column nobody can explain, on a machine without the weights."""
     for backbone in ("alex", "vgg"):
-        with pytest.raises(BackboneMissing, match="TORCH_HOME"):
+        with pytest.raises(BackboneMissing, match=f"needs weights: `python -m gsbench.fetch lpips-{backbone}`"):
             perceptual.load(backbone)
     truth = image(0)
     found = quality.evaluate([("a", image(1), truth)], background=(0.0, 0.0, 0.0))
     assert found.metrics["lpips_alex"] is None
-    assert "alexnet-owt-7be5be79.pth" in found.missing["lpips_alex"]
-    assert "vgg16-397923af.pth" in found.missing["lpips_vgg"]
+    assert "gsbench.fetch lpips-alex" in found.missing["lpips_alex"]
+    assert "gsbench.fetch lpips-vgg" in found.missing["lpips_vgg"]
     assert found.metrics["ssim"] == quality.ssim(image(1), truth)
 
 

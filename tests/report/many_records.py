@@ -23,6 +23,10 @@ HOSTILE = (
     "<script>document.title='owned'</script><img src=x onerror=alert(1)>\"'`</style></script>&amp;{{7*7}} "
     "\u202eright to left\u202c \u05e9\u05dc\u05d5\u05dd \u0645\u0631\u062d\u0628\u0627 " + "x" * 10_000
 )
+OLD_REASON = (  # of a record that was written before the words changed
+    "what a static fit leaves over changes with time "
+    "(p = 0.001, z = 12.0, 90% of time's slow waves are free of the camera)"
+)
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
 
 
@@ -90,7 +94,7 @@ def on_demand(records: list[Record], *, label: str = "auto", gate: str = "both")
     for r in records:
         own = label == r.model
         config = r.provenance.config | {"effects": {"gate": gate}, "model": {"gate": "off" if own else gate}}
-        screen = TimeScreen("on", "what a static fit leaves over changes with time", 0.001, 12.0, 0.9, 0.8)
+        screen = TimeScreen("on", OLD_REASON, 0.001, 12.0, 0.9, 0.8)
         found.append(
             dataclasses.replace(
                 r,

@@ -23,7 +23,6 @@ from gsbench.report.page.palette import MODELS, styles
 
 WHOLE = frontier(("7dgs",), ("suzanne",), 3, (1000,))
 NOWHERE = Path("/nowhere")  # without pictures
-NO_SPREAD = "no spread is known from one seed"
 
 
 def sentences(records: list[Record]) -> list[str]:
@@ -36,10 +35,10 @@ def test_one_seed_in_words():
     """Catches removed Gaussians of one gate only, a sign that is turned, and an interval of one seed."""
     (said,) = sentences(on_demand(WHOLE[:1]))
     assert said == (
-        "On suzanne, auto: time is on, as what a static fit leaves over changes with time. Of 1,000 Gaussians the "
-        "gates left 700 (70 %): 300 refined by AGR, 150 conditioned, 40 time frozen, 10 direction frozen and 200 "
-        "static. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen then. The "
-        f"gate at the end changed PSNR on test by −0.020 dB and a frame of 4.00 ms by −1.00 ms; {NO_SPREAD}."
+        "On suzanne, auto kept time: a static model's error changes over time (p = 0.001). The gates left 700 of 1,000 "
+        "Gaussians (70 %): 300 refined by AGR, 150 conditioned, 40 time frozen, 10 direction frozen and 200 static. "
+        "AGR moves 75 % of its Gaussians in a frame; the others are invisible at its time. The gate after training "
+        "changed PSNR on test by −0.020 dB, and a frame of 4.00 ms by −1.00 ms."
     )
 
 
@@ -47,11 +46,11 @@ def test_three_seeds_in_words():
     """Catches a mean that is a sum, and seeds without an interval."""
     (said,) = sentences(on_demand(WHOLE))
     assert said == (
-        "On suzanne, auto: time is on, as what a static fit leaves over changes with time; the same with all 3 seeds. "
-        "Of 1,000 Gaussians the gates left 710 (71 %): 310 refined by AGR, 150 conditioned, 40 time frozen, 10 "
-        "direction frozen and 200 static. At any one time AGR moves 75 % of its Gaussians; the others cannot be seen "
-        "then. The gate at the end changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005 over seeds) and a "
-        "frame of 4.00 ms by −1.00 ms (95 % −1.00 to −1.00 over seeds)."
+        "On suzanne, auto kept time: a static model's error changes over time (p = 0.001); all 3 seeds agree. The "
+        "gates left 710 of 1,000 Gaussians (71 %): 310 refined by AGR, 150 conditioned, 40 time frozen, 10 direction "
+        "frozen and 200 static. AGR moves 75 % of its Gaussians in a frame; the others are invisible at its time. The "
+        "gate after training changed PSNR on test by −0.030 dB (95 % −0.055 to −0.005 over seeds), and a frame of "
+        "4.00 ms by −1.00 ms (95 % −1.00 to −1.00 over seeds)."
     )
 
 
@@ -68,9 +67,8 @@ def test_a_comparison_of_models_is_said():
         for one, chosen in zip(on_demand(WHOLE), ("7dgs", "4dgs", "7dgs"), strict=True)
     ]
     assert sentences(runs) == [
-        "On suzanne, auto: time is on, as so; the same with all 3 seeds. PSNR on val after 700 iterations: 7dgs "
-        "22.84 dB, 4dgs 22.40 dB, 6dgs failed; 7dgs is trained to the end; 4dgs with 1 seed. "
-        "No gate has changed a Gaussian."
+        "On suzanne, auto kept time: so; all 3 seeds agree. PSNR on val after 700 iterations: 7dgs 22.84 dB, 4dgs "
+        "22.40 dB, 6dgs failed; 7dgs is trained to the end; 4dgs with 1 seed. No Gaussian was changed."
     ]
 
 
@@ -79,15 +77,15 @@ def test_what_is_undecided_or_differs_is_said():
     one, two, three = on_demand(WHOLE)
     runs = [screened(one, "undecided", "the camera moves"), screened(two, "off"), screened(three, "undecided")]
     assert sentences(runs) == [
-        "On suzanne, auto: time is undecided, so it is simulated, as the camera moves; off with 1 seed. "
-        "No gate has changed a Gaussian."
+        "On suzanne, auto kept time, because the test cannot decide: the camera moves; off with 1 seed. "
+        "No Gaussian was changed."
     ]
     (of,) = groups(runs)
     section = page_part.on_demand_section(of, canvas(), NOWHERE)
     assert section.tabs == []
     assert section.swatches == []
     mixed = [runs[0], two, three]
-    assert "On 2 of 3 seeds: Of 1,000 Gaussians the gates left 715" in sentences(mixed)[0]
+    assert "The gates left 715 of 1,000 Gaussians (72 %) with 2 of 3 seeds" in sentences(mixed)[0]
 
 
 def test_a_loss_that_was_not_evaluated_is_that_of_the_check():
@@ -95,13 +93,11 @@ def test_a_loss_that_was_not_evaluated_is_that_of_the_check():
     (run,) = on_demand(WHOLE[:1])
     plain = [dataclasses.replace(g, eval_loss_db=None, checked_on="held-out training views") for g in gates()]
     run = dataclasses.replace(run, on_demand=OnDemand(None, plain))
-    assert (
-        f"PSNR on held-out training views by −0.030 dB and a frame of 4.00 ms by −1.00 ms; {NO_SPREAD}."
-        in (sentences([run])[0])
-    )
+    said = "PSNR on held-out training views by −0.030 dB, and a frame of 4.00 ms by −1.00 ms."
+    assert said in sentences([run])[0]
     other = dataclasses.replace(run.provenance, device="another machine")
     elsewhere = dataclasses.replace(run, provenance=other, seed=9)
-    assert "a frame" not in sentences([*WHOLE, dataclasses.replace(elsewhere, model="auto")])[0]
+    assert "a frame of" not in sentences([*WHOLE, dataclasses.replace(elsewhere, model="auto")])[0]
     only_in_training = dataclasses.replace(run, on_demand=OnDemand(None, gates()[:1]))
     assert sentences([only_in_training])[0].endswith("500 refined by AGR, 200 conditioned and 100 static.")
 
@@ -164,7 +160,7 @@ def test_notes_are_listed_once():
 def test_hostile_choices_stay_text(tmp_path):
     """Catches markup in reasons, notes and names of classes, and numbers that break a drawing."""
     seen = Page(build.render(hostile(), tmp_path))
-    part = seen.text[seen.text.index("suzanne, 7dgs: time is") : seen.text.rindex("Where the seconds go")]
+    part = seen.text[seen.text.index("suzanne, 7dgs decided") : seen.text.rindex("Where the seconds go")]
     assert "<script>document.title='owned'</script>" in part
     assert "and 41 more notes." in part
     assert not [name for name, _ in seen.attributes if name.startswith("on")]
@@ -179,8 +175,8 @@ def test_lengths_stay_apart_in_labels_and_only_the_common_one_is_told():
     drawn = section.tabs[0].drawings[0].svg
     assert all(f"iterations={n}" in drawn for n in (250, 2000, 4000))
     assert len(section.sentences) == 2
-    assert section.sentences[0].startswith("On moving-matte, auto: ")
-    assert section.sentences[1] == "These are 1 of 4 scenes and runs; the table has all of them."
+    assert section.sentences[0].startswith("On moving-matte, auto kept time: ")
+    assert section.sentences[1] == "These are 1 of 4 results; the table has all."
 
 
 def test_many_choices_are_cut(tmp_path):
@@ -188,8 +184,8 @@ def test_many_choices_are_cut(tmp_path):
     runs = on_demand(frontier(("7dgs",), tuple(f"s{i}" for i in range(30)), 1, (1000,)))
     section = page_part.on_demand_section(group(runs), canvas(), tmp_path)
     assert len(section.sentences) == 13
-    assert section.sentences[-1] == "These are 12 of 30 scenes and runs; the table has all of them."
-    assert "Of 30 bars 24 are drawn; the table has all." in section.notes
+    assert section.sentences[-1] == "These are 12 of 30 results; the table has all."
+    assert "The figures have 24 of 30 rows; the table has all." in section.notes
     assert len(section.table.rows) == 30
 
 
@@ -257,7 +253,7 @@ def test_gated_models_price_no_effect():
     cube = compare.cube(both, comparisons(both))
     assert [p.models for p in cube.prices] == ["7dgs − 7dgs_noagr"]
     notes = worth.effects_section(both, comparisons(both), canvas()).notes
-    assert "Left out, as their Gaussians keep only the effects that pay: auto." in notes
+    assert "Left out, because each Gaussian keeps only the effects that it needs: auto." in notes
 
 
 def test_nothing_is_measured_where_nothing_was_chosen():

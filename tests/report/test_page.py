@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from make_golden import make
 from many_records import EFFECTS, HOSTILE, frontier, hostile, on_demand, write_all
+from skimage.color import deltaE_ciede2000, rgb2lab
 
 from gsbench.config import TrainConfig
 from gsbench.measure.curve import Point
@@ -22,7 +23,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.report import compare, live
 from gsbench.report.__main__ import main
 from gsbench.report.comparisons import comparisons
-from gsbench.report.configurations import groups
+from gsbench.report.configurations import groups, is_beside_others
 from gsbench.report.frontier import choose, points, targets
 from gsbench.report.page import build, charts, cost, evidence, gallery, messages, palette, time_to_quality, worth
 from gsbench.report.page.content import Canvas, Column, DataTable, Runs
@@ -128,21 +129,38 @@ def test_the_first_screen_names_the_run():
 def test_sentences_where_models_tie():
     """Catches a winner among equal models, and a pair that is called a difference."""
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
-    (answer, *_) = answers(records)
-    assert "not told apart from b" in answer.detail.lower() or answer.model == ""
-    assert "The pair is not told apart" in pairs_section(records).sentences[1]
+    (_, answer, *_) = answers(records)
+    assert "No significant difference to" in answer.detail
+    assert pairs_section(records).sentences[1] == "The difference is not significant."
 
 
 def test_sentences_of_one_seed():
     """Catches an interval or a p-value that one seed cannot give."""
     records = frontier(seeds=1)
     (_, minute, *_) = answers(records)
-    assert minute.interval == messages.NO_SPREAD
-    assert "One seed: whether it is ahead is not known." in minute.detail
-    said = pairs_section(records)
-    assert said.sentences[0].startswith("No spread is known from one seed.")
+    assert minute.interval == ""
+    assert minute.detail == "2,000 iterations, 32.5 s."
+    assert pairs_section(records).sentences[0].startswith("The largest difference: ")
     assert "95 %" not in " ".join(effects_section(records).sentences)
-    assert effects_section(records).sentences[0] == "Two scenes, one seed: no interval is known."
+
+
+def test_one_seed_is_said_once_with_the_command_for_more(tmp_path):
+    """Catches a page that repeats what one seed cannot tell, or does not say how to run more seeds."""
+    records = frontier(seeds=1, lengths=(1000,))
+    text = Page(page(records, tmp_path)).text
+    assert text.lower().count("one seed") == 1
+    assert (
+        "Run more seeds: python -m gsbench -m +exp=mini model=3dgs,4dgs,6dgs,7dgs,7dgs_noagr "
+        "scene=moving-matte,suzanne seed=0,1,2 train.iterations=1000"
+    ) in text
+    mixed = [r for r in frontier(lengths=(1000,)) if r.model != "4dgs" or r.seed == 2]
+    assert cost.seeds_words(group(mixed)) == (
+        "1 of 5 models have one seed: no interval is known, and no difference is tested. Run more seeds:",
+        "python -m gsbench -m +exp=mini model=4dgs scene=moving-matte,suzanne seed=0,1,2 train.iterations=1000",
+    )
+    assert cost.seeds_words(group(frontier(**SMALL))) == ("", "")
+    apart = [dataclasses.replace(r, overrides=[*r.overrides, "data.repair=[a,b]"]) for r in records]
+    assert " model=3dgs scene=suzanne seed=0,1,2 " in messages.more_seeds(apart)
 
 
 def test_the_answers_and_the_pairs_agree():
@@ -168,7 +186,7 @@ def test_the_answers_and_the_pairs_agree():
 
 def test_differences_of_two_scenes_say_so_first():
     """Catches prices and pairs of two scenes whose intervals read as if they held for others."""
-    said = "scenes; an interval over seeds and views, not over scenes: it does not tell what another scene would give."
+    said = "scenes. The intervals are for other seeds and views of these scenes. Another scene may differ by more."
     records = frontier(lengths=(1000,))
     assert effects_section(records).sentences[0] == f"Two {said}"
     assert pairs_section(records).sentences[0] == f"Two {said}"
@@ -177,7 +195,7 @@ def test_differences_of_two_scenes_say_so_first():
     assert all(math.isfinite(row[-3]) for row in rows)
     assert {row[-2] + row[-1] for row in rows} <= {0, 1, 2}
     three = frontier(scenes=("a", "b", "c"), lengths=(1000,))
-    assert effects_section(three).sentences[0].startswith("3 scenes; an interval over scenes like these")
+    assert effects_section(three).sentences[0].startswith("3 scenes. The intervals are for scenes like these.")
 
 
 def test_every_colour_is_defined(tmp_path):
@@ -196,18 +214,17 @@ def test_the_largest_part_of_a_difference_is_not_called_most():
     """Catches "most of the difference" of a stage that has two fifths of it."""
     parts = {"a": {"slice": 1.0, "raster": 1.0, "loss": 1.0}, "b": {"slice": 3.0, "raster": 2.5, "loss": 2.5}}
     said = worth._slowest_words(parts, ["slice", "raster", "loss"])
-    assert said == " b takes 2.7 times the seconds of a; 40 % of the difference is in slice."
+    assert said == " b takes 2.7 times as long as a. 40 % of the difference is in slice."
     more = {"a": {"slice": 1.0, "loss": 1.0}, "b": {"slice": 3.0, "loss": 0.5}}
-    assert "all of the difference is in slice" in worth._slowest_words(more, ["slice", "loss"])
+    assert "All of the difference is in slice." in worth._slowest_words(more, ["slice", "loss"])
 
 
 def test_nothing_is_dominated_by_a_mean():
     """Catches a word of certainty for what only the means say."""
     records = [dataclasses.replace(r, model=m) for m in ("a", "b") for r in frontier(("7dgs",), lengths=(1000,))]
     slow = [dataclasses.replace(r, cost=dataclasses.replace(r.cost, train_s=99.0)) for r in records if r.model == "b"]
-    (text, _) = cost.frontier_section(group([*records[: len(slow)], *slow]), canvas()).sentences
-    assert "By their means b is beaten by a" in text
-    assert "may be chance" in text
+    (text,) = cost.frontier_section(group([*records[: len(slow)], *slow]), canvas()).sentences
+    assert "b is both slower and worse than a, by their means. The difference may be chance." in text
     assert "dominated" not in text
 
 
@@ -218,13 +235,14 @@ def test_what_a_section_leaves_out_is_said():
     said = " ".join(evidence.protocol_section(group(records)).sentences)
     tabled = sum(r.variant == "" for r in records)
     assert 0 < tabled < len(records)
-    assert f"of the {tabled} runs in the tables" in said
+    assert f"describe the {tabled} runs in the tables" in said
     few = pairs_section(records)
     many = pairs_section([dataclasses.replace(r, model=f"{r.model}{i}") for r in frontier(seeds=2, views=2,
                           lengths=(1000,)) for i in range(2)])  # fmt: skip
     assert len(few.table.rows) <= worth.MOST_PAIRS < len(many.table.rows)
-    assert not any("are drawn" in note for note in few.notes)
-    assert any(note.startswith(f"Of {len(many.table.rows)} pairs the {worth.MOST_PAIRS} with") for note in many.notes)
+    assert not any("The figure has" in note for note in few.notes)
+    drawn = f"The figure has the {worth.MOST_PAIRS} largest of {len(many.table.rows)} differences; the table has all."
+    assert drawn in many.notes
     assert "6.60 s" in charts.stages([("a", {"slice": 6.6}), ("b", {"slice": 3.59})], ["slice"], [0]).svg("s", "")
 
 
@@ -272,10 +290,10 @@ def test_sentences_where_nothing_finished(tmp_path):
 def test_sentences_where_models_are_missing(tmp_path):
     """Catches effects that are priced from nothing, and a pair of one."""
     text = Page(page(frontier(("7dgs",), ("suzanne",), 3, (1000,)), tmp_path)).text
-    assert "No two finished models differ in one effect alone" in text
+    assert "No two finished models differ in exactly one effect" in text
     assert "there is no pair to compare" in text
-    assert "All runs are of one length (1,000 iterations)" in text
-    assert "It is the only point." in text
+    assert "All runs have 1,000 iterations." in text
+    assert "No other model has finished there." in text
 
 
 def test_a_failed_run_does_not_hide_what_finished(tmp_path):
@@ -393,7 +411,7 @@ def test_prices_within_one_parametrisation_are_said_beside_the_others():
     less = [dataclasses.replace(r, model="7dgs_nodir") for r in records if r.model == "4dgs"]
     section = effects_section([*records, *less])
     assert worth.NESTED in " ".join(section.notes)
-    assert any(said.startswith("Direction, with time, within one parametrisation: ") for said in section.sentences)
+    assert any(said.startswith("Direction, with time, nested: ") for said in section.sentences)
     assert {"direction, with time", "direction, with time, nested"} <= {row[0] for row in section.table.rows}
     assert messages.sentence("with AGR") == "With AGR"
 
@@ -403,6 +421,17 @@ def test_colours_are_readable_in_both_themes():
     assert min(contrast(c, "#ffffff") for c in LIGHT) >= 4.5
     assert min(contrast(c, "#141619") for c in DARK) >= 4.5
     assert len(LIGHT) == len(DARK) == len(MARKERS) == len(set(MARKERS))
+
+
+@pytest.mark.parametrize("theme", [LIGHT, DARK])
+def test_colours_of_models_differ(theme):
+    """Catches 7dgs, 7dgs_noagr and auto in three shades of one colour."""
+    rgb = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in theme])
+    lab = rgb2lab(rgb[None])[0]
+    apart = deltaE_ciede2000(lab[:, None], lab[None]) + 100 * np.eye(len(theme))
+    usual = [palette.MODELS.index(m) for m in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "auto")]
+    assert apart.min() > 11
+    assert apart[np.ix_(usual, usual)].min() > 18
 
 
 def test_a_model_keeps_its_colour():
@@ -520,6 +549,82 @@ def test_a_lambda_that_is_fixed_is_not_said_to_be_learned():
     assert events_by_letter(config, both, moving, choices["7dgs_noagr"])["L"] != []
 
 
+def test_a_table_fits_its_page():
+    """Catches a column that says the same in every row, and thirty columns beside each other where rows are few."""
+    columns = [Column("run"), Column("dB", 2), Column("machine"), Column("seeds")]
+    table = DataTable("t.csv", columns, [[f"run {i}", 1.0, "one machine", 1234] for i in range(3)])
+    assert [c.title for c in table.shown_columns] == ["run", "dB"]
+    assert table.shown[2] == ["run 2", "1.00"]
+    assert table.same == "machine one machine; seeds 1,234"
+    assert "one machine" in base64.b64decode(table.href.partition(",")[2]).decode()
+    assert DataTable("t.csv", columns, [["run 0", 1.0, "one machine", 1]]).same == ""
+    many = [Column(str(i), 1) for i in range(30)]
+    assert DataTable("t.csv", many, [[1.0] * 30] * 3).is_turned
+    assert not DataTable("t.csv", many, [[1.0] * 30] * 300).is_turned
+    assert not table.is_turned
+
+
+def test_the_total_of_the_seconds_comes_first():
+    """Catches a total that is the last of ten columns, which a narrow screen cuts."""
+    section = worth.stages_section(group(frontier(**SMALL)), canvas())
+    assert [c.title for c in section.table.columns[:2]] == ["model", "total s"]
+    for row in section.table.rows:
+        assert row[1] == pytest.approx(sum(row[2:]))
+
+
+def test_a_row_of_events_has_the_name_of_its_model():
+    """Catches letters in rows that nobody can tell apart."""
+    section = time_to_quality.anytime_section(group(frontier(**SMALL)), canvas())
+    rows = re.findall(r">([^<>]+)</text>", section.tabs[0].drawings[0].svg)
+    assert {"3dgs", "4dgs"} <= set(rows)
+
+
+def test_runs_of_another_length_are_left_out_and_that_is_said():
+    """Catches a mean over runs of two lengths, and runs that a section drops without a word."""
+    records = frontier(lengths=(500, 1000))
+    of = group(records)
+    mains = [r for r in records if r.variant == ""]
+    said = "Shown: 30 runs with 1,000 iterations. 30 runs with other lengths or settings are left out."
+    assert len(mains) == 30
+    for section, alone in (
+        (effects_section(records), effects_section(mains)),
+        (worth.stages_section(of, canvas()), worth.stages_section(group(mains), canvas())),
+        (time_to_quality.anytime_section(of, canvas()), time_to_quality.anytime_section(group(mains), canvas())),
+        (pairs_section(records), pairs_section(mains)),
+    ):
+        assert section.notes[0] == said
+        assert said not in alone.notes
+    stages = worth.stages_section(of, canvas()).table.rows
+    assert stages == worth.stages_section(group(mains), canvas()).table.rows
+
+
+def test_a_time_beside_other_work_is_marked():
+    """Catches an answer of 60 frames a second that was measured while another run slowed the machine."""
+
+    def loaded(record, load, cpu_s):
+        return dataclasses.replace(record, cost=dataclasses.replace(record.cost, load=load, train_cpu_s=cpu_s))
+
+    records = [loaded(r, 1.2, r.cost.train_s) for r in frontier(("7dgs",), ("suzanne",), 2, (1000,))]
+    assert "beside" not in " ".join(a.detail for a in answers(records))
+    assert "beside" not in cost.basis_words(group(records), comparisons(group(records)))
+    busy = [loaded(records[0], 2.1, records[0].cost.train_s), records[1]]
+    *_, frames = answers(busy)
+    assert frames.detail.startswith("1,000 iterations, 2.75 ms a frame (beside other work).")
+    assert "measured while the machine was busy" in cost.basis_words(group(busy), comparisons(group(busy)))
+    assert not is_beside_others(loaded(records[0], 2.1, 2 * records[0].cost.train_s)), "its own second thread"
+    assert not is_beside_others(loaded(records[0], 2.4, None)), "a record without CPU-seconds has two threads"
+    assert not is_beside_others(loaded(records[0], None, None))
+
+
+def test_auto_is_explained_and_linked(small_page, tmp_path):
+    """Catches a recommendation of a model that nobody knows from a paper, and a link to nothing."""
+    records = frontier(("7dgs",), ("suzanne",), 2, (1000,))
+    text = page([*records, *on_demand(records)], tmp_path)
+    assert "auto is a model of gsbench" in Page(text).text
+    assert '<a href="#g0-on-demand">What auto chose here</a>' in text
+    assert "auto is a model" not in small_page.text
+
+
 def test_a_table_shows_its_first_rows_and_links_all():
     """Catches a page that grows with every run, and a file that is cut like the page."""
     table = DataTable("t.csv", [Column("a", 1), Column("b")], [[i / 3, f"run {i}"] for i in range(500)])
@@ -589,7 +694,7 @@ def test_a_view_without_a_number_is_left_out():
     """Catches a null of one view that empties the whole page."""
     records = frontier(**SMALL)
     records[0] = dataclasses.replace(records[0], per_view=[ViewScore("test/r_000"), *records[0].per_view[1:]])
-    assert "told apart" in pairs_section(records).sentences[1]
+    assert "significant" in pairs_section(records).sentences[1]
 
 
 def test_hostile_is_hostile():
@@ -609,7 +714,7 @@ def test_the_papers_points_are_marked_as_other_hardware(tmp_path):
         protocol = {**make().protocol, **of_paper}
         runs = [make(scene="trex", seed=s, psnr=31.0 + s, dataset=dataset, protocol=protocol) for s in range(2)]
         text = page(runs, tmp_path)
-        assert ("the paper's own number, which was measured on other hardware" in Page(text).text) == expected
+        assert ("the paper's number, on other hardware" in Page(text).text) == expected
         names = [run["name"] for run in json.loads(re.search(r'id="runs">(.*?)</script>', text, re.S)[1])]
         assert ("the paper's 7dgs on trex" in names) == expected
 
@@ -620,7 +725,7 @@ def test_many_experiments_share_one_page(tmp_path):
     records = [dataclasses.replace(r, experiment=f"e{i}") for i in range(9) for r in frontier(("3dgs",), seeds=1)]
     text = page(records, tmp_path)
     assert len(text) < 2_000_000
-    assert "none are drawn singly; the table has all" in Page(text).text
+    assert "have figures of their own; the table has all" in Page(text).text
 
 
 def test_a_target_that_no_run_reached_has_no_profile(tmp_path):
@@ -658,8 +763,8 @@ def test_records_that_are_left_out_are_named_on_the_page(tmp_path):
 
 
 def test_a_variant_that_all_runs_share_is_said_once(tmp_path):
-    """Catches names of models that all carry the same words."""
-    records = [dataclasses.replace(r, variant="iterations=7") for r in frontier(**SMALL)]
+    """Catches names of models that all carry the same words, and a length that is said twice."""
+    records = [dataclasses.replace(r, variant="iterations=1000,downscale=4") for r in frontier(**SMALL)]
     text = Page(page(records, tmp_path)).text
-    assert "Every run with iterations=7." in text
-    assert "4dgs, iterations=7" not in text
+    assert "All runs have downscale=4. All runs have 1,000 iterations." in text
+    assert "4dgs, iterations" not in text

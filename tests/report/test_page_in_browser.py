@@ -109,6 +109,27 @@ def test_tabs_by_mouse_and_keyboard(visit):
     assert panels.nth(2).is_visible(), "a page that loads itself again forgets its tab"
 
 
+def test_the_legend_hides_a_model(visit):
+    """Catches a name that hides nothing, hides it in one section only, or leaves its points to the pointer."""
+    page = visit()
+    entry = page.locator("#g0-frontier button.model", has_text=re.compile("^7dgs$"))
+    colour = entry.get_attribute("data-colour")
+    hits = page.locator(f'#g0-frontier [role=tabpanel]:not([hidden]) .hit[data-colour="{colour}"]')
+    shade = "(id) => getComputedStyle(document.getElementById(id)).getPropertyValue('--model-' + " + colour + ")"
+    before = page.evaluate(shade, "g0-frontier")
+    assert hits.first.is_visible()
+    entry.focus()
+    page.keyboard.press("Enter")
+    assert entry.get_attribute("aria-pressed") == "false"
+    assert [page.evaluate(shade, f"g0-{key}") for key in ("frontier", "quality", "anytime")] == ["transparent"] * 3
+    assert page.evaluate(shade, "g0-on-demand") == before, "an effect set has the colour of its model"
+    assert not hits.first.is_visible()
+    assert page.locator("#g0-frontier button.model[aria-pressed=true]").count() > 0
+    page.locator("#g0-anytime button.model", has_text=re.compile("^7dgs$")).click()
+    assert page.evaluate(shade, "g0-frontier") == before
+    assert hits.first.is_visible()
+
+
 def test_the_slider_by_mouse_and_keyboard(visit):
     """Catches a slider that does not move the edge between the images, and choices that do not change them."""
     page = visit()

@@ -51,7 +51,7 @@ def test_settings_of_every_run_are_said_once():
 def test_a_table_names_the_scenes_that_settings_were_chosen_on():
     """Would catch a page that reports as a finding what was chosen on its own scene."""
     text = page(make(scene="suzanne"), make(scene="nobodys"))
-    assert "settings of gsbench were chosen on suzanne; not on nobodys" in text
+    assert "settings were tuned on suzanne; not on nobodys" in text
     assert "were chosen on" not in page(make(scene="nobodys"))
 
 
@@ -241,8 +241,8 @@ def test_seconds_of_two_machines_are_never_averaged():
     assert cells["7dgs"]["fps"] == "20.0 ± 0.0"
     assert cells["4dgs"]["train_min"] == cells["4dgs"]["fps"] == "–"
     assert (
-        "train min and FPS are of one machine, Invented CPU, 2 threads; those of other machines are left out: "
-        "another CPU, 2 threads (2 runs). All other columns are means over every run."
+        "train min and FPS are of one machine, Invented CPU, 2 threads. Those of other machines are left out: "
+        "another CPU, 2 threads (2 runs). All other columns are means over all runs."
     ) in table.footnotes
     assert "are left out" not in page(*runs[:3])
     (other,) = tables.build(runs, machine="another CPU, 2 threads")
@@ -255,15 +255,15 @@ def test_an_average_over_scenes_is_of_one_machine():
     average = text[text.index("average over 2 of 2") :]
     assert "| 3dgs | **25.00** | 0.900 | 0.100 | – | – | 5000 |" in average
     assert "| 4dgs | **25.00** | 0.900 | 0.100 | 1.50 | 20.0 | 5000 |" in average
-    assert "– stands where a scene lacks the number" in average
+    assert "–: not measured on every scene" in average
 
 
 def test_the_load_is_told_as_far_as_it_is_known():
     """Would catch a load of some runs that passes for that of all, and records that are silent about it taken for 0."""
     busy, silent = make(seed=1), make("4dgs")
     silent = dataclasses.replace(silent, cost=dataclasses.replace(silent.cost, load=None, train_cpu_s=None))
-    assert "these runs included: 3.0\n" in page(busy)
-    assert "these runs included: 3.0; 1 of 2 runs do not say" in page(busy, silent, failed(seed=2))
+    assert "with the run itself: 3.0" in page(busy)
+    assert "with the run itself: 3.0; 1 of 2 runs do not say" in page(busy, silent, failed(seed=2))
     assert "load" not in page(silent)
     assert list(tables.tidy([busy, silent]).load.isna()) == [False, True]
 
@@ -271,7 +271,9 @@ def test_the_load_is_told_as_far_as_it_is_known():
 def test_the_change_by_float32_is_told_as_far_as_it_is_known():
     """Catches the smallest change instead of the largest, and runs without it that pass for measured ones."""
     known = [make(seed=k, metrics={**make().metrics, "psnr_float32": change}) for k, change in enumerate((2e-6, 3e-7))]
-    assert "- float32 changes PSNR of a view by at most 2.0e-06 dB (three views of each run).\n" in page(*known)
+    assert "- Rounding to float32 changes PSNR of a view by at most 2.0e-06 dB (three views of each run).\n" in page(
+        *known
+    )
     assert "by at most 2.0e-06 dB (three views of each run; 1 of 3 runs do not say).\n" in page(*known, make("4dgs"))
     assert "float32" not in page(make())
 
@@ -323,7 +325,7 @@ def test_columns_that_leak_or_are_rare_say_so():
     text = page(make(metrics=metrics, missing={}))
     assert "LPIPS-VGG | psnr_best_on_test (leaks) |" in text
     assert "| 0.250 | 26.50 |" in text
-    assert "LPIPS-VGG has no column: no trunk weights" in page(make())
+    assert "LPIPS-VGG needs weights: \\`python -m gsbench.fetch lpips-vgg\\`." in page(make())
 
 
 def test_regions_are_beside_psnr_with_their_share_or_the_reason():
@@ -331,11 +333,11 @@ def test_regions_are_beside_psnr_with_their_share_or_the_reason():
     text = page(moving(make(), 21.5), dataclasses.replace(make(scene="other"), missing=NO_REGIONS))
     assert "| model | PSNR | PSNR moving | SSIM |" in text
     assert "| 25.00 | 21.50 | 0.900 |" in text.replace("**", "")
-    assert "- PSNR moving is over 12.3% of the image, in 1 of 1 views, found by images of one camera." in text
-    assert "PSNR moving is empty: needs 3 evaluated views with the same camera" in text  # of the other scene
-    assert text.count("PSNR object is not measured: needs masks, or images with alpha.") == 2
+    assert "- PSNR moving is measured on 12.3% of the image, in 1 of 1 views, by images of one camera." in text
+    assert "PSNR moving needs 3 evaluated views with the same camera" in text  # of the other scene
+    assert text.count("PSNR object needs masks, or images with alpha.") == 2
     alone = page(dataclasses.replace(make(), missing=NO_REGIONS))
-    assert "- PSNR moving is not measured: needs 3 evaluated views with the same camera. PSNR object is not" in alone
+    assert "- PSNR moving needs 3 evaluated views with the same camera. PSNR object needs masks" in alone
     assert "PSNR moving" not in page(make())  # a record of before
 
 
@@ -402,7 +404,7 @@ def test_the_terminal_form_fits(width):
     runs += [dataclasses.replace(make(seed=seed), model="a_model_with_a_name_of_forty_letters_____") for seed in (0, 1)]
     text = layout.terminal(tables.build(runs), width)
     assert max(map(len, text.splitlines())) <= width
-    assert "only in the files, for lack of width" in text
+    assert "columns left out, for lack of width" in text
     assert "7dgs seed 2" in text
 
 

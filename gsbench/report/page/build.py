@@ -48,6 +48,7 @@ class Chapter:
     summary: str
     answers: list[cost.BudgetAnswer]
     basis: str
+    seeds: tuple[str, str]  # which models have one seed only, and the command that runs more
     sections: list[PageSection]
     views: list[GalleryView]
     tables: list[layout.Table]
@@ -171,6 +172,7 @@ def _chapter(group: Group, folder: Path, canvas: Canvas) -> Chapter:
         summary=" · ".join([*counts, messages.shorten(group.machine, 80)]),
         answers=cost.answers(group, family),
         basis=cost.basis_words(group, family),
+        seeds=cost.seeds_words(group),
         sections=_sections(group, family, folder, canvas),
         views=gallery([r for r in group.finished if r.variant == group.variant], folder),
         tables=evidence.paper_tables(group),

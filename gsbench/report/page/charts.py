@@ -14,6 +14,7 @@ from gsbench.report.page.svg import INK, LANE, MUTED, PAPER, Panel, model_colour
 LOG_FROM = 5.0  # an axis is logarithmic if its largest value is this many times its smallest
 SOLID = ("s", "o", "D", "X", "p", "d", "8", "H")  # markers that look large for their area
 ROW = 38  # height in pixels of a row with its label above it
+NAME = 10  # font size of the names beside the rows of events
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def frontier(curves: list[FrontierCurve], x: str, y: str = "PSNR, dB") -> Panel:
         if curve.paper:
             axes.scatter([m.x for m in curve.paper], [m.y for m in curve.paper], s=34, c=colour, marker="x")
         every = (*curve.runs, *curve.paper, *curve.beaten, *curve.best)
-        panel.hits += [(m.x, m.y, m.run) for m in every]
+        panel.hits += [(m.x, m.y, m.run, curve.style.colour) for m in every]
         across += [m.x for m in every]
     _scale_x(axes, across)
     _margin_y(axes)
@@ -83,6 +84,7 @@ def _dots(axes: Axes, marks: Sequence[Mark], style: Style, size: float, **how: A
 class Anytime:
     """The PSNR of a run during its training, or the mean PSNR over seeds."""
 
+    name: str  # of the model, short enough for the space beside the axes
     style: Style
     seconds: Sequence[float]
     psnr: Sequence[float]
@@ -91,19 +93,23 @@ class Anytime:
 
 
 def anytime(curves: list[Anytime]) -> Panel:
-    """Draw PSNR on the validation views against training seconds; rows below the axes show training events."""
-    panel = Panel(290 + LANE * len(curves), lanes=len(curves))
+    """Draw PSNR on the validation views against training seconds; a named row for each model shows training events."""
+    beside = 12 + round(0.62 * NAME * max(len(curve.name) for curve in curves))
+    panel = Panel(290 + LANE * len(curves), left=max(38, beside), lanes=len(curves))
     axes = panel.axes
     for lane, curve in enumerate(curves):
         colour, y = model_colour(curve.style.colour), len(curves) - lane - 0.5
         axes.plot(curve.seconds, curve.psnr, color=colour, linewidth=1.5)
         panel.below.plot([0, curve.seconds[-1]], [y, y], color=colour, linewidth=1)
+        place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "xytext": (-6, 0), "ha": "right"}
+        place |= {"textcoords": "offset points", "va": "center_baseline", "fontsize": NAME}
+        panel.below.annotate(curve.name, (0, y), color=colour, **place)
         for seconds, letter in curve.events:
             box = {"facecolor": PAPER, "edgecolor": "none", "pad": 0.8}
             style: dict[str, Any] = {"ha": "center", "va": "center_baseline", "fontsize": 10, "color": INK, "bbox": box}
             panel.below.text(seconds, y, letter, **style)
         _dots(axes, [Mark(curve.seconds[-1], curve.psnr[-1], curve.run)], curve.style, 44, linewidths=0)
-        panel.hits += [(s, p, curve.run) for s, p in zip(curve.seconds, curve.psnr, strict=True)]
+        panel.hits += [(s, p, curve.run, curve.style.colour) for s, p in zip(curve.seconds, curve.psnr, strict=True)]
     axes.set_xlim(left=0)
     _margin_y(axes)
     axes.xaxis.set_major_locator(_ticks(6))

@@ -15,6 +15,7 @@ from gsbench.report.page.svg import Panel
 
 Value = str | float | int | None
 MOST_ROWS = 60  # rows of a table that the report shows; the CSV file has all
+MOST_COLUMNS = 13  # columns that fit beside each other
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Column:
 
     title: str
     digits: int | None = None
+    infinite: str = "∞"  # the text of an infinite number
 
 
 @dataclass(frozen=True)
@@ -33,13 +35,35 @@ class DataTable:
     columns: list[Column]
     rows: list[list[Value]]
 
-    @property
+    @cached_property
     def shown(self) -> list[list[str]]:
-        """Return the first rows of the table as text, for the HTML report."""
-        return [
-            [show(value, column) for value, column in zip(row, self.columns, strict=True)]
-            for row in self.rows[:MOST_ROWS]
-        ]
+        """Return the first rows of the table as text, for the HTML report, without the columns of `same`."""
+        return [[show(row[i], self.columns[i]) for i in self._kept] for row in self.rows[:MOST_ROWS]]
+
+    @cached_property
+    def shown_columns(self) -> list[Column]:
+        """Return the columns of `shown`."""
+        return [self.columns[i] for i in self._kept]
+
+    @cached_property
+    def same(self) -> str:
+        """Return the columns of text or whole numbers that have one value in all rows, with this value."""
+        left = [i for i in range(len(self.columns)) if i not in self._kept]
+        return "; ".join(f"{self.columns[i].title} {show(self.rows[0][i], self.columns[i])}" for i in left)
+
+    @property
+    def is_turned(self) -> bool:
+        """Tell whether the HTML report shows columns as rows, because they are too many and rows are few."""
+        return len(self.shown_columns) > MOST_COLUMNS > len(self.rows)
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """Return the numbers of the columns that the report shows as columns; the first one always is."""
+        if len(self.rows) < 2:
+            return list(range(len(self.columns)))
+        differs = [column.digits is not None or len({row[i] for row in self.rows}) > 1
+                   for i, column in enumerate(self.columns)]  # fmt: skip
+        return [i for i, kept in enumerate(differs) if kept or i == 0]
 
     @property
     def hidden(self) -> int:
@@ -64,7 +88,9 @@ def show(value: Value, column: Column) -> str:
         return "–"
     if isinstance(value, float):
         return (
-            "never" if value == float("inf") else messages.plain(value, 3 if column.digits is None else column.digits)
+            column.infinite
+            if value == float("inf")
+            else messages.plain(value, 3 if column.digits is None else column.digits)
         )
     return f"{value:,}" if isinstance(value, int) else messages.shorten(value)
 
@@ -126,6 +152,31 @@ class PageSection:
     images: list[Image] = field(default_factory=list)  # below the drawings
 
 
+def scenes_title(scenes: list[str]) -> str:
+    """Name scenes: a single one by its name, several by their number."""
+    return scenes[0] if len(scenes) == 1 else f"mean of {messages.count(len(scenes), 'scene')}"
+
+
+def shown_runs(group: Group, configurations: list[Configuration]) -> list[str]:
+    """List a note on the runs of a section if it leaves out runs of other lengths or settings; empty if it has all.
+
+    Args:
+        group: the run records of one experiment.
+        configurations: those that the section shows.
+    """
+    number = sum(len(runs) for c in configurations for runs in c.runs.values())
+    others = len(group.finished) - number
+    if not others or not number:
+        return []
+    lengths = {c.iterations for c in configurations}
+    several = len({c.iterations for c in group.configurations}) > 1
+    length = lengths.pop() if len(lengths) == 1 else None
+    known = f"{length:,} iterations" if several and length else ""
+    what = known or group.variant or "the settings of the experiment"
+    return [f"Shown: {messages.count(number, 'run')} with {messages.shorten(what, 100)}. "
+            f"{messages.count(others, 'run')} with other lengths or settings are left out."]  # fmt: skip
+
+
 class Runs:
     """A numbered list of the runs behind the points of all figures.
 
@@ -151,7 +202,7 @@ class Runs:
         """
         runs = [r for s in scenes for r in configuration.runs.get(s, [])]
         seeds = messages.count(len({r.seed for r in runs}), "seed")
-        where = scenes[0] if len(scenes) == 1 else f"mean of {messages.count(len(scenes), 'scene')}"
+        where = scenes_title(scenes)
         name = f"{configuration.name}, {where}, {seeds}"
         means = [
             [s.mean() if len(s := group.sample(configuration, scene, q)) else float("nan") for scene in scenes]
@@ -167,7 +218,7 @@ class Runs:
             record: the record of a run with the same scene and model.
         """
         name = f"the paper's {record.model} on {record.scene}"
-        return self._number((record.dataset, name), "on one V100, its best on test while training", [])
+        return self._number((record.dataset, name), "on a V100, its best on test during training", [])
 
     def _number(self, key: tuple[str, ...], facts: str, records: list[Record]) -> int:
         if key not in self._numbers:

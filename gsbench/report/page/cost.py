@@ -6,11 +6,21 @@ from dataclasses import dataclass
 from gsbench.measure.record import Record
 from gsbench.report import frontier as f
 from gsbench.report import paper
-from gsbench.report.configurations import Configuration, Group, without
+from gsbench.report.configurations import Configuration, Group, is_beside_others, without
 from gsbench.report.family import Family
 from gsbench.report.frontier import FrontierPoint
 from gsbench.report.page import charts, messages
-from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Runs, Tab, Value
+from gsbench.report.page.content import (
+    Canvas,
+    Column,
+    DataTable,
+    PageFigure,
+    PageSection,
+    Runs,
+    Tab,
+    Value,
+    scenes_title,
+)
 from gsbench.report.page.palette import Style
 from gsbench.report.paper_protocol import has_images_of_paper
 
@@ -18,9 +28,10 @@ AXES = (("seconds", "training seconds"), ("ms", "ms a frame"), ("mb", "MB of the
 MOST_RUNS = 300  # single runs that are drawn in a figure
 MOST_NAMED = 3  # models that a sentence names
 INTERVALS = (
-    "The 95 % interval of a model's own PSNR is over seeds: what other seeds would give on these scenes and views. "
-    "It does not tell whether two models differ; the section “Is it a difference?” does."
+    "The 95 % interval of a model's PSNR is for other seeds on these scenes and views. Whether two models differ is "
+    "tested in the section “Is it a difference?”."
 )
+BESIDE = " (beside other work)"  # after a time that was not measured on a quiet machine
 
 
 @dataclass(frozen=True)
@@ -49,20 +60,40 @@ def basis_words(group: Group, family: Family) -> str:
     """Describe on which scenes and views the best model for each budget was chosen, and how models are compared."""
     scenes = group.basis
     if not scenes:
-        return "Nothing has finished yet."
+        return "No run has finished yet."
     points = f.points(group, scenes)
-    where = scenes[0] if len(scenes) == 1 else f"the mean of {len(scenes)} scenes"
     split = _split(group)
-    chosen = "on val" if f.has_val(points) else f"on {split}, as some runs have no PSNR on val"
-    text = f"Chosen {chosen} among the finished runs that fit; shown is the PSNR on {split}, {where}. "
+    chosen = "on val" if f.has_val(points) else f"on {split}, because some runs have no PSNR on val"
+    text = f"Each answer is the model with the highest PSNR {chosen}, of those within the budget. "
+    text += f"Its PSNR is that on {split}, {'the ' * (len(scenes) > 1)}{scenes_title(scenes)}. "
     if split == "val" or not f.has_val(points):
-        text += "The same views choose and show, so the highest PSNR is a little too high. "
+        text += "The same views choose and measure, so the highest PSNR is a little too high. "
     if family.size():
         many = messages.count(family.size(), "comparison")
-        text += f"Models are told apart after Holm's correction for all {many} on this page. "
-    alone = group.variant if len({c.variant for c in group.configurations}) == 1 else ""
-    text += f"Every run with {alone}. " if alone else ""
+        text += f"A difference is significant if p < 5 % after Holm's correction for the {many} on this page. "
+    alone = without(group.variant, "iterations") if len({c.variant for c in group.configurations}) == 1 else ""
+    text += f"All runs have {alone}. " if alone else ""
+    if any(_beside(p.configuration) for p in points):
+        text += f"A time{BESIDE} was measured while the machine was busy. It may be shorter on a quiet machine. "
     return text + _lengths(points)
+
+
+def seeds_words(group: Group) -> tuple[str, str]:
+    """Say which models have one seed only, and give the command that runs more; both are "" if all have several."""
+    single = [c for c in group.configurations if max(map(len, c.runs.values())) == 1]
+    if not single:
+        return "", ""
+    whole = len(single) == len(group.configurations)
+    which = "One seed" if whole else f"{len(single)} of {len(group.configurations)} models have one seed"
+    common = [c for c in single if c.variant == single[0].variant]
+    command = messages.more_seeds([r for c in common for runs in c.runs.values() for r in runs])
+    text = f"{which}: no interval is known, and no difference is tested."
+    return f"{text} Run more seeds:" if command else text, command
+
+
+def _beside(configuration: Configuration) -> bool:
+    """Tell whether a run of a configuration was measured while the machine had other work."""
+    return any(is_beside_others(r) for runs in configuration.runs.values() for r in runs)
 
 
 def _split(group: Group) -> str:
@@ -74,33 +105,37 @@ def _answer(points: list[FrontierPoint], family: Family, cost: str, budget: floa
     title = f"{messages.budget(budget)} of training" if timed else f"{1000 / budget:g} frames a second"
     known = [p.cost[cost] for p in points if not math.isnan(p.cost[cost])]
     if not known:
-        return BudgetAnswer(title, "", "not measured", "", "No finished run tells.")
+        return BudgetAnswer(title, "", "not measured", "", "No finished run has this time.")
     write = messages.duration if timed else lambda ms: f"{messages.plain(ms)} ms a frame"
     choice = f.choose(points, cost, budget, family)
     if choice is None:
-        return BudgetAnswer(title, "", "none fits", "", f"The quickest took {write(min(known))}.")
+        return BudgetAnswer(title, "", "no model", "", f"The fastest needs {write(min(known))}.")
     point = choice.point
-    detail = f"{_told(point.configuration)}{write(point.cost[cost])}. {_compared(choice)}"
+    beside = BESIDE if _beside(point.configuration) else ""
+    detail = f"{_told(point.configuration)}{write(point.cost[cost])}{beside}. {_compared(choice)}"
     if timed and budget > 2 * max(known):
-        detail += f" No run here trained longer than {write(max(known))}."
-    return BudgetAnswer(
-        title, point.series, f"{messages.plain(point.psnr.mean)} dB", messages.interval(point.psnr), detail
-    )
+        detail += f" The longest training took {write(max(known))}."
+    interval = messages.interval(point.psnr)
+    return BudgetAnswer(title, point.series, f"{messages.plain(point.psnr.mean)} dB", interval, detail.strip())
 
 
 def _compared(choice: f.BudgetChoice) -> str:
-    """Say whether the chosen model is significantly better than each other model within the budget."""
+    """Say whether the chosen model is significantly better than each other model within the budget.
+
+    The text is empty if no difference could be tested, for lack of seeds.
+    """
     others = choice.others
     if not others:
-        return "No other model fits."
+        return "No other model is within this budget."
     if len(choice.unknown) == others:
-        return "One seed: whether it is ahead is not known."
+        return ""
     if len(choice.ahead) == others:
-        return f"Ahead of {choice.ahead[0].series}." if others == 1 else "Ahead of every other model that fits."
-    said = [f"Ahead of {len(choice.ahead)} of {messages.count(others, 'other model')}."] if choice.ahead else []
-    said += [f"Not told apart from {_named(choice.level)}."] if choice.level else []
-    said += [f"On the views shown {_named(choice.behind)} did better."] if choice.behind else []
-    said += [f"No spread is known of the difference to {_named(choice.unknown)}."] if choice.unknown else []
+        every = choice.ahead[0].series if others == 1 else "every other model within this budget"
+        return f"Significantly better than {every}."
+    said = [f"Significantly better than {len(choice.ahead)} of {others} other models."] if choice.ahead else []
+    said += [f"No significant difference to {_named(choice.level)}."] if choice.level else []
+    said += [f"Significantly worse than {_named(choice.behind)} on the views shown."] if choice.behind else []
+    said += [f"Not tested against {_named(choice.unknown)}: too few seeds."] if choice.unknown else []
     return " ".join(said)
 
 
@@ -126,27 +161,23 @@ def frontier_section(group: Group, canvas: Canvas) -> PageSection:
     """
     scenes = group.basis
     points = f.points(group, scenes)
-    tabs = [_frontier_tab(group, canvas, "f0", _title(scenes), scenes)] if points else []
+    tabs = [_frontier_tab(group, canvas, "f0", scenes_title(scenes), scenes)] if points else []
     single = [s for s in group.scenes if [s] != scenes and any(s in c.runs for c in group.configurations)]
     drawn = single[: canvas.scenes]
     tabs += [_frontier_tab(group, canvas, f"f{i}", s, [s]) for i, s in enumerate(drawn, 1)]
     columns = [Column("scene"), Column("model"), Column("variant"), Column("seeds"), Column("PSNR dB", 2)]
     columns += [Column("95 % low", 2), Column("95 % high", 2), Column("PSNR val dB", 2), Column("training s", 1)]
-    columns += [Column("ms a frame", 2), Column("MB", 2), Column("beaten in seconds")]
+    columns += [Column("ms a frame", 2), Column("MB", 2), Column("slower and worse than another")]
     rows = [row for where in [scenes, *([s] for s in single)] for row in _rows(group, where)]
     table = DataTable("frontier.csv", columns, rows) if rows else None
     theirs = any(_paper(r, "ms") for r in group.finished)
     notes = [INTERVALS] if any(p.psnr.over for p in points) else []
-    notes += ["×: the paper's own number, which was measured on other hardware by another protocol."] if theirs else []
+    notes += ["×: the paper's number, on other hardware and as the best on test during training."] if theirs else []
     if len(drawn) < len(single):
-        notes.append(f"Of {len(single)} scenes {len(drawn) or 'none'} are drawn singly; the table has all.")
+        notes.append(f"{len(drawn) or 'None'} of {len(single)} scenes have figures of their own; the table has all.")
     return PageSection(
         "frontier", "What accuracy costs", _frontier_words(group, points), tabs, table, legend=bool(tabs), notes=notes
     )
-
-
-def _title(scenes: list[str]) -> str:
-    return scenes[0] if len(scenes) == 1 else f"mean of {len(scenes)} scenes"
 
 
 def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
@@ -155,7 +186,7 @@ def _rows(group: Group, scenes: list[str]) -> list[list[Value]]:
     beaten = f.beaten(points, "seconds")
     return [
         [
-            _title(scenes),
+            scenes_title(scenes),
             p.configuration.model,
             p.configuration.variant or "none",
             p.psnr.seeds,
@@ -228,16 +259,17 @@ def _frontier_words(group: Group, points: list[FrontierPoint]) -> list[str]:
     if not points:
         return ["No run has finished, so there is nothing to compare."]
     best, scenes, split = f.ranked(points)[0], group.basis, _split(group)
-    where = (
-        f"On {scenes[0]}"
-        if len(scenes) == 1
-        else f"On the mean of {len(scenes)} scenes ({messages.listing(scenes[:6])})"
-    )
-    reached = f"{messages.plain(best.psnr.mean)} dB ({messages.interval(best.psnr)})"
-    took = f" in {messages.duration(best.cost['seconds'])}" if not math.isnan(best.cost["seconds"]) else ""
-    leads = f"{best.configuration.name} is highest{' on val' if f.has_val(points) else ''}"
-    text = f"{where}, {leads}: it has {reached} on {split}{took}. {_beaten_words(points)}"
-    return [text, _lengths(points)]
+    named = messages.in_brackets(messages.listing(scenes[:6]) if len(scenes) > 1 else "")
+    reached = f"{messages.plain(best.psnr.mean)} dB{messages.in_brackets(messages.interval(best.psnr))}"
+    seconds = best.cost["seconds"]
+    took = "" if math.isnan(seconds) else f" after {messages.duration(seconds)} of training"
+    where = f"On {'the ' * (len(scenes) > 1)}{scenes_title(scenes)}{named}, {best.configuration.name}"
+    if len(points) == 1:
+        return [f"{where} has {reached} on {split}{took}. No other model has finished there."]
+    on_val = f.has_val(points) and split != "val"
+    leads = f"{where} has the highest PSNR on {'val' if on_val else split}"
+    text = f"{leads}. Its PSNR on {split} is {reached}" if on_val else f"{leads}: {reached}"
+    return [f"{text}{took}. {_beaten_words(points)}".strip()]
 
 
 def _beaten_words(points: list[FrontierPoint]) -> str:
@@ -247,31 +279,24 @@ def _beaten_words(points: list[FrontierPoint]) -> str:
     """
     timed = [p for p in points if not math.isnan(p.cost["seconds"])]
     beaten = f.beaten(timed, "seconds")
-    if len(points) == 1:
-        return "It is the only point."
+    what = "model" if len({p.series for p in points}) == len(points) else "configuration"
     if not beaten:
-        return (
-            "By their means no point is beaten: each step in PSNR costs more training time." if len(timed) > 1 else ""
-        )
+        return f"No {what} is both slower and worse than another." if len(timed) > 1 else ""
     if len(beaten) > 1:
-        return (
-            f"By their means {len(beaten)} of {len(timed)} points are beaten: another point has at least the PSNR in "
-            "at most the seconds. Some of these differences may be chance."
-        )
+        many = f"{len(beaten)} of {len(timed)} {what}s are both slower and worse than another"
+        return f"{many}, by their means. Some of these differences may be chance."
     rivals = [p for p in timed if p not in beaten and f.beats(p, beaten[0], "seconds")]
     by = min(rivals, key=lambda p: p.cost["seconds"])
-    return (
-        f"By their means {beaten[0].configuration.name} is beaten by {by.configuration.name}, which has at least the "
-        "PSNR in at most the seconds; the difference may be chance."
-    )
+    names = f"{beaten[0].configuration.name} is both slower and worse than {by.configuration.name}"
+    return f"{names}, by their means. The difference may be chance."
 
 
 def _lengths(points: list[FrontierPoint]) -> str:
     """Say which training lengths the runs have."""
     lengths = sorted({n for p in points if (n := p.configuration.iterations)})
     if len(lengths) > 1:
-        return f"Each point is a finished run: {len(lengths)} lengths, {lengths[0]:,} to {lengths[-1]:,} iterations."
+        return f"The runs have {len(lengths)} lengths, from {lengths[0]:,} to {lengths[-1]:,} iterations."
     if any(r.length_choice for p in points for runs in p.configuration.runs.values() for r in runs):
-        return "Each point is a finished run, whose length was chosen on val (train.lengths)."
-    length = f"{lengths[0]:,} iterations" if lengths else "one length"
-    return f"All runs are of one length ({length}): what a shorter or longer run would give is not known."
+        return "The length of each run was chosen on val (train.lengths)."
+    length = messages.count(lengths[0], "iteration") if lengths else "one length"
+    return f"All runs have {length}. With other lengths the models may rank differently."

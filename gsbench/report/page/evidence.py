@@ -2,7 +2,7 @@
 
 from gsbench.measure.record import Record
 from gsbench.report import layout, tables
-from gsbench.report.conditions import conditions
+from gsbench.report.conditions import commit, conditions
 from gsbench.report.configurations import Group, iterations
 from gsbench.report.page import messages
 from gsbench.report.page.content import Column, DataTable, PageSection, Value
@@ -35,7 +35,7 @@ def protocol_section(group: Group) -> PageSection:
             *(group.value(r, q) for q in ("psnr", "seconds", "cpu_s", "load", "ms", "mb")),
             iterations(r),
             r.provenance.machine,
-            r.provenance.git_commit,
+            commit(r),
             messages.command([r]) or "not in its record",
         ]
         for r in group.records
@@ -43,15 +43,15 @@ def protocol_section(group: Group) -> PageSection:
     compared = _compared(group)
     notes = [messages.shorten(note, LONGEST_NOTE) for note in conditions(compared)]
     if group.elsewhere:
-        left = (
-            f"Seconds, ms and FPS of {messages.count(group.elsewhere, 'run')} on other machines are left out everywhere"
-        )
-        notes.insert(0, f"{left}; this is of {messages.shorten(group.machine, 200)}.")
+        others = f"{messages.count(group.elsewhere, 'run')} on other machines are left out everywhere"
+        machine = messages.shorten(group.machine, 200)
+        notes.insert(0, f"Times are of one machine: {machine}. Seconds, ms and FPS of {others}.")
     ended = messages.count(len(group.finished), "run")
     lost = len(group.records) - len(group.finished)
-    said = [f"{ended} finished, {messages.count(lost, 'run')} did not (below)." if lost else f"All {ended} finished."]
+    every = f"All {ended} finished." if len(group.finished) > 1 else "The run finished."
+    said = [f"{ended} finished, {messages.count(lost, 'run')} did not (below)." if lost else every]
     if len(compared) < len(group.records):
-        said.append(f"The lines below are of the {messages.count(len(compared), 'run')} in the tables above.")
+        said.append(f"The lines below describe the {messages.count(len(compared), 'run')} in the tables above.")
     return PageSection(
         "protocol", "Protocol, machine, seeds", said, table=DataTable("runs.csv", columns, rows), notes=notes
     )

@@ -7,8 +7,8 @@ from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report.intervals import Estimate
 
-NO_SPREAD = "no spread is known from one seed"
 LONGEST = 300  # characters of a text from a record
+SEEDS = (0, 1, 2)  # the fewest seeds whose interval is of use
 
 
 def shorten(text: object, longest: int = LONGEST) -> str:
@@ -73,9 +73,15 @@ def budget(seconds: float) -> str:
 
 
 def interval(of: Estimate, digits: int = 2, *, sign: bool = False) -> str:
-    """Format a 95 % interval and say whether it is over seeds, views or scenes; return NO_SPREAD if there is none."""
+    """Format a 95 % interval and say whether it is over seeds, views or scenes; "" if there is none."""
     write = signed if sign else plain
-    return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else NO_SPREAD
+    return f"95 % {write(of.low, digits)} to {write(of.high, digits)} over {of.over}" if of.over else ""
+
+
+def in_brackets(*words: str) -> str:
+    """Join the words that are not empty by semicolons, in brackets and after a space; "" if all are empty."""
+    known = "; ".join(filter(None, words))
+    return f" ({known})" if known else ""
 
 
 def over(of: Estimate) -> str:
@@ -87,10 +93,26 @@ def scope(of: Estimate) -> str:
     """Return a sentence with the number of compared scenes, which also says whether intervals hold for other scenes."""
     scenes = {1: "One scene", 2: "Two scenes"}.get(of.scenes, count(of.scenes, "scene"))
     if not of.over:
-        return f"{scenes}, one seed: no interval is known."
+        return f"{scenes}, without an interval."
     if of.over == "scenes":
-        return f"{scenes}; an interval over scenes like these, with all seeds and views in it."
-    return f"{scenes}; an interval over {of.over}, not over scenes: it does not tell what another scene would give."
+        return f"{scenes}. The intervals are for scenes like these."
+    these = "this scene" if of.scenes == 1 else "these scenes"
+    return f"{scenes}. The intervals are for other {of.over} of {these}. Another scene may differ by more."
+
+
+def more_seeds(records: list[Record]) -> str:
+    """Return the command that runs the given runs with more seeds; "" if the records do not hold their settings.
+
+    If the runs differ in more than the values of the same settings, the command is that of the first run.
+    """
+    told = [dict(word.partition("=")[::2] for word in r.overrides) for r in records if r.overrides]
+    if not told:
+        return ""
+    alike = all(one.keys() == told[0].keys() and not any("," in value for value in one.values()) for one in told)
+    values = {key: list(dict.fromkeys(one[key] for one in (told if alike else told[:1]))) for key in told[0]}
+    values["seed"] = [str(seed) for seed in sorted({r.seed for r in records} | set(SEEDS))]
+    words = [f"{key}={','.join(several)}" for key, several in values.items()]
+    return f"python -m gsbench -m {' '.join(shlex.quote(shorten(word)) for word in words)}"
 
 
 def run_name(record: Record) -> str:

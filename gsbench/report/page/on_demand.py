@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from statistics import fmean
 
-from gsbench.effects.messages import EFFECT_SETS, of_comparison, of_decision
+from gsbench.effects.messages import EFFECT_SETS, of_comparison, reason
 from gsbench.measure.record import Record, TimeScreen
 from gsbench.report.configurations import Group
 from gsbench.report.intervals import Estimate
@@ -27,9 +27,10 @@ LONGEST_REASON = 200
 LONGEST_LABEL = 32  # characters of the label of a bar, which has a number beside it
 LABEL_END = 15  # characters at its end, which differ between training lengths and sizes
 IN_TRAINING = (
-    "What the gate in training changed is not in these dB and ms, as the training goes on after it: the frontier has "
-    "runs with and without gates, where both were run."
+    "The changes in dB and ms are those of the gate after training. A gate during training changes the training too: "
+    "compare runs with and without gates in “What accuracy costs”."
 )
+KEPT = {"on": "kept time", "off": "removed time", "undecided": "kept time, because the test cannot decide"}
 NAMES = EFFECT_SETS | {REMOVED: "removed"}
 
 
@@ -45,7 +46,7 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
     common = [one for one in found if one.configuration in group.compared] or found
     said = [_sentence(one) for one in common[:MOST_SAID]]
     if len(found) > len(said):
-        said.append(f"These are {len(said)} of {len(found)} scenes and runs; the table has all of them.")
+        said.append(f"These are {len(said)} of {len(found)} results; the table has all.")
     gated = [one for one in found if one.gated]
     return PageSection(
         "on-demand",
@@ -64,17 +65,18 @@ def on_demand_section(group: Group, canvas: Canvas, folder: Path) -> PageSection
 
 def _sentence(one: Decided) -> str:
     """Describe which effects (time, view direction, the network AGR) a model and its Gaussians keep on a scene."""
-    parts = [_screen_words(one.runs), _comparison_words(one.runs), *_gate_words(one)]
-    return f"On {one.scene}, {one.name}: {' '.join(part for part in parts if part)}"
+    parts = [_screen_words(one.runs) or ":", _comparison_words(one.runs), *_gate_words(one)]
+    return f"On {one.scene}, {one.name}{' '.join(part for part in parts if part)}"
 
 
 def _screen_words(runs: list[Record]) -> str:
-    """Say whether the model depends on time, why the first run decided so, and if other seeds gave the same result."""
+    """Say whether the model keeps time, why the first run decided so, and if other seeds gave the same result."""
     screens = _screens(runs)
     if not screens:
         return ""
     first = screens[0]
-    text = messages.shorten(f"{of_decision(first)}, as {first.reason}", LONGEST_REASON)
+    kept = KEPT.get(first.decision, f"decided “{messages.shorten(first.decision, 20)}” on time")
+    text = messages.shorten(f" {kept}: {reason(first)}", LONGEST_REASON)
     others = Counter(screen.decision for screen in screens if screen.decision != first.decision)
     if others:
         parts = [
@@ -83,7 +85,7 @@ def _screen_words(runs: list[Record]) -> str:
         ]
         text += f"; {messages.listing(parts)}"
     elif len(screens) > 1:
-        text += f"; the same with all {len(screens)} seeds"
+        text += f"; all {len(screens)} seeds agree"
     return f"{text}."
 
 
@@ -108,27 +110,28 @@ def _gate_words(one: Decided) -> list[str]:
     The text gives the change of PSNR and of the milliseconds per frame.
     """
     if not one.gated:
-        return ["No gate has changed a Gaussian."]
+        return ["No Gaussian was changed."]
     kept = [f"{one.rows[name]:,.0f} {said}" for name, said in EFFECT_SETS.items() if one.rows[name] >= 0.5]
     share = f" ({100 * one.left / one.before:.0f} %)" if one.before else ""
-    where = "" if one.gated == len(one.runs) else f" On {one.gated} of {len(one.runs)} seeds:"
-    text = f"{where} Of {one.before:,.0f} Gaussians the gates left {one.left:,.0f}{share}"
-    said = [(f"{text}: {messages.listing(kept)}." if kept else f"{text}.").strip()]
+    where = "" if one.gated == len(one.runs) else f" with {one.gated} of {len(one.runs)} seeds"
+    text = f"The gates left {one.left:,.0f} of {one.before:,.0f} Gaussians{share}{where}"
+    said = [f"{text}: {messages.listing(kept)}." if kept else f"{text}."]
     if one.asleep > 0:
         moves = 100 * (1 - one.asleep)
-        said.append(f"At any one time AGR moves {moves:.0f} % of its Gaussians; the others cannot be seen then.")
+        said.append(f"AGR moves {moves:.0f} % of its Gaussians in a frame; the others are invisible at its time.")
     if one.psnr.scenes:
-        text = f"The gate at the end changed PSNR on {messages.shorten(one.views, 40)} by {_change(one.psnr, 'dB', 3)}"
+        text = f"The gate after training changed PSNR on {messages.shorten(one.views, 40)} by "
+        text += _change(one.psnr, "dB", 3)
         if one.ms.scenes:
-            text += f" and a frame of {messages.plain(one.ms_before)} ms by {_change(one.ms, 'ms', 2)}"
-        said.append(f"{text}." if one.psnr.over else f"{text}; {messages.NO_SPREAD}.")
+            text += f", and a frame of {messages.plain(one.ms_before)} ms by {_change(one.ms, 'ms', 2)}"
+        said.append(f"{text}.")
     return said
 
 
 def _change(of: Estimate, unit: str, digits: int) -> str:
     """Format the change of a value, with its interval if there is one."""
-    interval = f" ({messages.interval(of, digits, sign=True)})" if of.over else ""
-    return f"{messages.signed(of.mean, digits)} {unit}{interval}"
+    interval = messages.interval(of, digits, sign=True)
+    return f"{messages.signed(of.mean, digits)} {unit}{messages.in_brackets(interval)}"
 
 
 def _notes(found: list[Decided], gated: int) -> list[str]:
@@ -147,7 +150,7 @@ def _notes(found: list[Decided], gated: int) -> list[str]:
         notes.append(text.replace("§", which, 1))
     more = [f"and {len(notes) - MOST_NOTES} more notes."] if len(notes) > MOST_NOTES else []
     if gated > MOST_BARS:
-        more.append(f"Of {gated} bars {MOST_BARS} are drawn; the table has all.")
+        more.append(f"The figures have {MOST_BARS} of {gated} rows; the table has all.")
     gates = [g for one in found for r in one.runs for g in (r.on_demand.gates if r.on_demand else [])]
     if any(gate.step is not None for gate in gates):
         more.append(IN_TRAINING)
@@ -171,8 +174,8 @@ def _drawings(gated: list[Decided], canvas: Canvas) -> list[PageFigure]:
     colours = [model_colour(MODELS.index(EFFECT_SET_LIKE[name])) for name in EFFECT_SETS]
     whose = messages.listing([bar.label for bar in effect_sets])
     drawn = (
-        ("Gaussians by effect set, of those before the gates", "k", effect_sets, [*colours, LINE]),
-        ("Harmonics by degree, of the Gaussians left", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
+        ("Gaussians before the gates, by effect set", "k", effect_sets, [*colours, LINE]),
+        ("Gaussians left, by degree of harmonics", "d", degrees, [stage_colour(_stage(i)) for i in range(DEGREES)]),
     )
     return [
         PageFigure(title, charts.bars(bars, hues, "%"), f"{canvas.name}o{key}", f"{title}: {whose}")

@@ -1,5 +1,5 @@
 "use strict";
-// Tabs, the card that names a run, the slider between two images, and reloading while runs are going on.
+// Tabs, a legend that hides models, the card that names a run, the slider between images, and reloading of a live page.
 const each = (selector, act, root = document) => root.querySelectorAll(selector).forEach(act);
 
 each(".tabs", (tabs) => {
@@ -27,6 +27,21 @@ each(".tabs", (tabs) => {
   let before = 0;
   try { before = Number(sessionStorage.getItem(kept)) || 0; } catch { /* as above */ }
   select(before < buttons.length ? before : 0, false);
+});
+
+each("button.model", (button) => {
+  const { colour } = button.dataset;
+  const article = button.closest("article");
+  button.addEventListener("click", () => { // a hidden model's colour is transparent, and its points have no card
+    const shown = button.getAttribute("aria-pressed") !== "true";
+    each(`button.model[data-colour="${colour}"]`, (same) => {
+      same.setAttribute("aria-pressed", shown);
+      const { style } = same.closest("section");
+      if (shown) style.removeProperty("--model-" + colour);
+      else style.setProperty("--model-" + colour, "transparent");
+    }, article);
+    each(`.hit[data-colour="${colour}"]`, (hit) => { hit.style.display = shown ? "" : "none"; }, article);
+  });
 });
 
 const runs = JSON.parse(document.getElementById("runs").textContent);

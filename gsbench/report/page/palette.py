@@ -1,6 +1,7 @@
 """Give every model one colour and one marker, the same in all figures, for the light and the dark theme.
 
 The first hues come from the palette of Okabe and Ito, which readers with common colour deficiencies can distinguish.
+The others were chosen one after the other, each as far as possible from those before it (CIEDE2000), in both themes.
 Each hue is darkened for a white page and lightened for a black page, so that its contrast is at least 4.5:1. The
 markers distinguish the models without colour.
 """
@@ -23,10 +24,10 @@ PAGE_LIGHT = {"ink": "#1b1d21", "muted": "#565b63", "line": "#dfe1e4", "paper": 
               "focus": "#0069a8"}  # fmt: skip
 PAGE_DARK = {"ink": "#eceef1", "muted": "#a9afb8", "line": "#33373d", "paper": "#141619", "raised": "#1d2024",
              "focus": "#5cbcf2"}  # fmt: skip
-LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#7d6608", "#1f6f78", "#4b4fa3", "#8c2d2d", "#3d6b1f",
-         "#b0185a", "#6a4a2f", "#2e5cb8", "#8a5a00", "#7a1fa2", "#00708f", "#b3261e")  # fmt: skip
-DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#e3cc4a", "#6fd0da", "#a9adff", "#ff9c9c", "#a8d672",
-        "#ff8fbf", "#d9b38c", "#8fb4ff", "#f0b860", "#d7a3f7", "#66d4f5", "#ff8a80")  # fmt: skip
+LIGHT = ("#5c6066", "#0069a8", "#00734f", "#b34700", "#9c3d82", "#1f4291", "#0b4f51", "#0d3e10", "#55450a",
+         "#7b43ca", "#900f04", "#6a7616", "#be2142", "#3c7880", "#916814", "#078221", "#343718")  # fmt: skip
+DARK = ("#b9bec6", "#5cbcf2", "#3ccb9f", "#ff9454", "#eb9fd0", "#cbcefe", "#4fe6ea", "#93ff8e", "#f9ce00",
+        "#ac76f0", "#ffc4b4", "#9daf19", "#fd536a", "#63b2bb", "#d79b15", "#1cbf38", "#ddf43b")  # fmt: skip
 MARKERS: tuple[Marker, ...] = (
     "^",
     "s",

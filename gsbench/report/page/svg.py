@@ -67,7 +67,7 @@ class Panel:
     top: int = 24
     lanes: int = 0  # number of rows below the axes, for events
     width: int = WIDTH
-    hits: list[tuple[float, float, int]] = field(default_factory=list)  # data coordinates, number of the run
+    hits: list[tuple[float, float, int, int]] = field(default_factory=list)  # data coordinates, run, model's colour
     figure: Figure = field(init=False)
     axes: Axes = field(init=False)
     below: Axes = field(init=False)  # the axes of these rows, with the same x axis
@@ -124,9 +124,10 @@ class Panel:
         view = f'viewBox="0 0 {self.width} {self.height}"'
         return f'<svg {view} role="img" aria-label="{escape(alt, quote=True)}">{body}{circles}</svg>'
 
-    def _hit(self, x: float, y: float, run: int) -> str:
+    def _hit(self, x: float, y: float, run: int, colour: int) -> str:
         across, up = self.axes.transData.transform((x, y))
-        return f'<circle class="hit" data-run="{run}" cx="{across:.1f}" cy="{self.height - up:.1f}" r="{HIT}"/>'
+        place = f'cx="{across:.1f}" cy="{self.height - up:.1f}" r="{HIT}"'
+        return f'<circle class="hit" data-run="{run}" data-colour="{colour}" {place}/>'
 
 
 def _font(found: re.Match[str]) -> str:

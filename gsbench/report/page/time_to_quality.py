@@ -6,14 +6,17 @@ from statistics import fmean
 from gsbench.report import frontier as f
 from gsbench.report.configurations import Configuration, Group, iterations
 from gsbench.report.page import charts, events, messages
-from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Tab, Value
+from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Tab, Value, shown_runs
+
+LONGEST_NAME = 14  # characters of a model's name beside its row of events
+LENGTHS = "Do not read shorter trainings off these curves: schedules depend on length."
 
 
 def quality_section(group: Group, canvas: Canvas) -> PageSection:
     """Make the section on how long each model trains to reach PSNR targets, with the models' performance profiles."""
     targets = f.targets(group)
     if not targets:
-        text = "No target: no finished run has PSNR on val and training seconds, or all reach the same."
+        text = "There is no target: no finished run has PSNR on val and seconds of training, or all have the same PSNR."
         return PageSection("quality", "Time to quality", [text])
     ratios = f.profile(targets)
     drawings = []
@@ -22,7 +25,7 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         alt = f"Performance profile of {messages.listing(list(ratios))} over {problems} targets"
         drawings = [PageFigure("Targets reached within a factor of the fastest", panel, f"{canvas.name}q", alt)]
     models = [m for m in canvas.look if any(m in t.seconds for t in targets)]
-    columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1) for m in models)]
+    columns = [Column("scene"), Column("target"), Column("PSNR dB", 2), *(Column(f"{m} s", 1, "never") for m in models)]
     rows: list[list[Value]] = [[t.scene, t.rule, t.psnr, *(t.seconds.get(m) for m in models)] for t in targets]
     return PageSection(
         "quality",
@@ -31,12 +34,12 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         [Tab("", drawings)],
         DataTable("time_to_quality.csv", columns, rows),
         beside=True,
-        legend=True,
+        legend=bool(drawings),
         notes=[
-            "Targets are round numbers of dB on val between the lowest and the highest run of a scene, and the paper's "
-            "7dgs, its best on test, where the data are the paper's: no model's own PSNR is a target. The step is the "
-            "widest of 2, 1, 0.5, 0.2 and 0.1 dB that gives three. Seconds are means of the quickest finished "
-            "runs, not interpolated."
+            "Targets are round values of PSNR on val between the lowest and the highest run of a scene. Their step is "
+            "the largest of 2, 1, 0.5, 0.2 and 0.1 dB that gives three. On the paper's images, the paper's PSNR of "
+            "7DGS (best on test) is a target too. Seconds are those of the fastest finished configuration of a model, "
+            "averaged over seeds. Nothing is interpolated."
         ],
     )
 
@@ -53,13 +56,12 @@ def _quality_words(targets: list[f.Target], models: list[str]) -> list[str]:
     most = [m for m in models if reached[m] == max(reached.values())]
     quick = [m for m in models if fastest[m] == max(fastest.values())]
     alone = sum(sum(map(math.isfinite, t.seconds.values())) == 1 < len(t.seconds) for t in targets)
-    verb = "reaches" if len(most) == 1 else "reach"
-    text = f"{messages.listing(most)} {verb} most targets ({reached[most[0]]} of {len(targets)}). By mean seconds "
-    text += (
-        f"{messages.listing(quick)} {'is' if len(quick) == 1 else 'are'} first most often ({fastest[quick[0]]} times)."
-    )
+    several = f"{messages.listing(most)} {'reaches' if len(most) == 1 else 'reach'} the most targets: "
+    text = several + f"{reached[most[0]]} of {len(targets)}{' each' if len(most) > 1 else ''}. "
+    text += f"{messages.listing(quick)} {'is' if len(quick) == 1 else 'are'} most often the fastest: for "
+    text += f"{messages.count(fastest[quick[0]], 'target')}{' each' if len(quick) > 1 else ''}."
     if alone:
-        text += f" {messages.count(alone, 'target')} {'is' if alone == 1 else 'are'} reached by one model only."
+        text += f" Only one model reaches {messages.count(alone, 'target')}."
     return [text]
 
 
@@ -81,20 +83,19 @@ def anytime_section(group: Group, canvas: Canvas) -> PageSection:
                 seen |= {letter for _, letters in marks for letter in letters}
                 at = [(_when(step, steps, seconds), letters) for step, letters in marks]
                 run = canvas.runs.of_configuration(group, configuration, [scene])
-                curves.append(charts.Anytime(canvas.look[configuration.series], seconds, psnr, run, at))
+                name = messages.shorten_middle(configuration.series, LONGEST_NAME, LONGEST_NAME // 2)
+                curves.append(charts.Anytime(name, canvas.look[configuration.series], seconds, psnr, run, at))
                 rows += [[scene, configuration.model, *point] for point in zip(steps, seconds, psnr, strict=True)]
                 tails.setdefault(configuration.model, []).append(max(psnr) - psnr[-1])
         if curves and i < max(1, canvas.scenes):
             alt = f"PSNR on val against training seconds on {scene}, one curve for each of {len(curves)} models"
             drawings.append(PageFigure(scene, charts.anytime(curves), f"{canvas.name}a{i}", alt))
     if not rows:
-        return PageSection("anytime", "While training", ["No finished run has a curve of PSNR on val."])
+        return PageSection("anytime", "While training", ["No finished run has PSNR on val during training."])
     columns = [Column("scene"), Column("model"), Column("iteration"), Column("seconds", 2), Column("PSNR val dB", 2)]
     letters = [f"{letter}: {events.MEANING[letter]}" for letter in events.MEANING if letter in seen]
-    notes = [
-        "This is the course of runs of this length, not what shorter runs would give: rates and densification scale."
-    ]
-    notes += [f"Events in mean seconds: {'; '.join(letters)}."] if letters else []
+    notes = [*shown_runs(group, group.main_configurations), LENGTHS]
+    notes += [f"Events in the row of each model: {'; '.join(letters)}."] if letters else []
     table = DataTable("anytime.csv", columns, rows)
     return PageSection(
         "anytime", "While training", _anytime_words(tails), [Tab("", drawings)], table, legend=True, notes=notes
@@ -135,9 +136,8 @@ def _anytime_words(tails: dict[str, list[float]]) -> list[str]:
     """Say which models end with a lower PSNR on the validation views than they had earlier in training."""
     lost = {m: fmean(losses) for m, losses in tails.items() if fmean(losses) >= 0.05}
     if not lost:
-        return ["Every model ends within 0.05 dB of the best it had on val: none overfits visibly by its last step."]
+        return ["PSNR on val of every model ends within 0.05 dB of its highest value: no model overfits visibly."]
     worst = sorted(lost, key=lambda m: -lost[m])
     parts = [f"{m} by {messages.plain(lost[m])} dB" for m in worst]
-    rest = [m for m in tails if m not in lost]
-    text = f"On the mean of the scenes these end below the best they had on val: {messages.listing(parts)}"
-    return [f"{text}; {messages.listing(rest)} within 0.05 dB." if rest else f"{text}."]
+    text = f"PSNR on val ends below its highest value, in the mean over scenes: {messages.listing(parts)}."
+    return [f"{text} The other models end within 0.05 dB of theirs." if len(lost) < len(tails) else text]
