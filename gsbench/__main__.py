@@ -5,7 +5,6 @@ torch is imported only when the first run starts, so that wrong options are repo
 
 import os
 import shlex
-import signal
 import sys
 import warnings
 from pathlib import Path
@@ -18,12 +17,13 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench import usage
 from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line, printable
-from gsbench.run.stop import Stopped, stop_at_once
+from gsbench.run.stop import Stopped, listen
 from gsbench.sweep.axes import check_complete, check_words, expand
 from gsbench.sweep.callbacks import started
 from gsbench.sweep.explain import explain, raised_by_library
 from gsbench.sweep.finish import see_through
-from gsbench.sweep.task import Problem, do
+from gsbench.sweep.parallel import do_or_start
+from gsbench.sweep.task import Problem
 from gsbench.version import __version__
 
 BAD_INPUT, FAILED = 2, 1  # exit statuses: the command line or the data is wrong; a run failed
@@ -31,23 +31,24 @@ _problems: list[Problem] = []  # problems of the runs that failed; the sweep con
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
-def entry(composed: DictConfig) -> None:
-    """Do one run of a sweep. If the run fails, the error is stored and the sweep continues."""
+def entry(composed: DictConfig) -> Problem | None:
+    """Do one run of a sweep. If the run fails, the error is stored and returned, and the sweep continues."""
     try:
         check_complete(composed)
     except InputError as error:
         print(f"gsbench: error: {printable(error)}", file=sys.stderr)
         _problems.append(Problem(str(error), True))
-        return
+        return _problems[-1]
     if composed.experiment == "stability":  # the only experiment that trains no model on a scene
         from gsbench.stability.__main__ import main as audit
 
         if audit(["--out", str(Path(composed.results) / "stability")]):
             _problems.append(Problem("stability: a default breaks its bound", False))
-        return
-    problem = do(composed)
+        return None
+    problem = do_or_start(composed)
     if problem is not None:
         _problems.append(problem)
+    return problem
 
 
 def main() -> None:
@@ -56,7 +57,7 @@ def main() -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors; they are printed in one line below
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
-    signal.signal(signal.SIGTERM, stop_at_once)
+    listen()
     warnings.formatwarning = _in_one_line
     if "--version" in sys.argv[1:]:  # Hydra would print its own
         print(f"gsbench {__version__}")
@@ -71,10 +72,10 @@ def main() -> None:
     try:
         sys.argv[1:] = expand(sys.argv[1:])
         check_words(sys.argv[1:])
-        broken = see_through(entry, started)
-    except (Stopped, KeyboardInterrupt) as stopped:
-        print(f"gsbench: {str(stopped) or 'stopped by SIGINT'}", file=sys.stderr)
-        sys.exit(stopped.code if isinstance(stopped, Stopped) else 128 + signal.SIGINT)
+        broken, is_refused = see_through(entry, started)
+    except Stopped as stopped:
+        print(f"gsbench: {stopped}", file=sys.stderr)
+        sys.exit(stopped.code)
     except Exception as error:
         told = _told(error)
         if told is None:
@@ -84,7 +85,7 @@ def main() -> None:
     if broken:
         print(f"gsbench: {len(broken)} runs did not end well: python -m gsbench.sweep status "
               f"{shlex.quote(str(started[0].parents[1]))}", file=sys.stderr)  # fmt: skip
-    if _problems and all(problem.is_refused for problem in _problems) and not broken:
+    if is_refused or (_problems and all(problem.is_refused for problem in _problems) and not broken):
         sys.exit(BAD_INPUT)
     sys.exit(FAILED if _problems or broken else 0)
 

@@ -28,6 +28,7 @@ VERSION = 1
 LONGEST_NAME = 200  # bytes; of a scene, a model or an experiment, which are names of folders
 MAX_POINTS = 10_000  # the most points of a training curve, which a page can still draw quickly
 FILE_NAME = "record.json"
+CHECKPOINT = "checkpoint.pt"  # the file of the training, in the same folder
 PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
 STATUSES = ("ok", "failed", "diverged")
 METRICS = (

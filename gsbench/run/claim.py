@@ -70,13 +70,18 @@ def _remove(path: Path, content: bytes, mine: Progress) -> None:
         heir.unlink(missing_ok=True)
 
 
-def release(folder: Path, mine: Progress) -> None:
-    """Remove this process's claim on the run in `folder`; the claim of another process is kept."""
+def release(folder: Path, mine: Progress, *, is_stopped: bool = False) -> None:
+    """Remove this process's claim on the run in `folder`; the claim of another process is kept.
+
+    If a signal has stopped the run, its progress becomes stopped.json.
+    """
     path = folder / progress.FILE_NAME
     try:
         with _alone(folder):
             _, other = _read(path)
             if other is not None and _is_one(other, mine):
+                if is_stopped:
+                    progress.write_stopped(folder, other)
                 path.unlink(missing_ok=True)
     except OSError:  # the folder cannot be written any more; the claim expires with this process
         return

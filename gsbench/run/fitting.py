@@ -110,7 +110,7 @@ def fit(
         DivergedError: a loss or gradient was not finite.
         Stopped: a signal asked the process to end; the checkpoint is saved.
     """
-    path, last = this.folder / checkpoint.FILE_NAME, trainer.config.train.iterations
+    path = this.folder / checkpoint.FILE_NAME
     with stop.requested() as request:
         report = reporter()
         if trainer.step:
@@ -124,12 +124,12 @@ def fit(
 
         if trainer.step != until:
             trainer.run(lambda state: save(state, this, trainer.scene, plain), this.name, goes_on)
-        if request.signal is not None and (until is not None or trainer.step < last):
-            report.end()
-            if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
-                request.hand_on(request.signal)
-            raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
-                                               f"the same command continues from there")  # fmt: skip
+            report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
+    if request.signal is not None:  # asked here, so that a signal after the last step is not lost
+        if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
+            request.hand_on(request.signal)
+        raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
+                                           f"the same command continues from there")  # fmt: skip
     _check_fitted(trainer)
 
 

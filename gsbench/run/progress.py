@@ -1,4 +1,7 @@
-"""Report the progress of a run to other processes in a file progress.json. The module does not import torch."""
+"""Report the progress of a run to other processes in a file progress.json, and in stopped.json where it was stopped.
+
+The module does not import torch.
+"""
 
 import dataclasses
 import json
@@ -14,6 +17,7 @@ from gsbench.measure.schema import parse
 from gsbench.reading import parse_json, read_file
 
 FILE_NAME = "progress.json"
+STOPPED = "stopped.json"  # the progress of a run that a signal stopped; its process is gone
 EVERY = 5.0  # seconds between two writes
 LARGEST = 1 << 20  # bytes
 SILENT = 600.0  # seconds without a report after which a run on an unreachable host counts as lost
@@ -84,13 +88,15 @@ class Reporter:
         except OSError:  # a full disk must not end the run here, but at its checkpoint or record
             return
 
-    def end(self) -> None:
-        """Remove progress.json, because this process has stopped the run."""
-        (self.folder / FILE_NAME).unlink(missing_ok=True)
+
+def write_stopped(folder: Path, progress: Progress) -> None:
+    """Write stopped.json in the folder of a run that a signal has stopped, atomically."""
+    stopped = dataclasses.replace(progress, updated=time.time())
+    write_atomically(folder / STOPPED, encode(stopped), lasting=False)
 
 
 def read(path: Path) -> Progress:
-    """Read a progress.json.
+    """Read a progress.json or stopped.json.
 
     Raises:
         InputError: the file is invalid.

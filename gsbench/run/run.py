@@ -17,12 +17,13 @@ from gsbench.measure.curve import FALL, Curve
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
 from gsbench.process.memory import is_out_of_memory
-from gsbench.run import claim, trackers
+from gsbench.run import claim, progress, trackers
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
 from gsbench.run.finished import STALE, finished, where
 from gsbench.run.identity import Run, identify
 from gsbench.run.progress import Progress
+from gsbench.run.stop import Stopped
 from gsbench.train.diagnosis import explain
 from gsbench.train.finite_check import DivergedError
 
@@ -54,13 +55,16 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     this = identify(composed, choices, overrides)
     check_folder(this.folder)
     trackers.check(this.config.log)
-    mine = Progress(this.overrides)
-    if not _is_claimed(this, mine):
-        return None
-    attempt, record = Attempt(this), None
+    mine, attempt, record = Progress(this.overrides), Attempt(this), None
     try:
+        if not _is_claimed(this, mine):
+            return None
+        (this.folder / progress.STOPPED).unlink(missing_ok=True)
         remove_leftovers(this.folder)
         record = _done(attempt)
+    except Stopped:
+        claim.release(this.folder, mine, is_stopped=True)
+        raise
     finally:
         claim.release(this.folder, mine)
         if attempt.log is not None:

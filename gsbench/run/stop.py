@@ -1,26 +1,53 @@
-"""Stop a run after the current step when the process gets a signal: SIGINT, SIGTERM or Slurm's SIGUSR2."""
+"""Stop a run after the current step when the process gets a signal: SIGINT, SIGTERM, SIGHUP or Slurm's SIGUSR2."""
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+from gsbench.errors import one_line
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that ask the process to end
+SIGNALS = (*ENDING, signal.SIGUSR2)
+# Seconds after a signal in which others count as the same request. A terminal, `timeout`, systemd and the first process
+# of a sweep each signal a process that may have got the signal already.
+SAME_REQUEST = 2.0
+_asked = -SAME_REQUEST  # when the first signal of the present request came, by time.monotonic
 
 
 class Stopped(BaseException):  # like KeyboardInterrupt, so that `except Exception` does not catch it
     """A signal asked the process to end, and the run has saved its state."""
 
-    def __init__(self, number: int, message: str) -> None:
-        super().__init__(message)
+    def __init__(self, number: int, message: str | None = None) -> None:
+        super().__init__(message or f"stopped by {signal.Signals(number).name}")
+        self.number = number
         self.code = 128 + number  # the exit status of a process that a signal ended
+
+
+def listen() -> None:
+    """Let signals that ask the process to end raise Stopped, except those that it ignores, such as after `nohup`."""
+    for number in ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, stop_at_once)
 
 
 def stop_at_once(number: int, _: FrameType | None) -> None:
     """Handle a signal outside of training, when nothing has to be saved, by raising Stopped."""
-    raise Stopped(number, f"stopped by {signal.Signals(number).name}")
+    if _is_new():
+        raise Stopped(number)
+
+
+def _is_new() -> bool:
+    """Return whether a signal that came just now is a new request to end."""
+    global _asked  # signal handlers belong to the process, and so does this
+    now = time.monotonic()
+    if now - _asked < SAME_REQUEST:
+        return False
+    _asked = now
+    return True
 
 
 class Request:
@@ -31,9 +58,11 @@ class Request:
         self._before: dict[int, Any] = {}
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:  # a second signal goes to the earlier handler, which usually ends the process
+        if self.signal is None:
+            _is_new()
+            self.signal = number
+        elif time.monotonic() - _asked >= SAME_REQUEST:  # the earlier handler usually ends the process
             self.hand_on(number, frame)
-        self.signal = number
 
     def hand_on(self, number: int, frame: FrameType | None = None) -> None:
         """Call the signal handler that was installed before; submitit's handler requeues a Slurm job at SIGUSR2."""
@@ -51,6 +80,9 @@ def requested() -> Iterator[Request]:
 
     The training reads the recorded signal between two steps. Only the main thread may set handlers; in other threads no
     signal is recorded.
+
+    Raises:
+        Stopped: an error ended the block after a signal had come; without this, a sweep would go on to its next run.
     """
     request = Request()
     if threading.current_thread() is not threading.main_thread():
@@ -63,6 +95,10 @@ def requested() -> Iterator[Request]:
         request._before[number] = signal.signal(number, request._ask)
     try:
         yield request
+    except Exception as error:
+        if request.signal not in ENDING:
+            raise
+        raise Stopped(request.signal, f"stopped by {signal.Signals(request.signal).name}: {one_line(error)}") from error
     finally:
         for noted, before in request._before.items():
             signal.signal(noted, before)

@@ -144,14 +144,14 @@ def _verdict(runs: list[RunStatus]) -> int:
 
 def _retry(folder: Path, launch: list[str]) -> int:
     from gsbench.run.grammar import quoted_value  # imports Hydra, which a status does not need
+    from gsbench.sweep.parallel import do_or_start
     from gsbench.sweep.retry import retry
-    from gsbench.sweep.task import do
 
     folder = folder.resolve()  # runs are launched from the folder that the first command was given in
     experiment = read(folder)
     single = [run for run in status(experiment)
               if run.state in BROKEN and identity(run.overrides) not in experiment.requested]  # fmt: skip
-    count = retry(experiment, launch, do)
+    count = retry(experiment, launch, do_or_start)
     for run in single[:MOST_COMMANDS]:
         words = " ".join(map(shlex.quote, (*run.overrides, f"results={quoted_value(str(folder.parent))}")))
         print(f"gsbench.sweep: not of a sweep, so only its own command starts it again: python -m gsbench "

@@ -1,7 +1,7 @@
 """Write the plan of a sweep when Hydra starts it, and the outcome of each run when the run ends.
 
-Hydra calls `WritePlan`, which conf/config.yaml lists under hydra.callbacks. With Slurm and joblib, the `WritePlan`
-object is pickled into every job.
+Hydra calls `WritePlan`, which conf/config.yaml lists under hydra.callbacks. With Slurm, the `WritePlan` object is
+pickled into every job.
 """
 
 import copy
@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.conf import HydraConf
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.utils import JobReturn
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict, read_write
@@ -27,6 +28,7 @@ from gsbench.measure.record import FILE_NAME
 from gsbench.run.progress import born
 from gsbench.sweep import container, plan
 from gsbench.sweep.plan import Ended, Plan
+from gsbench.sweep.task import Problem
 
 started: list[Path] = []  # the folders of the plans that this process wrote
 
@@ -55,9 +57,20 @@ class WritePlan(Callback):
 
         The path is stored because two commands may request the same run with different overrides.
         """
-        if config.hydra.mode == RunMode.MULTIRUN:
-            folder = Path(config.hydra.sweep.dir)
-            plan.write_ended(folder, config.hydra.job.num, ended(config, folder.parents[2]))
+        is_started = is_parallel(config.hydra) and job_return.status == JobStatus.COMPLETED  # its process writes it
+        if config.hydra.mode == RunMode.MULTIRUN and not is_started:
+            write_outcome(config, job_return._return_value)  # `return_value` would print an error, and raise it
+
+
+def is_parallel(hydra: HydraConf) -> bool:
+    """Return whether each run has a process of its own on this machine (`+launch=parallel`)."""
+    return hydra.runtime.choices.get("launch") == "parallel" and hydra.mode == RunMode.MULTIRUN
+
+
+def write_outcome(config: DictConfig, problem: object) -> None:
+    """Write the outcome of a run of a sweep that ended in this process; `problem` is why it did not end well."""
+    folder = Path(config.hydra.sweep.dir)
+    plan.write_ended(folder, config.hydra.job.num, ended(config, problem, folder.parents[2]))
 
 
 def expand(config: DictConfig) -> list[list[str]]:
@@ -82,8 +95,12 @@ def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
     )
 
 
-def ended(config: DictConfig, results: Path) -> Ended:
+def ended(config: DictConfig, problem: object, results: Path) -> Ended:
     """Return the outcome of a run that ended in this process: the path of its record, or why there is none."""
+    if isinstance(problem, Problem) and problem.is_refused:
+        return Ended(None, problem.reason, is_refused=True)
+    if isinstance(problem, InputError):
+        return Ended(None, str(problem), is_refused=True)
     from gsbench.run.identity import identify  # imports torch, which the run has loaded already
 
     composed = copy.deepcopy(config)

@@ -12,7 +12,7 @@ from gsbench.extras import how_to_install
 from gsbench.measure.renamed import present_key
 from gsbench.run.grammar import typed
 
-LIBRARIES = ("hydra", "omegaconf", "antlr4", "joblib", "submitit")
+LIBRARIES = ("hydra", "omegaconf", "antlr4", "submitit")
 AMBIGUOUS = re.compile(r"Ambiguous value for argument '((.*?)=(.*))'\n")  # Hydra's, of a sweep without --multirun
 NO_SLURM = 'Could not detect "srun"'  # how submitit says so
 
@@ -22,7 +22,7 @@ def explain(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group == "hydra/launcher":
-            return f"+launch=slurm and +launch=parallel need more packages: {how_to_install('cluster')}"
+            return f"+launch=slurm needs packages of its own: {how_to_install('cluster')}"
         return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:

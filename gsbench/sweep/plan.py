@@ -7,6 +7,7 @@ file contain the same overrides. Therefore runs can be matched with files withou
 
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ Identity = tuple[str, ...]
 class Plan:
     """The runs that one command requested, and the process that launches them."""
 
-    launcher: str  # of Hydra: basic, joblib or submitit_slurm
+    launcher: str  # of Hydra: basic or submitit_slurm
     runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
     hydra: list[str]  # overrides of Hydra's own config
     cwd: str  # the folder of the command; relative paths in overrides start there
@@ -40,6 +41,7 @@ class Ended:
 
     record: str | None  # path of its record, relative to the folder of all results; None if it has no record
     reason: str | None  # why it has no record
+    is_refused: bool = False  # whether it was refused before it began, so that nothing was run
 
 
 def identity(overrides: Sequence[str]) -> Identity:
@@ -66,6 +68,11 @@ def read(path: Path) -> Plan:
 def find(experiment: Path) -> list[Path]:
     """Return the paths of all sweep plans of an experiment, oldest first."""
     return sorted((experiment / FOLDER).glob(f"*/{FILE_NAME}"))
+
+
+def forget(folder: Path) -> None:
+    """Delete the plan in `folder`, and the folder, because not one of its runs began."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_ended(folder: Path, number: int, ended: Ended) -> None:

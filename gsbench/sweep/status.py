@@ -6,15 +6,16 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsbench.measure.record import CHECKPOINT
 from gsbench.run.progress import SILENT, Progress, born, is_alive
 from gsbench.sweep import plan, slurm, traces
 from gsbench.sweep.plan import JOBS, Ended, Identity, Plan, identity
 from gsbench.sweep.slurm import Queue
 from gsbench.sweep.traces import Outcome, Traces
 
-STATES = ("done", "running", "queued", "planned", "failed", "lost")
+STATES = ("done", "running", "queued", "planned", "stopped", "not started", "failed", "lost")
 GOING = ("running", "queued", "planned")
-BROKEN = ("failed", "lost")
+BROKEN = ("stopped", "not started", "failed", "lost")  # `retry` launches these again
 # Lines of a log that name a cause, and lines that report an error; a progress bar may precede the error on its line.
 CAUSE = re.compile(r"exceeded.* memory|oom.kill|out of memory|no space left", re.IGNORECASE)
 ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)
@@ -23,7 +24,7 @@ EFFECT = re.compile(r"\bexited with exit code|\bexit code \d+$", re.IGNORECASE) 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """The state of a run (done, running, queued, planned, failed or lost), with details such as the reason."""
+    """The state of a run, one of STATES, with details such as the reason."""
 
     overrides: list[str]  # as in its record
     state: str  # one of STATES
@@ -79,7 +80,7 @@ def read(folder: Path) -> Experiment:
 def status(experiment: Experiment) -> list[RunStatus]:
     """Return the state of every run that a sweep requested, and of every other run that left a file."""
     known = {**dict.fromkeys(experiment.requested), **dict.fromkeys(experiment.traces.outcomes),
-             **dict.fromkeys(experiment.traces.progress)}  # fmt: skip
+             **dict.fromkeys(experiment.traces.progress), **dict.fromkeys(experiment.traces.stopped)}  # fmt: skip
     judged = {one: _judge(experiment, one) for one in known}
     kept = {run.record for one, run in judged.items() if one in experiment.requested and run.record is not None}
     # A requested run may have a record with other overrides; such a record is not counted as a second run.
@@ -93,39 +94,51 @@ def _judge(experiment: Experiment, one: Identity) -> RunStatus:
     """Determine the state of a run.
 
     The first of these that exists decides: its live process, its record, its job in Slurm's queue, and a command that
-    can still start the run. Otherwise the run failed or is lost.
+    can still start the run. Otherwise the run was stopped, has failed, is lost or has not started.
     """
     requested = experiment.requested.get(one)
-    _, progress = experiment.traces.progress.get(one, (None, None))
+    path, progress = experiment.traces.progress.get(one, (None, None))
+    _, stopped = experiment.traces.stopped.get(one, (None, None))
     outcome = experiment.traces.outcomes.get(one) or _kept(experiment, requested)
     if outcome and progress and progress.updated <= outcome.written:
         progress = None  # the progress file is older than the record
+    went_on = progress and stopped and stopped.updated <= progress.updated
+    if stopped and (went_on or (outcome and stopped.started <= outcome.written)):
+        stopped = None  # or it was stopped when its record was written already
     if progress:
         alive = _alive(progress, experiment.queue)
         if alive:
             return _running(one, progress, alive)
-    if outcome and outcome.status == "ok" and not progress:
+    if outcome and outcome.status == "ok" and not progress and not stopped:
         return RunStatus(list(one), "done", psnr=outcome.psnr, record=str(outcome.path))
     if requested and requested.job in experiment.queue.states:
         state = experiment.queue.states[requested.job]
         waits = state.partition(" ")[2] if state.startswith("PENDING") else None
         return RunStatus(list(one), "running" if waits is None else "queued", waits or "starts", requested.job)
-    last = max(outcome.written if outcome else 0, progress.updated if progress else 0)
+    last = max(outcome.written if outcome else 0, *(at.updated for at in (progress, stopped) if at), 0)
     is_new = requested is not None and requested.ended is None and requested.plan.started > last
     if requested and is_new and _launching(requested, experiment.queue):
         return RunStatus(list(one), "planned", job=requested.job)
+    if stopped:
+        at = f"at step {stopped.step} of {stopped.steps}" if stopped.steps else "before its first step"
+        return RunStatus(list(one), "stopped", f"stopped {at}: the same command continues", stopped.job, stopped.step,
+                         stopped.steps, psnr=stopped.psnr_val)  # fmt: skip
     if outcome and not progress:
         reason = outcome.reason if outcome.status == "failed" else f"{outcome.status}: {outcome.reason}"
         return RunStatus(list(one), "failed", reason, record=str(outcome.path))
     if progress:
         at = f"at step {progress.step} of {progress.steps}" if progress.steps else "before its first step"
         gone = f"process {progress.pid} on {progress.host} is gone, last seen {_ago(progress.updated)} {at}"
+        if path and path.with_name(CHECKPOINT).exists():
+            gone += ": the same command continues from its last checkpoint"
         return RunStatus(list(one), "lost", gone, progress.job, progress.step, progress.steps, psnr=progress.psnr_val)
     if requested and requested.ended:
         return RunStatus(
             list(one), "failed", requested.ended.reason or f"its record {requested.ended.record} is gone", requested.job
         )
-    return RunStatus(list(one), "lost", "never started", requested.job if requested else None)
+    if requested and requested.job:
+        return RunStatus(list(one), "lost", "never started", requested.job)
+    return RunStatus(list(one), "not started")
 
 
 def _kept(experiment: Experiment, requested: RequestedRun | None) -> Outcome | None:

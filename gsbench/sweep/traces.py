@@ -29,11 +29,12 @@ class Outcome:
 
 @dataclass
 class Traces:
-    """The runs that left a record or a progress file."""
+    """The runs that left a record, a progress file, or the progress file of a run that a signal has stopped."""
 
     outcomes: dict[Identity, Outcome] = field(default_factory=dict)
     by_path: dict[Path, Outcome] = field(default_factory=dict)
     progress: dict[Identity, tuple[Path, Progress]] = field(default_factory=dict)
+    stopped: dict[Identity, tuple[Path, Progress]] = field(default_factory=dict)
 
 
 def read(folders: list[Path]) -> Traces:
@@ -51,9 +52,9 @@ def read(folders: list[Path]) -> Traces:
                 one = progress.read(path)
             except InputError:
                 continue  # the run has just removed it, or it is damaged; then the run counts as lost
-            of = identity(one.overrides)
-            if of not in found.progress or found.progress[of][1].updated < one.updated:
-                found.progress[of] = path, one
+            of, kind = identity(one.overrides), found.stopped if path.name == progress.STOPPED else found.progress
+            if of not in kind or kind[of][1].updated < one.updated:
+                kind[of] = path, one
     return found
 
 
@@ -62,7 +63,7 @@ def _files(folders: list[Path]) -> Iterator[Path]:
     for folder in folders:
         for at, below, names in os.walk(folder):
             below[:] = sorted(name for name in below if not name.startswith(".") and name != PUBLISHED)
-            for name in (RECORD, progress.FILE_NAME):
+            for name in (RECORD, progress.FILE_NAME, progress.STOPPED):
                 path = Path(at, name)
                 if name in names and path.is_file():  # reading a pipe would block
                     yield path

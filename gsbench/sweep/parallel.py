@@ -1,0 +1,131 @@
+"""Start the runs of a sweep in parallel processes of this machine, a process for each run (`+launch=parallel`).
+
+A process is a fork of one that has imported torch, so that a run does not wait for imports. If one dies, for example
+because memory ran out, the others go on. A signal to any of them stops the sweep: each run saves a checkpoint, and no
+other begins.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+from multiprocessing import connection, get_context
+from multiprocessing.process import BaseProcess
+from typing import cast
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from gsbench.errors import InputError, printable
+from gsbench.process.memory import is_out_of_memory, too_little_address_space
+from gsbench.run import stop
+from gsbench.run.stop import Request, Stopped
+from gsbench.sweep.callbacks import is_parallel, write_outcome
+from gsbench.sweep.task import Problem, do
+
+POLL = 0.2  # seconds between two looks for a signal, and of a run's process for its parent
+_running: dict[BaseProcess, str] = {}  # the processes of runs, and the overrides of each
+
+
+def do_or_start(composed: DictConfig) -> Problem | None:
+    """Do a run here, or start a process that does it; return the problem, if any, of a run that was done here.
+
+    With `+launch=parallel`, this waits until fewer than `launch.at_once` processes run.
+
+    Raises:
+        InputError: `launch.at_once` is invalid.
+        Stopped: a signal asked this process, or that of another run, to end.
+    """
+    if not is_parallel(HydraConfig.get()):
+        return do(composed)
+    at_once, cpus = composed.launch.at_once, len(os.sched_getaffinity(0))
+    if at_once != -1 and at_once < 1:
+        raise InputError(f"launch.at_once: expected at least 1, or -1 for one run for each CPU, got {at_once}")
+    most = cpus if at_once == -1 else at_once
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cpus // most)))
+    _import_torch()
+    with stop.requested() as request:
+        _wait(most - 1, request)
+        if request.signal is None:
+            process = get_context("fork").Process(target=_work, args=(composed, request, os.getpid()))
+            process.start()
+            _running[process] = " ".join(HydraConfig.get().overrides.task)
+    if request.signal is not None:
+        raise Stopped(request.signal)
+    return None
+
+
+def wait() -> None:
+    """Wait until all processes have ended.
+
+    Raises:
+        Stopped: a signal asked this process or that of a run to end.
+    """
+    with stop.requested() as request:
+        _wait(0, request)
+    if request.signal is not None:
+        raise Stopped(request.signal)
+
+
+def end(number: int) -> None:
+    """Send a signal to all processes and wait for their end; a second signal to this process is sent to them too."""
+    for process in _running:
+        if process.is_alive() and process.pid is not None:
+            os.kill(process.pid, number)
+    try:
+        while _running:
+            _running.popitem()[0].join()
+    except Stopped as again:
+        end(again.number)
+
+
+def _wait(most: int, request: Request) -> None:
+    """Wait until at most `most` processes run, or until a signal asks this process or one of them to end."""
+    while len(_running) > most and request.signal is None:
+        ended = connection.wait([process.sentinel for process in _running], POLL)
+        for process in [process for process in _running if process.sentinel in ended]:
+            process.join()
+            _tell_end(process.exitcode or 0, _running.pop(process), request)
+
+
+def _tell_end(code: int, overrides: str, request: Request) -> None:
+    """Print how a process ended if it was killed; if a signal asked it to end, ask this process to end too."""
+    number = -code if code < 0 else code - 128
+    if number in stop.ENDING:
+        request.signal = request.signal or number
+    elif code < 0:
+        why = " (memory may have run out)" if number == signal.SIGKILL else ""
+        print(f"gsbench: error: {printable(overrides)}: its process was ended by {signal.Signals(number).name}{why}: "
+              "the same command continues from the last checkpoint", file=sys.stderr)  # fmt: skip
+
+
+def _import_torch() -> None:
+    """Import what a run needs, so that its process has it; if memory is too small, each run says so itself."""
+    if too_little_address_space() is not None:
+        return
+    try:
+        import gsbench.run.run  # noqa: F401
+    except (ImportError, OSError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+
+
+def _work(composed: DictConfig, request: Request, parent: int) -> None:
+    """Do a run in its process; `request` tells of a signal that came before the process listens itself."""
+    threading.Thread(target=_end_with, args=(parent,), name="gsbench-parent", daemon=True).start()
+    try:
+        stop.listen()
+        if request.signal is not None:
+            raise Stopped(request.signal)
+        write_outcome(cast(DictConfig, HydraConfig.instance().cfg), do(composed))
+    except Stopped as stopped:
+        print(f"gsbench: {stopped}", file=sys.stderr)
+        sys.exit(stopped.code)
+
+
+def _end_with(parent: int) -> None:
+    """Ask this process to end when its parent is gone."""
+    while os.getppid() == parent:
+        time.sleep(POLL)
+    os.kill(os.getpid(), signal.SIGTERM)
