@@ -16,6 +16,7 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
+from gsbench.run import stop
 from gsbench.sweep import estimate
 from gsbench.sweep.plan import identity
 from gsbench.sweep.status import BROKEN, GOING, STATES, RunStatus, read, status
@@ -28,12 +29,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Show the state of an experiment or launch runs again, as the command line says, and return the exit code.
 
     Returns:
-        0 if no run failed or is lost, 1 if a run failed or is lost, 2 if the folder or an argument is wrong, and 130
-        after Ctrl-C.
+        0 if all runs are done or going on, 1 if a run was stopped, has not started, failed or is lost, 2 if the folder
+        or an argument is wrong, and 128 and its number after a signal (Ctrl-C: 130).
     """
     parser = argparse.ArgumentParser(prog="python -m gsbench.sweep", description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    shown = commands.add_parser("status", help="show which runs are done, running, queued, planned, failed or lost")
+    shown = commands.add_parser("status", help="show the state of each run: done, running, stopped, failed, ...")
     shown.add_argument("experiment", type=Path, metavar="results/EXP")
     shown.add_argument("--watch", action="store_true", help="repeat until no run is running or waiting")
     shown.add_argument("--json", action="store_true", help="print all runs as JSON, also those that are done")
@@ -41,7 +42,9 @@ def main(arguments: list[str] | None = None) -> int:
     timed.add_argument("experiment", type=Path, metavar="results/EXP")
     timed.add_argument("--at-once", type=int, default=1, metavar="N", help="runs at a time (1)")
     timed.add_argument("--json", action="store_true", help="print the estimate of each run as JSON")
-    again = commands.add_parser("retry", help="launch again the runs that failed, are lost or never started")
+    again = commands.add_parser(
+        "retry", help="launch again the runs that were stopped, failed, are lost or not started"
+    )
     again.add_argument("experiment", type=Path, metavar="results/EXP")
     again.add_argument("launch", nargs="*", metavar="launch.KEY=VALUE", help="launch settings to change")
     options = parser.parse_args(arguments)
@@ -61,6 +64,9 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"gsbench.sweep: {printable(error)}", file=sys.stderr)
         return 2
+    except stop.Stopped as stopped:
+        print(f"gsbench.sweep: {stopped}", file=sys.stderr)
+        return stopped.code
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the program that reads the output has ended, such as `head`
@@ -102,8 +108,11 @@ def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None
     common = set.intersection(*(set(run.overrides) for run in runs)) if len(runs) > 1 else set()
     named = [(run, " ".join(one for one in run.overrides if one not in common)) for run in runs]
     width = max((len(name) for run, name in named if run.state != "done"), default=0)
+    wide = max((len(run.state) for run in runs), default=0)
     for state in STATES[1:]:
-        shown += [f"  {state:8} {name:{width}}  {_details(run)}" for run, name in named if run.state == state]
+        shown += [
+            f"  {state:{max(wide, 8)}} {name:{width}}  {_details(run)}" for run, name in named if run.state == state
+        ]
     return list(map(printable, shown))
 
 
@@ -147,6 +156,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
     from gsbench.sweep.parallel import do_or_start
     from gsbench.sweep.retry import retry
 
+    stop.listen()
     folder = folder.resolve()  # runs are launched from the folder that the first command was given in
     experiment = read(folder)
     single = [run for run in status(experiment)
@@ -159,7 +169,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
     if len(single) > MOST_COMMANDS:
         print(f"gsbench.sweep: and {len(single) - MOST_COMMANDS} more runs of no sweep", file=sys.stderr)
     if not count and not single:
-        print(f"{folder}: no run failed, is lost or never started", file=sys.stderr)
+        print(f"{folder}: no run was stopped, failed, is lost or not started", file=sys.stderr)
     return _verdict(_show(folder, False))
 
 

@@ -64,7 +64,7 @@ class WritePlan(Callback):
 
 def is_parallel(hydra: HydraConf) -> bool:
     """Return whether each run has a process of its own on this machine (`+launch=parallel`)."""
-    return hydra.runtime.choices.get("launch") == "parallel" and hydra.mode == RunMode.MULTIRUN
+    return bool(hydra.runtime.choices.get("launch") == "parallel")
 
 
 def write_outcome(config: DictConfig, problem: object) -> None:

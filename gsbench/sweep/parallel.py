@@ -5,6 +5,7 @@ because memory ran out, the others go on. A signal to any of them stops the swee
 other begins.
 """
 
+import contextlib
 import os
 import signal
 import sys
@@ -12,6 +13,7 @@ import threading
 import time
 from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import cast
 
 from hydra.core.hydra_config import HydraConfig
@@ -96,8 +98,8 @@ def _tell_end(code: int, overrides: str, request: Request) -> None:
         request.signal = request.signal or number
     elif code < 0:
         why = " (memory may have run out)" if number == signal.SIGKILL else ""
-        print(f"gsbench: error: {printable(overrides)}: its process was ended by {signal.Signals(number).name}{why}: "
-              "the same command continues from the last checkpoint", file=sys.stderr)  # fmt: skip
+        print(f"\ngsbench: error: {printable(overrides)}: its process was ended by {signal.Signals(number).name}{why}: "
+              "the same command continues from its last checkpoint", file=sys.stderr)  # fmt: skip
 
 
 def _import_torch() -> None:
@@ -113,6 +115,8 @@ def _import_torch() -> None:
 
 def _work(composed: DictConfig, request: Request, parent: int) -> None:
     """Do a run in its process; `request` tells of a signal that came before the process listens itself."""
+    with contextlib.suppress(OSError):  # the kernel kills a run if memory runs out, not the parent, which reports it
+        Path("/proc/self/oom_score_adj").write_text("500")
     threading.Thread(target=_end_with, args=(parent,), name="gsbench-parent", daemon=True).start()
     try:
         stop.listen()

@@ -5,6 +5,7 @@ file contain the same overrides. Therefore runs can be matched with files withou
 0.1 s.
 """
 
+import contextlib
 import json
 import re
 import shutil
@@ -73,6 +74,8 @@ def find(experiment: Path) -> list[Path]:
 def forget(folder: Path) -> None:
     """Delete the plan in `folder`, and the folder, because not one of its runs began."""
     shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):  # other plans are there
+        folder.parent.rmdir()
 
 
 def write_ended(folder: Path, number: int, ended: Ended) -> None:

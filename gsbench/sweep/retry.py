@@ -106,10 +106,17 @@ def _relaunch(
         folder = Path(config.hydra.sweep.dir)
         plan.write(plan_of(runs, config), folder)
         container.use(config, runs)
-        print(f"{len(runs)} runs again, by {config.hydra.runtime.choices['hydra/launcher']}", file=sys.stderr)
+        print(f"{len(runs)} runs again, launch={config.hydra.runtime.choices.get('launch', 'local')}", file=sys.stderr)
         context = HydraContext(config_loader=GlobalHydra.instance().config_loader(), callbacks=Callbacks(config))
         launcher = Plugins.instance().instantiate_launcher(hydra_context=context, task_function=task, config=config)
-        see_through(lambda: launcher.launch(runs, 0), [folder])
+        see_through(lambda: _raise_first([job._return_value for job in launcher.launch(runs, 0)]), [folder])
+
+
+def _raise_first(returned: Sequence[object]) -> None:
+    """Raise the first error among what the runs returned: one that refused a run. Hydra's sweeper does the same."""
+    for value in returned:
+        if isinstance(value, Exception):
+            raise value
 
 
 def _common(runs: list[list[str]]) -> list[str]:

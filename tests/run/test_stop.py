@@ -93,12 +93,15 @@ def test_the_handler_of_before_acts_once_the_run_has_saved() -> None:
         signal.signal(signal.SIGUSR2, before)
 
 
-def test_a_second_signal_ends_at_once() -> None:
-    """Catches a process that cannot be stopped while it saves to a disk that hangs."""
+def test_a_second_signal_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a process that cannot be stopped while it saves to a disk that hangs, and one that `timeout` ends at
+    once: it signals the process and then its group."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with stop.requested():
             signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            monkeypatch.setattr(stop, "SAME_REQUEST", 0.0)
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
     finally:

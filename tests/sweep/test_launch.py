@@ -126,7 +126,7 @@ def test_retry_passes_over_what_cannot_be_launched(
         plan.write(one, experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000")
     assert sweep_main(["retry", str(experiment)]) == 1  # they are lost as before
     told = [line for line in capsys.readouterr().err.splitlines() if "cannot be launched again" in line]
-    reasons = (f"'{gone}'", "Did you mean 'iterations'", "at input '['", "n_jobs == 0")
+    reasons = (f"'{gone}'", "Did you mean 'iterations'", "at input '['", "launch.at_once: expected at least 1")
     for line, said in zip(sorted(told), reasons, strict=True):
         assert said in line
 
@@ -143,7 +143,7 @@ def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
     assert sweep_main(["retry", str(tmp_path / "mini")]) == 1
     said = capsys.readouterr().err
     assert f"python -m gsbench {' '.join(identity(crowd.overrides(*run)))} results={tmp_path}" in said
-    assert "no run failed" not in said
+    assert "no run was stopped" not in said
 
 
 def test_a_retry_launches_with_the_settings_that_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,7 @@ def test_retry_does_what_is_missing_and_repeats_nothing(square: Path, tmp_path: 
     assert states(experiment) == ["done", "done"]
     assert kept.stat().st_mtime_ns == before[0]
     assert json.loads(lost.read_text())["metrics"] == json.loads(before[1])["metrics"]
-    assert "no run failed" in sweep("retry", str(experiment)).stderr
+    assert "no run was stopped, failed" in sweep("retry", str(experiment)).stderr
 
 
 @pytest.mark.slow
