@@ -108,11 +108,9 @@ def lines(experiment: Path, runs: Sequence[RunStatus], silent: str | None = None
     common = set.intersection(*(set(run.overrides) for run in runs)) if len(runs) > 1 else set()
     named = [(run, " ".join(one for one in run.overrides if one not in common)) for run in runs]
     width = max((len(name) for run, name in named if run.state != "done"), default=0)
-    wide = max((len(run.state) for run in runs), default=0)
+    wide = max(8, *(len(run.state) for run in runs))
     for state in STATES[1:]:
-        shown += [
-            f"  {state:{max(wide, 8)}} {name:{width}}  {_details(run)}" for run, name in named if run.state == state
-        ]
+        shown += [f"  {state:{wide}} {name:{width}}  {_details(run)}" for run, name in named if run.state == state]
     return list(map(printable, shown))
 
 
