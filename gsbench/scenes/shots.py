@@ -96,7 +96,7 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
     if lens is None:
         stated, actual = f"{shot.lens.width}x{shot.lens.height}", f"{size[0]}x{size[1]}"
         raise InputError(f"{shot.where}: expected {stated} as its camera, or both sides resized by one ratio, "
-                         f"got {actual}: use the images of which the camera was computed")  # fmt: skip
+                         f"got {actual}: use the images that the camera is of, and scene.downscale")  # fmt: skip
     if size != expected:
         raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
                          f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip

@@ -23,7 +23,6 @@ from gsbench.reading import read_file
 from gsbench.scenes.files import digest, without_suffix
 
 TABLE = "times.csv"
-DOCS = "data.md#times"
 _MAX_TABLE = 1 << 26  # bytes of times.csv
 _LARGEST = 1e30  # the largest time, in any unit
 _LONGEST = 100  # digits of a number that is read exactly
@@ -161,11 +160,13 @@ def of_table(
         separator = next((mark for mark in ",;\t" if mark in head), ",")
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: expected a table name,time: {error}", docs=DOCS) from None
+        raise InputError(f"{path}: expected a table name,time: {error}", docs="data.md#times") from None
     filled = [(number, row) for number, row in enumerate(rows, 1) if any(row)]
     columns = [cell.lower() for cell in filled[0][1]] if filled else []
     if any(columns.count(key) != 1 for key in ("name", "time")):
-        raise InputError(f"{path}: expected the first line name,time, got {','.join(columns)[:60]!a}", docs=DOCS)
+        raise InputError(
+            f"{path}: expected the first line name,time, got {','.join(columns)[:60]!a}", docs="data.md#times"
+        )
     table: dict[str, float] = {}
     for number, row in filled[1:]:
         cells = dict(zip(columns, row, strict=False))
@@ -180,7 +181,7 @@ def of_table(
     missing = next((name for name, row in zip(names, used, strict=True) if not row), None)
     if missing is not None:
         raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
-                         docs=DOCS)  # fmt: skip
+                         docs="data.md#times")  # fmt: skip
     values = [Fraction(table[name]) for name in used]
     spare = len(table) - len(set(used))
     rest = f"; {spare} rows of other images are left out" if spare else ""
@@ -217,7 +218,7 @@ def of_fields(
         if is_small and max(times) - min(times) < _FEW * (last - first):
             raise InputError(f"{file}: time: expected the unit of the other files, got {min(times):.10g} to "
                              f"{max(times):.10g}, and over all files {first:.10g} to {last:.10g}: scale all to [0, 1]",
-                             docs=DOCS)  # fmt: skip
+                             docs="data.md#times")  # fmt: skip
     scaled = iter(_scaled([Fraction(value) for value in listed]))
     note = f"times: the field 'time', {first:.10g} to {last:.10g}, scaled to [0, 1] over all splits"
     return {file: [next(scaled) for _ in times] for file, times in values.items()}, [note]
@@ -248,7 +249,7 @@ def _check_distinct(
         other = seen.setdefault((place, value), name)
         if other != name:
             raise InputError(f"{where}images {other[:80]!a} and {name[:80]!a}: expected different times, as their pose "
-                             f"and intrinsics are equal, got the same: {cure}", docs=DOCS)  # fmt: skip
+                             f"and intrinsics are equal, got the same: {cure}", docs="data.md#times")  # fmt: skip
 
 
 def _columns(names: Sequence[str], source: Path) -> list[_Column]:
@@ -258,14 +259,14 @@ def _columns(names: Sequence[str], source: Path) -> list[_Column]:
     if not least and any(numbers):
         name = next(name for name, one in zip(names, numbers, strict=True) if not one)
         raise InputError(f"{source}: image {name[:80]!a}: expected a number in its name, as others have: rename it, or "
-                         f"write {TABLE}", docs=DOCS)  # fmt: skip
+                         f"write {TABLE}", docs="data.md#times")  # fmt: skip
     columns = [_Column(tuple(one[at] for one in numbers), len(numbers[0]) + at + 1, len(numbers[0]))
                for at in range(-least, 0)]  # fmt: skip
     if len({len(one) for one in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
         few, many = (next(name for name, one in zip(names, numbers, strict=True) if len(one) == count)
                      for count in (least, max(map(len, numbers))))  # fmt: skip
         raise InputError(f"{source}: images {few[:60]!a} and {many[:60]!a}: expected names of one form, the first has "
-                         f"fewer numbers: rename them, or write {TABLE}", docs=DOCS)  # fmt: skip
+                         f"fewer numbers: rename them, or write {TABLE}", docs="data.md#times")  # fmt: skip
     return columns
 
 
@@ -310,7 +311,7 @@ def _seconds(moment: re.Match[str], source: Path) -> Fraction:
         days = date(year, month, day).toordinal()
     except ValueError:
         raise InputError(f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
-                         docs=DOCS) from None  # fmt: skip
+                         docs="data.md#times") from None  # fmt: skip
     return days * 86400 + int(parts["H"]) * 3600 + int(parts["M"]) * 60 + int(parts["S"]) + fraction
 
 
@@ -326,7 +327,7 @@ def _number(text: str, where: str) -> float:
     except ValueError:
         number = np.nan
     if not abs(number) <= _LARGEST:
-        raise InputError(f"{where}: expected a time, got {text[:40]!a}", docs=DOCS)
+        raise InputError(f"{where}: expected a time, got {text[:40]!a}", docs="data.md#times")
     return number
 
 
@@ -347,7 +348,7 @@ def _time_among(
         if max(Counter(places).values()) > 1:
             first, second = _pair_at_a_place(names, places)
             raise InputError(f"{source}: images {first[:60]!a} and {second[:60]!a}: expected a number that changes, as "
-                             f"their pose and intrinsics are equal: write {TABLE}", docs=DOCS)  # fmt: skip
+                             f"their pose and intrinsics are equal: write {TABLE}", docs="data.md#times")  # fmt: skip
         candidates = [column for column in changing if not column.words & {*_CAMERA_WORDS}]
         if not candidates:
             if len(changing) == 1:
@@ -361,7 +362,7 @@ def _time_among(
         return candidates[0]
     listed = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
     raise InputError(f"{source}: image {names[0][:80]!a}: expected one number that is the time, got {listed}, which "
-                     f"all change from image to image: write {TABLE}", docs=DOCS)  # fmt: skip
+                     f"all change from image to image: write {TABLE}", docs="data.md#times")  # fmt: skip
 
 
 def _changes_at_a_place(column: _Column, places: Sequence[Hashable]) -> bool:
