@@ -29,11 +29,11 @@ _OLDER = (  # words of older records, and what is written now
     (r"what a static fit leaves over changes with time", "a static model's error changes over time"),
     (r"what a static fit leaves over does not( clearly)? change with time",
      r"a static model's error does not\1 change over time"),
-    (r"differ, in (\S+) of their blocks, and with time", r"change over time, in \1 of their blocks"),
-    (r"differ, in (\S+) of their blocks, but not by slow waves of time",
+    (r"differ, in ([^,]+) of their blocks, and with time", r"change over time, in \1 of their blocks"),
+    (r"differ, in ([^,]+) of their blocks, but not by slow waves of time",
      r"differ in \1 of their blocks, but not clearly over time"),
     (r", z = [-\d.]+(, \d+% of time's slow waves are free of the camera)?\)", ")"),
-    (r"camera place", "camera position"),
+    (r"(camera|camera's) place", r"\1 position"),
 )  # fmt: skip
 
 

@@ -187,7 +187,7 @@ class _TableBuilder:
         if len(sections) > 1:
             sections.append(self._average())
         title = f"experiment {first.experiment}, data {printable(first.dataset)}"
-        common = [f"All runs have {self.common}, which the experiment does not set."] if self.common else []
+        common = [f"All runs differ from the experiment in {self.common}."] if self.common else []
         said = [*common, *of_one_machine(self.records, self.machine), *conditions(self.records), *self._no_vgg()]
         return Table(title, self.columns, sections, self.marks, said)
 

@@ -7,10 +7,12 @@ import io
 import re
 from pathlib import Path
 
+import pytest
 from make_golden import make
 from many_records import frontier, gates, hostile, on_demand, write_all
 from test_page import Page, canvas, group
 
+from gsbench.effects.messages import reason
 from gsbench.measure.record import Candidate, ModelComparison, OnDemand, Record, TimeScreen
 from gsbench.report import compare
 from gsbench.report import frontier as points
@@ -57,6 +59,32 @@ def test_three_seeds_in_words():
 def screened(record: Record, decision: str, reason: str = "so", **changes: object) -> Record:
     screen = TimeScreen(decision, reason, None, None, None, 0.5)
     return dataclasses.replace(record, on_demand=OnDemand(screen, **changes))
+
+
+@pytest.mark.parametrize(
+    ("old", "now"),
+    [
+        (
+            "the images of each of 12 camera places differ, in 29% of their blocks, and with time (p = 0.001, z = 4.0)",
+            "the images of each of 12 camera positions change over time, in 29% of their blocks (p = 0.001)",
+        ),
+        (
+            "the images of the camera's place differ, in less than 1% of their blocks, but not by slow waves of time "
+            "(p = 0.400, z = -0.2)",
+            "the images of the camera's position differ in less than 1% of their blocks, but not clearly over time "
+            "(p = 0.400)",
+        ),
+        (
+            "what a static fit leaves over does not change with time (p = 0.310, z = 0.4, 99% of time's slow waves are "
+            "free of the camera)",
+            "a static model's error does not change over time (p = 0.310)",
+        ),
+        ("the views have no times", "the views have no times"),
+    ],
+)
+def test_reasons_of_older_records_are_in_present_words(old, now):
+    """Catches words that a page of published records keeps, as they are in the records."""
+    assert reason(TimeScreen("on", old, None, None, None, 0.0)) == now
 
 
 def test_a_comparison_of_models_is_said():

@@ -560,7 +560,10 @@ def test_a_table_fits_its_page():
     assert DataTable("t.csv", columns, [["run 0", 1.0, "one machine", 1]]).same == ""
     many = [Column(str(i), 1) for i in range(30)]
     assert DataTable("t.csv", many, [[1.0] * 30] * 3).is_turned
-    assert not DataTable("t.csv", many, [[1.0] * 30] * 300).is_turned
+    long = DataTable("t.csv", many, [[1.0] * 30] * 300)
+    assert not long.is_turned
+    assert len(long.shown[0]) == len(long.shown_columns) == 30 - long.hidden_columns
+    assert 10 < len(long.shown_columns) < 30
     assert not table.is_turned
 
 

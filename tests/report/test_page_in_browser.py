@@ -78,6 +78,19 @@ def test_nothing_is_wider_than_the_screen(visit, name, width):
     assert page.evaluate(loose) == 0
 
 
+def test_no_table_is_cut_on_a_wide_screen(visit):
+    """Catches a last column that must be scrolled for at 1,440 pixels, and a phone on which a row loses its name."""
+    page = visit(width=1440)
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    boxes = page.locator(".scroll").evaluate_all("all => all.map(s => [s.ariaLabel, s.scrollWidth - s.clientWidth])")
+    assert len(boxes) > 5
+    assert [name for name, more in boxes if more > 0] == []
+    narrow = visit(width=390).locator('[aria-label="stages.csv"]')
+    narrow.evaluate("box => { box.scrollLeft = 1000; }")
+    edge = narrow.bounding_box()["x"]
+    assert narrow.locator("tbody td:first-child").first.bounding_box()["x"] == pytest.approx(edge, abs=1)
+
+
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_first_screen_holds_the_answers(visit, width):
     """Catches an answer that one must scroll for: four budgets with their models and intervals."""

@@ -15,7 +15,9 @@ from gsbench.report.page.svg import Panel
 
 Value = str | float | int | None
 MOST_ROWS = 60  # rows of a table that the report shows; the CSV file has all
-MOST_COLUMNS = 13  # columns that fit beside each other
+WIDEST = 135  # characters of a table that fit beside each other; the CSV file has the other columns
+NARROWEST = 18  # characters of a column with long texts, which are wrapped; as in page.css
+TURNED = 13  # rows up to which a table that is too wide is turned
 
 
 @dataclass(frozen=True)
@@ -48,22 +50,45 @@ class DataTable:
     @cached_property
     def same(self) -> str:
         """Return the columns of text or whole numbers that have one value in all rows, with this value."""
-        left = [i for i in range(len(self.columns)) if i not in self._kept]
+        left = [i for i in range(len(self.columns)) if i not in self._varying]
         return "; ".join(f"{self.columns[i].title} {show(self.rows[0][i], self.columns[i])}" for i in left)
 
     @property
     def is_turned(self) -> bool:
         """Tell whether the HTML report shows columns as rows, because they are too many and rows are few."""
-        return len(self.shown_columns) > MOST_COLUMNS > len(self.rows)
+        return self._fitting < len(self._varying) and len(self.rows) < TURNED
+
+    @property
+    def hidden_columns(self) -> int:
+        """Return the number of columns that the HTML report does not show; they are only in the CSV file."""
+        return len(self._varying) - len(self._kept)
+
+    @property
+    def _kept(self) -> list[int]:
+        """Return the numbers of the columns of `shown`."""
+        return self._varying if self.is_turned else self._varying[: self._fitting]
 
     @cached_property
-    def _kept(self) -> list[int]:
-        """Return the numbers of the columns that the report shows as columns; the first one always is."""
+    def _fitting(self) -> int:
+        """Return how many columns fit beside each other, at least two, by the lengths of their titles and texts."""
+        total = 0
+        for number, i in enumerate(self._varying):
+            column = self.columns[i]
+            longest = max((len(show(row[i], column)) for row in self.rows[:MOST_ROWS]), default=0)
+            total += 2 + max(min(longest, NARROWEST), *map(len, column.title.split()))
+            if total > WIDEST and number >= 2:
+                return number
+        return len(self._varying)
+
+    @cached_property
+    def _varying(self) -> list[int]:
+        """Return the numbers of the columns that are not in `same`; the first one never is."""
         if len(self.rows) < 2:
             return list(range(len(self.columns)))
-        differs = [column.digits is not None or len({row[i] for row in self.rows}) > 1
-                   for i, column in enumerate(self.columns)]  # fmt: skip
-        return [i for i, kept in enumerate(differs) if kept or i == 0]
+        differs = [
+            column.digits is not None or len({row[i] for row in self.rows}) > 1 for i, column in enumerate(self.columns)
+        ]
+        return [i for i, varies in enumerate(differs) if varies or i == 0]
 
     @property
     def hidden(self) -> int:
