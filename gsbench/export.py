@@ -25,6 +25,7 @@ PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
 MOST_FRAMES = 100_000
 MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are told
 MOST_SIDE = 16_384  # pixels of a rendered image, before --supersample reduces it
+VIDEO_SIDE = 720  # pixels of the shorter side of a video whose size is not named, at least
 
 
 class ExportRequest(NamedTuple):
@@ -46,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
             print("\n".join(said))
         if asked.options.video:
             with closing(
-                film.frames(asked.run, shots(asked), asked.options.supersample)
+                film.frames(asked.run, shots(asked, VIDEO_SIDE), asked.options.supersample)
             ) as images:  # closes the progress bar too
                 film.write_video(images, asked.options.video, asked.options.fps)
         if asked.options.images:
@@ -67,7 +68,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     made.add_argument("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
     made.add_argument("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame of a clip over time")
-    made.add_argument("--video", type=Path, metavar="OUT.mp4", help="write a video along --path")
+    made.add_argument(
+        "--video", type=Path, metavar="OUT.mp4", help=f"write a video along --path, {VIDEO_SIDE} pixels high or more"
+    )
     made.add_argument("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
     made.add_argument("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")
     seen = made.add_mutually_exclusive_group()
@@ -78,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
     made.add_argument("--seconds", type=float, default=4, help="length of an orbit, a spiral or --plys (4)")
-    made.add_argument("--width", type=int, metavar="PIXELS", help="of the frames (the training's)")
+    made.add_argument("--width", type=int, metavar="PIXELS", help="of the frames (of images: the training's)")
     made.add_argument("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
     made.add_argument(
         "--supersample", type=int, default=1, metavar="N", help="render N times as large, and average (1)"
@@ -216,9 +219,22 @@ def direction(text: str) -> torch.Tensor:
     return (found / found.norm()).float()
 
 
-def shots(asked: ExportRequest) -> list[paths.Shot]:
-    """Return the camera, in the size of --width and --height, and the time of each frame of a video."""
-    return [(of_size(camera, asked.options.width, asked.options.height), time) for camera, time in path_of(asked)]
+def shots(asked: ExportRequest, least: int | None = None) -> list[paths.Shot]:
+    """Return the camera and the time of each frame of a video, in the size of --width and --height.
+
+    If neither is named, frames have the size of the training's images; with `least` they are even and have at least so
+    many pixels on the shorter side.
+    """
+    width, height = asked.options.width, asked.options.height
+    if width is height is None and least is not None:
+        return [(enlarged(camera, least), time) for camera, time in path_of(asked)]
+    return [(of_size(camera, width, height), time) for camera, time in path_of(asked)]
+
+
+def enlarged(camera: Camera, least: int) -> Camera:
+    """Return a camera with even sides, the shorter one of at least `least` pixels."""
+    scale = max(1.0, least / min(camera.width, camera.height))
+    return paths.resized(camera, *(2 * max(1, round(scale * side / 2)) for side in (camera.width, camera.height)))
 
 
 def of_size(camera: Camera, width: int | None, height: int | None) -> Camera:

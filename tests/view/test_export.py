@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +129,28 @@ def test_frames_have_the_size_that_is_asked_for(
     read, frame = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()
     assert read
     assert frame.shape == (size[1], size[0], 3)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [((100, 100), (720, 720)), ((800, 800), (800, 800)), ((1357, 761), (1356, 760)), ((201, 101), (1432, 720)),
+     ((80, 160), (720, 1440))],
+)  # fmt: skip
+def test_a_video_is_large_enough_to_be_looked_at(
+    size: tuple[int, int], expected: tuple[int, int], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a stamp of 80 pixels, sides that VP9 cannot encode, other proportions, and PNGs of another size."""
+    run = load_run(folder)
+    run = replace(run, scene=replace(run.scene, width=size[0], height=size[1]))
+    monkeypatch.setattr("gsbench.export.load_run", lambda *_: run)
+    written: dict[Path, set[tuple[int, int]]] = {}
+    monkeypatch.setattr(film, "frames", lambda _, shots, __: iter(shots))
+    for name in ("write_video", "write_images"):
+        monkeypatch.setattr(film, name, lambda images, path, *_: written.update(
+            {path: {(camera.width, camera.height) for camera, _ in images}}))  # fmt: skip
+    monkeypatch.setattr("gsbench.export.closing", nullcontext)
+    assert main([str(folder), "--video", str(tmp_path / "a.mp4"), "--images", str(tmp_path / "a"), *SHORT]) == 0
+    assert written == {tmp_path / "a.mp4": {expected}, tmp_path / "a": {size}}
 
 
 def test_another_size_shows_the_same(folder: Path) -> None:
