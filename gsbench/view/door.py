@@ -155,8 +155,8 @@ class Door:
         """Guard a viser server that is started inside this context.
 
         viser has no option for a check of requests. It looks up the function `websockets.asyncio.server.serve` when its
-        server starts. This context replaces that function by one with the check, and restores it at the end. It is the
-        only place where gsbench changes another library.
+        server starts. This context replaces that function by one with the check, and restores it at the end. gsbench
+        changes one other library: submitit, in `gsbench/sweep/container.py`.
 
         Raises:
             InputError: this version of viser does not use that function, so its server would accept requests from any

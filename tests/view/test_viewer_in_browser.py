@@ -323,7 +323,7 @@ def test_a_sharp_screen_gets_all_its_pixels(browser, viewer):
     assert "fixedDpr=2" in page.url
     assert "initialCameraFov=0.5" in page.url
     page.goto(page.url.replace("fixedDpr=2", "fixedDpr=0.5"))
-    page.wait_for_selector("text=x 250", timeout=60_000)
+    page.wait_for_selector("text=x 250", timeout=60_000, state="attached")  # in a folder, as the image is narrow
     context.close()
 
 
