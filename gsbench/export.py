@@ -115,6 +115,9 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
                          f"{options.width}, {options.height}")  # fmt: skip
     for path in (path for path in (options.ply, options.video, options.images) if path):
         film.check_parent(path)
+    if options.ply and options.ply.suffix.lower() != ".ply":
+        raise InputError(f"--ply: expected a file name that ends in .ply, got {options.ply}: write a PLY, which other "
+                         f"tools convert", docs="viewing.md#export")  # fmt: skip
     if options.plys:
         check_sequence(options)
     check_device(options.device)

@@ -78,7 +78,7 @@ def markdown(tables: list[Table]) -> str:
         for section in table.sections:
             lines += [f"## {_escape(section.title)}", ""]
             if section.rows:
-                lines += [_line(titles), _line(["---", *["---:"] * (len(titles) - 1)])]
+                lines += [_line(list(map(_escape, titles))), _line(["---", *["---:"] * (len(titles) - 1)])]
             for row in section.rows:
                 label, first, *rest = map(_escape, _texts(row, table.columns))
                 lines.append(_line([label, f"**{first}**" if row.best else first, *rest]))
@@ -145,5 +145,5 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _escape(text: str) -> str:
-    """Escape the special characters of Markdown, so that the text is shown unchanged."""
-    return re.sub(r"([\\`*<|\[\]])", r"\\\1", text)
+    """Escape the special characters of Markdown and HTML, so that the text is shown unchanged."""
+    return re.sub(r"([\\`*|\[\]])", r"\\\1", re.sub(r"&(?=[#\w])", "&amp;", text).replace("<", "&lt;"))

@@ -188,7 +188,7 @@ def test_hostile_names_stay_text(tmp_path):
     write(build([run, broken]), tmp_path)
     text = (tmp_path / "table1.md").read_text()
     assert not any(line.startswith(("# head", "# out")) for line in text.splitlines())
-    assert "\\<script>" in text
+    assert "&lt;script>" in text
     assert "\\[a\\](" in text
     assert all("|" not in line.replace("\\|", "") for line in text.splitlines() if "head" in line)
     cells = pd.read_csv(tmp_path / "table1.csv")["dataset"].tolist()

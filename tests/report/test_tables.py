@@ -351,9 +351,11 @@ def test_training_views_are_shown_on_request():
 
 def test_text_from_a_record_cannot_break_the_page_or_the_terminal():
     """Would catch a reason with a pipe, a newline or an escape code that breaks the table or colours the terminal."""
-    run = failed(reason="a | b\nc <script> \x1b[31m *d*", dataset="x|y\x07")
+    run = failed(reason="a | b\nc <script> \x1b[31m *d*", dataset="x|y\x07<b>&lt;")
     text = page(run)
-    assert r"a \| b\\nc \<script> \\x1b\[31m \*d\*" in text
+    assert "data x\\|y\\\\x07&lt;b>&amp;lt;" in text
+    assert "<" not in text
+    assert r"a \| b\\nc &lt;script> \\x1b\[31m \*d\*" in text
     assert not set(layout.terminal(tables.build([run]))) & {"\x1b", "\x07"}
 
 

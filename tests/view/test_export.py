@@ -207,6 +207,7 @@ def test_the_middle_is_a_median_by_opacity() -> None:
         (("--ply", "a.ply", "--camera", "\x1b[31m"), r"\x1b[31m"),
         (("--ply", "a\0.ply", "--camera", "0"), "a file"),
         (("--ply", ".", "--camera", "0"), "a file"),
+        (("--ply", "a.spz", "--camera", "0"), "ends in .ply, got a.spz"),
         (("--images", "a\0"), "a file"),
         (("--video", "a\0.mp4"), "a file"),
         (("--ply", "a.ply", "--direction", "," * 5000), "--direction"),
