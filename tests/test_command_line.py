@@ -72,7 +72,7 @@ def test_the_help_lists_models_of_the_user(tmp_path: Path, capsys: pytest.Captur
         (["+exp=mini", "scene=suzanne", "scene.eval_split=tset"], ["eval_split 'tset'", "Did you mean 'test'"]),
         (["+exp=mini", "scene=suzanne", "model.options.schem=schur"], ["model.options.schem", "Did you mean 'scheme'"]),
         (["+exp=mini", "scene=suzanne", "model.options.scheme=shur"], ["scheme 'shur'", "Did you mean 'schur'"]),
-        (["+exp=mini", "scene=suzanne", "scene.downscale=7"], ["downscale", "7"]),
+        (["+exp=mini", "scene=suzanne", "scene.downscale=400"], ["downscale", "400"]),
         (["+exp=mini", "scene=suzanne", "+init.ply=/nowhere.ply"], ["init.ply", "/nowhere.ply"]),
         (["+exp=mini", "scene=suzanne", f"+init.ply={__file__}"], ["test_command_line.py", "expected a PLY"]),
         (["+exp=mini", "data.scenes=[]"], ["data.scenes", "empty list"]),
