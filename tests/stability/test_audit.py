@@ -171,11 +171,11 @@ def test_missing_numbers_are_not_good_ones() -> None:
     assert audit.curves.percentile(errors) == math.inf
 
 
-def test_a_shaken_start_is_16_roundings_away() -> None:
-    """Catches start values that stay, that move by more than rounding changes a slice, or that two seeds move alike."""
+def test_a_shaken_start_is_64_roundings_away() -> None:
+    """Catches start values that stay, that move by more than what ten steps round, or that two seeds move alike."""
     made = [torch.nn.ParameterList([torch.linspace(-3, 3, 50).double()]) for _ in range(3)]
     for model, seed in zip(made[1:], (1, 2), strict=True):
         trainings._shake(model, seed)  # type: ignore[arg-type]
     start, one, two = (next(iter(model)).detach() for model in made)
-    assert 2.0**-24 < ((one - start) / start).abs().max() <= 2.0**-20
+    assert 2.0**-19 < ((one - start) / start).abs().max() <= 2.0**-18
     assert not torch.equal(one, two)
