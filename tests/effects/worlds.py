@@ -16,7 +16,8 @@ World = Callable[[float], Gaussians3D]
 
 
 def camera(azimuth: float, height: float, size: int = SIZE) -> Camera:
-    """A camera at distance 4 that looks at the origin."""
+    """A camera at distance 4 that looks at the origin, whose image is a fifth higher than wide."""
+    tall = size + size // 5
     level = math.sqrt(max(0.0, 1 - height * height))
     center = 4 * torch.tensor([level * math.cos(azimuth), level * math.sin(azimuth), height])
     forward = -center / center.norm()
@@ -25,8 +26,8 @@ def camera(azimuth: float, height: float, size: int = SIZE) -> Camera:
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ center
-    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
-    return Camera(viewmat, K, size, size)
+    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, tall / 2], [0, 0, 1]])
+    return Camera(viewmat, K, size, tall)
 
 
 def blobs(count: int = 60, seed: int = 0) -> Gaussians3D:
