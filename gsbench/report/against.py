@@ -8,9 +8,9 @@ Other code or another device rounds floating-point numbers differently, and diff
 training as much as another seed does. Therefore the other runs of one model on one scene form two samples, one for each
 folder. Student's t compares the two means, and Holm's method adjusts the p-values for all models and scenes.
 
-A few seeds do not give a reliable variance. Therefore the variance over seeds is pooled over the models and scenes of
-an experiment. If the variance of the compared runs themselves is larger, it is used instead. With the pooled variance,
-even one run in one folder can be compared with three runs in the other: the interval of the difference is then the
+A few seeds do not give a reliable variance. Therefore the variance of the compared runs is averaged with the variance
+pooled over the models and scenes of an experiment, which counts as `POOLED_RUNS` runs (a moderated t: Smyth 2004). With
+it, even one run in one folder can be compared with three runs in the other: the interval of the difference is then the
 prediction interval, in which one more run of the other folder would lie.
 """
 
@@ -29,6 +29,7 @@ AGREES, DIFFERS, UNTOLD = "agrees", "differs", "cannot be told"
 # Settings of a run's evaluation.
 MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale", "resize")
 OF_THE_BITS = ("psnr", "gaussians", "mb")  # quantities that are equal if the trained Gaussians are bit-equal
+POOLED_RUNS = 4  # degrees of freedom of the pooled variance, beside those of the row's own
 SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not compared
 
 
@@ -60,9 +61,9 @@ RULE = (
     "other folder's run of its seed. A row also agrees where the means are within 0.01 dB, 25 % of seconds or ms, 10 % "
     "of Gaussians or MB; or where the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; or, "
     "of a single run, where it is in the 95 % prediction interval of the other folder's runs and as near to their "
-    "mean. It differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is pooled "
-    "over all rows; a row's own counts where it is larger. The verdict of the whole is that of PSNR: it differs where "
-    "one row does, and agrees where all rows do."
+    "mean. It differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is the "
+    "row's own, averaged with that of all rows, which counts as four runs. The verdict of the whole is that of PSNR: "
+    "it differs where one row does, and agrees where all rows do."
 )
 
 NONE = Estimate(math.nan, 0, 0, "")
@@ -236,8 +237,9 @@ def value(record: Record, quantity: str) -> float:
 def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
     """Estimate the difference between the two folders' means for each model and scene, with an interval.
 
-    The variance over seeds is pooled over all given models and scenes. The variance of a single model and scene is used
-    instead if it is larger. Bit-equal runs count once, and their difference is zero.
+    The variance over seeds is the mean of that of the model on the scene and of that pooled over all given models and
+    scenes, weighted by degrees of freedom; the pooled one has at most `POOLED_RUNS`, as models and scenes differ in
+    spread. Bit-equal runs count once, and their difference is zero.
     """
     units = [abs(fmean(row.theirs)) if limit.relative else 1.0 for row in rows]
     samples = [[[v / (unit or 1.0) for v in runs] for runs in (row.ours, row.theirs)]
@@ -245,15 +247,19 @@ def differences(rows: list[Judged], limit: Limit) -> list[Estimate]:
     own = [_squares(*(of_row[1:] if row.is_bit_equal else of_row)) for row, of_row in zip(rows, samples, strict=True)]
     freedom = sum(free for _, free in own)
     pooled = sum(squares for squares, _ in own) / freedom if freedom else math.nan
+    shared = min(freedom, POOLED_RUNS)
     found = []
     for row, (ours, theirs), (squares, free), unit in zip(rows, samples, own, units, strict=True):
         if row.is_bit_equal:
             found.append(EQUAL)
             continue
         mean, count = (fmean(ours) - fmean(theirs)) * unit, min(len(ours), len(theirs))
-        spread = max(pooled, squares / free if free else 0.0) * unit**2 * (1 / len(ours) + 1 / len(theirs))
-        levels = (Spread(spread, freedom),) if freedom else ()
-        found.append(Estimate(mean, 1, count, "seeds" if freedom else "", levels))
+        if not freedom:
+            found.append(Estimate(mean, 1, count, ""))
+            continue
+        moderated = (shared * pooled + squares) / (shared + free)
+        spread = Spread(moderated * unit**2 * (1 / len(ours) + 1 / len(theirs)), shared + free)
+        found.append(Estimate(mean, 1, count, "seeds", (spread,)))
     return found
 
 
