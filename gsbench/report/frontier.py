@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 
 from gsbench.report import paper
-from gsbench.report.configurations import Configuration, Group, Values
+from gsbench.report.configurations import Configuration, Group, Values, iterations
 from gsbench.report.family import Family, Weights
 from gsbench.report.intervals import Estimate, estimate
 from gsbench.report.paper_protocol import has_images_of_paper
@@ -164,20 +165,45 @@ class Target:
 def targets(group: Group) -> list[Target]:
     """Return the PSNR targets of every scene, and the training seconds that each model needs to reach them.
 
-    PSNR is measured on the validation views. A model's seconds are those of its fastest finished settings whose mean
-    PSNR over seeds reaches the target. Nothing is interpolated between different training lengths.
+    PSNR is measured on the validation views. A model's seconds are the least after which the mean curve of one of its
+    configurations, which may train on after that, has the target. Nothing is interpolated between measurements.
     """
     found = []
     for scene in group.scenes:
-        reached: dict[str, list[tuple[float, float]]] = {}  # by model: PSNR on val, seconds of a configuration
+        ends: list[float] = []  # PSNR on val of each configuration at its end
+        reached: dict[str, list[tuple[float, float]]] = {}  # by model: PSNR on val, seconds
         for configuration in group.configurations:
             quality, cost = (group.sample(configuration, scene, name) for name in ("psnr_val", "seconds"))
             if len(quality) and len(cost):
-                reached.setdefault(configuration.series, []).append((float(quality.mean()), float(cost.mean())))
-        for rule, psnr in _rules(group, scene, [p for ends in reached.values() for p, _ in ends]):
-            needed = {m: min((s for p, s in ends if p >= psnr), default=math.inf) for m, ends in reached.items()}
-            found.append(Target(scene, rule, psnr, needed))
+                _, seconds, psnr = mean_curve(group, configuration, scene) or ([], [], [])
+                end = float(quality.mean()), float(cost.mean())
+                ends.append(end[0])
+                reached.setdefault(configuration.series, []).extend([end, *zip(psnr, seconds, strict=True)])
+        for rule, psnr_of_rule in _rules(group, scene, ends):
+            needed = {m: min((s for p, s in at if p >= psnr_of_rule), default=math.inf) for m, at in reached.items()}
+            found.append(Target(scene, rule, psnr_of_rule, needed))
     return found
+
+
+def mean_curve(
+    group: Group, configuration: Configuration, scene: str
+) -> tuple[list[int], list[float], list[float]] | None:
+    """Return iterations, mean seconds and mean PSNR over seeds, at the iterations that all seeds measured.
+
+    The result is None if there is no such iteration, or if the seeds kept different lengths (`train.lengths`).
+    """
+    if len({iterations(r) for r in configuration.runs.get(scene, [])}) > 1:
+        return None
+    seeds = [
+        {p.iteration: p for p in r.curve if p.psnr_val is not None}
+        for r in configuration.runs.get(scene, [])
+        if not math.isnan(group.value(r, "seconds"))
+    ]
+    steps = sorted(set.intersection(*map(set, seeds))) if seeds else []
+    if not steps:
+        return None
+    seconds = [fmean(s[step].seconds for s in seeds) for step in steps]
+    return steps, seconds, [fmean(s[step].psnr_val or 0.0 for s in seeds) for step in steps]
 
 
 def _rules(group: Group, scene: str, reached: list[float]) -> list[tuple[str, float]]:

@@ -151,6 +151,24 @@ def test_targets_are_round_numbers_and_never_is_an_answer():
     assert found["24 dB"].seconds == {"3dgs": math.inf, "a": math.inf, "b": 100.0}
 
 
+def test_the_time_to_a_target_is_read_from_the_curve():
+    """Catches the seconds of a whole training in every row of a scene, a target that one seed has and the mean has not,
+    and a target that a curve had before it fell."""
+    at = {"rises": (18.0, 21.0, 22.4, 24.6), "falls": (20.5, 22.5, 21.5, 19.0)}
+    runs = [
+        dataclasses.replace(r, curve=[Point(100 * i, 10.0 * i, p + noise) for i, p in enumerate(curve, 1)])
+        for name, curve in at.items()
+        for seed, noise in ((0, 0.5), (1, -0.7))
+        for r in runs_of(name, "", curve[-1], 40.0, (seed,))
+    ]
+    found = {t.psnr: t.seconds for t in frontier.targets(group(*runs))}
+    assert found == {
+        20.0: {"rises": 20.0, "falls": 10.0},
+        22.0: {"rises": 30.0, "falls": 20.0},
+        24.0: {"rises": 40.0, "falls": math.inf},
+    }
+
+
 def test_no_target_is_the_winners_own_mean():
     """Catches targets that only the winner can reach, as they are what its own seeds ended with."""
     runs = group(

@@ -4,7 +4,7 @@ import math
 from statistics import fmean
 
 from gsbench.report import frontier as f
-from gsbench.report.configurations import Configuration, Group, iterations
+from gsbench.report.configurations import Group
 from gsbench.report.page import charts, events, messages
 from gsbench.report.page.content import Canvas, Column, DataTable, PageFigure, PageSection, Tab, Value, shown_runs
 
@@ -38,8 +38,8 @@ def quality_section(group: Group, canvas: Canvas) -> PageSection:
         notes=[
             "Targets are round values of PSNR on val between the lowest and the highest run of a scene. Their step is "
             "the largest of 2, 1, 0.5, 0.2 and 0.1 dB that gives three. On the paper's images, the paper's PSNR of "
-            "7DGS (best on test) is a target too. Seconds are those of the fastest finished configuration of a model, "
-            "averaged over seeds. Nothing is interpolated."
+            "7DGS (best on test) is a target too. Seconds are those after which the mean curve on val of a model's "
+            "runs, of any length, first has the target; the runs go on after that. Nothing is interpolated."
         ],
     )
 
@@ -77,7 +77,7 @@ def anytime_section(group: Group, canvas: Canvas) -> PageSection:
     for i, scene in enumerate(group.scenes):
         curves = []
         for configuration in group.main_configurations:
-            if curve := _mean_curve(group, configuration, scene):
+            if curve := f.mean_curve(group, configuration, scene):
                 steps, seconds, psnr = curve
                 marks = events.of(configuration.runs[scene][0])
                 seen |= {letter for _, letters in marks for letter in letters}
@@ -100,27 +100,6 @@ def anytime_section(group: Group, canvas: Canvas) -> PageSection:
     return PageSection(
         "anytime", "While training", _anytime_words(tails), [Tab("", drawings)], table, legend=True, notes=notes
     )
-
-
-def _mean_curve(
-    group: Group, configuration: Configuration, scene: str
-) -> tuple[list[int], list[float], list[float]] | None:
-    """Return iterations, mean seconds and mean PSNR over seeds, at the iterations that all seeds measured.
-
-    The result is None if there is no such iteration, or if the seeds kept different lengths (`train.lengths`).
-    """
-    if len({iterations(r) for r in configuration.runs.get(scene, [])}) > 1:
-        return None
-    seeds = [
-        {p.iteration: p for p in r.curve if p.psnr_val is not None}
-        for r in configuration.runs.get(scene, [])
-        if not math.isnan(group.value(r, "seconds"))
-    ]
-    steps = sorted(set.intersection(*map(set, seeds))) if seeds else []
-    if not steps:
-        return None
-    seconds = [fmean(s[step].seconds for s in seeds) for step in steps]
-    return steps, seconds, [fmean(s[step].psnr_val or 0.0 for s in seeds) for step in steps]
 
 
 def _when(step: int, steps: list[int], seconds: list[float]) -> float:
