@@ -141,7 +141,7 @@ def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
     assert verdicts(of, quantity) == {AGREES}
     row = of.rows[0].judged[quantity]
     assert 0.1 < row.difference.mean / fmean(row.theirs) < 0.2
-    assert row.difference.half / fmean(row.theirs) == pytest.approx(0.13, abs=0.03)
+    assert row.difference.half / fmean(row.theirs) == pytest.approx(0.16, abs=0.02)
 
 
 def test_one_run_on_each_side_cannot_be_told():
