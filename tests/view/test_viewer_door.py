@@ -24,6 +24,7 @@ from gsbench.errors import InputError
 from gsbench.run.load import load_run
 from gsbench.view import __main__, door
 from gsbench.view.client import Client
+from gsbench.view.controls import _checked
 from gsbench.view.door import Door, is_known
 from gsbench.view.viewer import Viewer
 
@@ -215,6 +216,13 @@ def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, cap
         time.sleep(0.5)
         until(lambda: rests(viewer))
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_background_is_three_bytes() -> None:
+    """Catches a colour of a hundred numbers, or of one beyond 8 bits, that a frame would be rendered with."""
+    assert _checked((0, 128, 255)) == (0, 128, 255)
+    for color in ((), (1,) * 100, (0, 300, 0), (-1, 0, 0), (2**60, 0, 0)):
+        assert _checked(color) is None
 
 
 def test_large_or_many_messages_are_not_kept(viewer: Viewer) -> None:
