@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -48,18 +49,20 @@ class WritePlan(Callback):
               file=sys.stderr)  # fmt: skip
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Prepare the process of a job that runs in a container image."""
+        """Note when the run starts, and prepare the process of a job that runs in a container image."""
+        self._began = time.time()
         if config.launch.container is not None:
             container.enter()
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Write the outcome of the run, which contains the path of its record.
+        """Write the outcome of the run, which contains the path of its record, and print the time left of the sweep.
 
         The path is stored because two commands may request the same run with different overrides.
         """
         is_started = is_parallel(config.hydra) and job_return.status == JobStatus.COMPLETED  # its process writes it
         if config.hydra.mode == RunMode.MULTIRUN and not is_started:
-            write_outcome(config, job_return._return_value)  # `return_value` would print an error, and raise it
+            # `return_value` would print an error, and raise it
+            write_outcome(config, job_return._return_value, self._began)
 
 
 def is_parallel(hydra: HydraConf) -> bool:
@@ -67,10 +70,20 @@ def is_parallel(hydra: HydraConf) -> bool:
     return bool(hydra.runtime.choices.get("launch") == "parallel")
 
 
-def write_outcome(config: DictConfig, problem: object) -> None:
-    """Write the outcome of a run of a sweep that ended in this process; `problem` is why it did not end well."""
+def write_outcome(config: DictConfig, problem: object, began: float, at_once: int = 1) -> None:
+    """Write the outcome of a run of a sweep that ended in this process, and print the time left of the sweep.
+
+    Args:
+        config: the composed config, with Hydra's own.
+        problem: why the run did not end well; None if it did.
+        began: the time at which the run started, Unix seconds.
+        at_once: the number of runs at a time.
+    """
     folder = Path(config.hydra.sweep.dir)
-    plan.write_ended(folder, config.hydra.job.num, ended(config, problem, folder.parents[2]))
+    plan.write_ended(folder, config.hydra.job.num, ended(config, problem, folder.parents[2], began))
+    if "submitit" not in config.hydra.launcher._target_:  # Slurm starts its jobs when it can
+        line = time_left(folder, at_once)
+        print(line, end="\n" if line else "", file=sys.stderr)
 
 
 def expand(config: DictConfig) -> list[list[str]]:
@@ -95,8 +108,31 @@ def plan_of(runs: Sequence[Sequence[str]], config: DictConfig) -> Plan:
     )
 
 
-def ended(config: DictConfig, problem: object, results: Path) -> Ended:
-    """Return the outcome of a run that ended in this process: the path of its record, or why there is none."""
+def time_left(folder: Path, at_once: int) -> str:
+    """Return a line with the number of ended runs of a sweep, and about how long its other runs will take.
+
+    The other runs are expected to take as long as the mean of those that this sweep has trained. The line is empty
+    before the first of these, and after the last run.
+
+    Args:
+        folder: the folder of the sweep's plan.
+        at_once: the number of runs at a time.
+    """
+    total, outcomes = len(plan.read(folder / plan.FILE_NAME).runs), plan.read_ended(folder)
+    took = [outcome.seconds for outcome in outcomes.values() if outcome.seconds is not None]
+    left = total - len(outcomes)
+    if not took or left <= 0:
+        return ""
+    seconds = fmean(took) * left / max(1, min(at_once, left))
+    about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    return f"{len(outcomes)} of {total} runs have ended; about {about} left"
+
+
+def ended(config: DictConfig, problem: object, results: Path, began: float) -> Ended:
+    """Return the outcome of a run that ended in this process: the path of its record, or why there is none.
+
+    `began` is the time (Unix seconds) at which the run started; a record that is older was kept.
+    """
     if isinstance(problem, Problem) and problem.is_refused:
         return Ended(None, problem.reason, is_refused=True)
     if isinstance(problem, InputError):
@@ -112,4 +148,5 @@ def ended(config: DictConfig, problem: object, results: Path) -> Ended:
         return Ended(None, one_line(error))
     if not path.exists():
         return Ended(None, "it ended without a record")
-    return Ended(os.path.relpath(path, results), None)
+    seconds = time.time() - began if path.stat().st_mtime >= began else None
+    return Ended(os.path.relpath(path, results), None, seconds=seconds)

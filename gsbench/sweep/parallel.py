@@ -50,7 +50,7 @@ def do_or_start(composed: DictConfig) -> Problem | None:
     with stop.requested() as request:
         _wait(most - 1, request)
         if request.signal is None:
-            process = get_context("fork").Process(target=_work, args=(composed, request, os.getpid()))
+            process = get_context("fork").Process(target=_work, args=(composed, request, os.getpid(), most))
             process.start()
             _running[process] = " ".join(HydraConfig.get().overrides.task)
     if request.signal is not None:
@@ -113,8 +113,9 @@ def _import_torch() -> None:
             raise
 
 
-def _work(composed: DictConfig, request: Request, parent: int) -> None:
-    """Do a run in its process; `request` tells of a signal that came before the process listens itself."""
+def _work(composed: DictConfig, request: Request, parent: int, at_once: int) -> None:
+    """Do one of `at_once` runs in its process; `request` tells of a signal that came before the process listens."""
+    began = time.time()
     with contextlib.suppress(OSError):  # the kernel kills a run if memory runs out, not the parent, which reports it
         Path("/proc/self/oom_score_adj").write_text("500")
     threading.Thread(target=_end_with, args=(parent,), name="gsbench-parent", daemon=True).start()
@@ -122,7 +123,7 @@ def _work(composed: DictConfig, request: Request, parent: int) -> None:
         stop.listen()
         if request.signal is not None:
             raise Stopped(request.signal)
-        write_outcome(cast(DictConfig, HydraConfig.instance().cfg), do(composed))
+        write_outcome(cast(DictConfig, HydraConfig.instance().cfg), do(composed), began, at_once)
     except Stopped as stopped:
         print(f"gsbench: {stopped}", file=sys.stderr)
         sys.exit(stopped.code)

@@ -43,6 +43,7 @@ class Ended:
     record: str | None  # path of its record, relative to the folder of all results; None if it has no record
     reason: str | None  # why it has no record
     is_refused: bool = False  # whether it was refused before it began, so that nothing was run
+    seconds: float | None = None  # from its start to its end; None if an earlier record was kept, or it is not known
 
 
 def identity(overrides: Sequence[str]) -> Identity:

@@ -1,0 +1,38 @@
+"""The time left of a sweep, which each run prints when it ends."""
+
+import re
+from pathlib import Path
+
+import pytest
+from tiny_run import main_here, overrides, write_moving_square
+
+from gsbench.sweep import plan
+from gsbench.sweep.callbacks import time_left
+from gsbench.sweep.plan import Ended, Plan
+
+
+def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -> None:
+    """Catches runs that were kept and count as trained in no time, runs that failed and are waited for, runs at once
+    that are added up, and a line that divides by nothing."""
+    plan.write(Plan("joblib", [[f"seed={i}"] for i in range(10)], [], ".", "here", 1, None, 0.0), tmp_path)
+    assert time_left(tmp_path, 2) == ""
+    plan.write_ended(tmp_path, 0, Ended("record.json", None))  # kept
+    assert time_left(tmp_path, 2) == ""
+    plan.write_ended(tmp_path, 1, Ended("record.json", None, seconds=30.0))
+    plan.write_ended(tmp_path, 2, Ended("record.json", None, seconds=50.0))
+    assert time_left(tmp_path, 2) == "3 of 10 runs have ended; about 2 min left"
+    assert time_left(tmp_path, 1) == "3 of 10 runs have ended; about 5 min left"
+    for number in range(3, 9):
+        plan.write_ended(tmp_path, number, Ended(None, "it ended without a record"))
+    assert time_left(tmp_path, 4) == "9 of 10 runs have ended; about 40 s left"
+    plan.write_ended(tmp_path, 9, Ended("record.json", None, seconds=1.0))
+    assert time_left(tmp_path, 2) == ""
+
+
+def test_a_sweep_prints_the_time_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a sweep that says nothing until its end, and one that is repeated and expects its kept runs to train."""
+    words = overrides(write_moving_square(tmp_path / "data"), tmp_path / "results", "model=3dgs", "train.iterations=2")
+    assert main_here("-m", *words, "seed=0,1") == 0
+    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", capsys.readouterr().err)) == 1
+    assert main_here("-m", *words, "seed=0,1") == 0
+    assert "have ended" not in capsys.readouterr().err
