@@ -13,6 +13,7 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
 from gsbench.models.registry import import_models
+from gsbench.process.memory import is_out_of_memory, require
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
@@ -26,6 +27,7 @@ MOST_FRAMES = 100_000
 MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are told
 MOST_SIDE = 16_384  # pixels of a rendered image, before --supersample reduces it
 VIDEO_SIDE = 720  # pixels of the shorter side of a video whose size is not named, at least
+BYTES_OF_PIXEL = 32  # of a rendered image in float32 with its alpha, a copy of it, and 8 bits of it
 
 
 class ExportRequest(NamedTuple):
@@ -56,8 +58,11 @@ def main(arguments: list[str] | None = None) -> int:
         if asked.options.json:
             written = {name: getattr(asked.options, name) for name in ("ply", "plys", "video", "images")}
             print(as_json({"written": written, "notes": said}))
-    except (InputError, OSError) as error:
-        print(f"gsbench.export: {one_line(error)}", file=sys.stderr)
+    except (InputError, OSError, MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory
+        if isinstance(error, RuntimeError) and not is_out_of_memory(error):
+            raise
+        why = "out of memory: " if is_out_of_memory(error) else ""
+        print(f"gsbench.export: {why}{one_line(error)}", file=sys.stderr)
         return 2
     return 0
 
@@ -227,11 +232,19 @@ def shots(asked: ExportRequest, least: int | None = None) -> list[paths.Shot]:
 
     If neither is named, frames have the size of the training's images; with `least` they are even and have at least so
     many pixels on the shorter side.
+
+    Raises:
+        TooLargeError: a frame needs more memory than there is.
     """
     width, height = asked.options.width, asked.options.height
     if width is height is None and least is not None:
-        return [(enlarged(camera, least), time) for camera, time in path_of(asked)]
-    return [(of_size(camera, width, height), time) for camera, time in path_of(asked)]
+        sized = [(enlarged(camera, least), time) for camera, time in path_of(asked)]
+    else:
+        sized = [(of_size(camera, width, height), time) for camera, time in path_of(asked)]
+    pixels = asked.options.supersample**2 * max(camera.width * camera.height for camera, _ in sized)
+    require(BYTES_OF_PIXEL * pixels, f"frames of {pixels:,} rendered pixels",
+            "lower --width, --height or --supersample")  # fmt: skip
+    return sized
 
 
 def enlarged(camera: Camera, least: int) -> Camera:

@@ -31,10 +31,8 @@ def write_atomically(path: Path, data: bytes | Callable[[BufferedRandom], object
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # The error of a full disk has no file name, and a user does not know the temporary file.
-        if isinstance(error, OSError) and error.errno:
-            error.filename = str(path)
-            del error.filename2  # None would be printed
+        if isinstance(error, OSError):
+            _name(error, path)
         raise
     if not lasting:
         return
@@ -63,8 +61,18 @@ def create_atomically(path: Path, data: bytes) -> bool:
                 raise
             return _create_here(path, data)
         return True
+    except OSError as error:
+        _name(error, path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _name(error: OSError, path: Path) -> None:
+    """Name a file in an error: that of a full disk has no name, and a user does not know the temporary file."""
+    if error.errno:
+        error.filename = str(path)
+        del error.filename2  # None would be printed
 
 
 def _create_here(path: Path, data: bytes) -> bool:

@@ -20,13 +20,16 @@ from gsbench.measure.curve import Point
 from gsbench.measure.exact_views import MOST_PSNR
 from gsbench.measure.machine import Hardware, named
 from gsbench.measure.renamed import with_present_keys
-from gsbench.measure.schema import parse
+from gsbench.measure.schema import MOST, parse
 from gsbench.measure.speed import RenderTimes
-from gsbench.reading import MAX_JSON, parse_json, read_file
+from gsbench.reading import parse_json, read_file
 
 VERSION = 1
 LONGEST_NAME = 200  # bytes; of a scene, a model or an experiment, which are names of folders
+MAX_FILE = 1 << 23  # bytes; the largest record known has less than a million
 MAX_POINTS = 10_000  # the most points of a training curve, which a page can still draw quickly
+MAX_VIEWS = 10_000
+MAX_SHOWN = 100  # entries of a list or an object that tables show whole
 FILE_NAME = "record.json"
 CHECKPOINT = "checkpoint.pt"  # the file of the training, in the same folder
 PUBLISHED = "published"  # the folder of records that ship with the code; it is read only where it is named
@@ -176,7 +179,7 @@ class ModelComparison:
 
     iteration: int  # the iteration after which PSNR on val was measured
     chosen: str  # the name of the candidate with the highest PSNR, which was trained to the end
-    candidates: list[Candidate]
+    candidates: list[Candidate] = field(metadata={MOST: MAX_SHOWN})
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,8 @@ class LengthChoice:
     """The choice on val of a training among trainings of several lengths (`train.lengths`)."""
 
     kept: int  # the iterations of the training whose Gaussians are kept
-    tried: list[Candidate]  # the shortest first; a longer one that is missing was not trained
+    # the shortest first; a longer one that is missing was not trained
+    tried: list[Candidate] = field(metadata={MOST: MAX_SHOWN})
 
 
 @dataclass(frozen=True)
@@ -248,13 +252,14 @@ class Record:
     dataset: str
     seed: int
     effects: Effects
-    protocol: dict[str, Any]  # plain JSON: name, background, downscale, eval_split, quantise, paper_dataset, ...
+    # plain JSON: name, background, downscale, eval_split, quantise, paper_dataset, ...
+    protocol: dict[str, Any] = field(metadata={MOST: MAX_SHOWN})
     provenance: Provenance
     metrics: dict[str, float | None] | None = None  # None only where the run is not ok
     missing: dict[str, str] = field(default_factory=dict)
-    per_view: list[ViewScore] = field(default_factory=list)
+    per_view: list[ViewScore] = field(default_factory=list, metadata={MOST: MAX_VIEWS})
     cost: Cost | None = None  # None only where the run is not ok
-    curve: list[Point] = field(default_factory=list)
+    curve: list[Point] = field(default_factory=list, metadata={MOST: MAX_POINTS})
     version: int = VERSION
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
@@ -263,7 +268,7 @@ class Record:
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
     length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`
-    exact: list[str] = field(default_factory=list)  # views that a measurement found exact: gsbench.measure.exact_views
+    exact: list[str] = field(default_factory=list, metadata={MOST: MAX_VIEWS})  # views: gsbench.measure.exact_views
 
     @property
     def path(self) -> Path:
@@ -297,7 +302,7 @@ def read(path: Path) -> Record:
     Raises:
         InputError: the record is not valid; the message names the file and the field.
     """
-    return _validated(parse_json(read_file(path, str(path), MAX_JSON), str(path)), path)
+    return _validated(parse_json(read_file(path, str(path), MAX_FILE), str(path)), path)
 
 
 def _validated(plain: Any, path: Path) -> Record:

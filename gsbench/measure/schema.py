@@ -10,13 +10,17 @@ from gsbench.errors import InputError, did_you_mean
 
 T = TypeVar("T")
 LARGEST = 1e100  # squares stay finite, and charts can show the number
+MOST_ENTRIES = 1000  # of a list or an object, unless its field's metadata have another number under MOST
+MOST = "most"
 
 
 def parse(kind: type[T], value: object, file: str) -> T:
     """Parse `value`, the result of json.loads, into an instance of the dataclass `kind`.
 
     Fields may be dataclasses, named tuples, list[X], dict[str, X], X | None, bool, int, float (integers are accepted),
-    str, and Any (plain JSON). A dataclass may have a method `with_present_names`, which renames keys of older files.
+    str, and Any (plain JSON). Lists and objects have at most MOST_ENTRIES entries, or as many as the metadata of their
+    field say (`field(metadata={MOST: 9})`). A dataclass may have a method `with_present_names`, which renames keys of
+    older files.
 
     Raises:
         InputError: `value` does not match; the message is `<file>: <field>: expected ..., got ...`.
@@ -25,8 +29,10 @@ def parse(kind: type[T], value: object, file: str) -> T:
     return parsed
 
 
-def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
+def _parse(kind: Any, value: Any, file: str, field: str, most: int = MOST_ENTRIES) -> Any:
     """Parse `value` as the type `kind`; `field` is its path in the file, such as `cost.render_ms.p50` or `curve[3]`."""
+    if isinstance(value, list | dict) and len(value) > most:
+        raise InputError(f"{file}: {field or 'the file'}: expected at most {most:,} entries, got {len(value):,}")
     if dataclasses.is_dataclass(kind):
         return _parse_fields(kind, value, file, field)
     if hasattr(kind, "_fields"):  # a named tuple, written as a list
@@ -35,7 +41,7 @@ def _parse(kind: Any, value: Any, file: str, field: str) -> Any:
             raise _fault(file, field, f"a list of {', '.join(kind._fields)}", value)
         return kind(*(_parse(k, v, file, f"{field}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True))))
     if isinstance(kind, UnionType):
-        return None if value is None else _parse(get_args(kind)[0], value, file, field)
+        return None if value is None else _parse(get_args(kind)[0], value, file, field, most)
     if get_origin(kind) is list:
         if type(value) is not list:
             raise _fault(file, field, "a list", value)
@@ -69,7 +75,8 @@ def _parse_fields(kind: Any, value: Any, file: str, field: str) -> Any:
     for one in dataclasses.fields(kind):  # a field added later has a default, so older files stay readable
         if one.name not in value and one.default is one.default_factory is dataclasses.MISSING:
             raise InputError(f"{file}: {prefix}{one.name}: expected a value, the key is missing")
-    return kind(**{name: _parse(kinds[name], given, file, prefix + name) for name, given in value.items()})
+    most = {one.name: one.metadata.get(MOST, MOST_ENTRIES) for one in dataclasses.fields(kind)}
+    return kind(**{name: _parse(kinds[name], given, file, prefix + name, most[name]) for name, given in value.items()})
 
 
 def _parse_any(value: Any, file: str, field: str) -> Any:

@@ -56,8 +56,8 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available() -> int | None:
-    """Return the bytes that the system and the control group leave to this process, or None if unknown."""
-    limits = [x for x in (_system(), _control_group()) if x is not None]
+    """Return the bytes that the system, the control group and `ulimit -v` leave to this process, None if unknown."""
+    limits = [x for x in (_system(), _control_group(), _address_space()) if x is not None]
     return min(limits, default=None)
 
 
@@ -67,6 +67,22 @@ def _system() -> int | None:
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _address_space() -> int | None:
+    """Return what the limit of the address space (`ulimit -v`) leaves; None if there is none."""
+    if sys.platform == "win32":  # it has no such limit
+        return None
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return None
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except OSError:
+        return None
+    return max(0, limit - pages * resource.getpagesize())
 
 
 def _control_group() -> int | None:

@@ -93,7 +93,8 @@ def show_exactness(options: argparse.Namespace) -> int:
         import_models(options.model_module)
         subject = subjects.load(options.model, options.out, options.data_root)
         found = frame.measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
-        frame_report.draw(found, subject.picture)
+        if not options.json:
+            frame_report.draw(found, subject.picture)
     except (InputError, OSError) as error:
         print(f"gsbench.stability: error: {one_line(error)}", file=sys.stderr)
         return 2

@@ -95,7 +95,7 @@ def _without(overrides: Sequence[str], differing: tuple[str, ...]) -> tuple[str,
 
 def span(times: Sequence[float], at_once: int) -> float:
     """Return when all runs are done, if `at_once` of them run at a time and the longest begin first."""
-    ends = [0.0] * at_once
+    ends = [0.0] * min(at_once, max(1, len(times)))
     for one in sorted(times, reverse=True):
         heapq.heapreplace(ends, ends[0] + one)
     return max(ends)

@@ -10,11 +10,11 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.schema import parse
+from gsbench.measure.schema import MOST, parse
 from gsbench.reading import MAX_JSON, parse_json, read_file
 from gsbench.run.overrides import deciding
 
@@ -27,7 +27,8 @@ class Plan:
     """The runs that one command requested, and the process that launches them."""
 
     launcher: str  # of Hydra: basic or submitit_slurm
-    runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
+    # the overrides of each run, in the order of the tasks of a job array
+    runs: list[list[str]] = field(metadata={MOST: 100_000})
     hydra: list[str]  # overrides of Hydra's own config
     cwd: str  # the folder of the command; relative paths in overrides start there
     host: str

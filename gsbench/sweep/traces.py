@@ -9,8 +9,8 @@ from typing import Any
 
 from gsbench.errors import InputError, one_line
 from gsbench.measure.record import FILE_NAME as RECORD
-from gsbench.measure.record import PUBLISHED
-from gsbench.reading import MAX_JSON, read_file
+from gsbench.measure.record import MAX_FILE, PUBLISHED
+from gsbench.reading import read_file
 from gsbench.run import progress
 from gsbench.run.progress import Progress
 from gsbench.sweep.plan import Identity, identity
@@ -76,7 +76,7 @@ def _outcome(path: Path) -> tuple[list[str], Outcome]:
     """
     written = path.stat().st_mtime
     try:
-        plain: Any = json.loads(read_file(path, str(path), MAX_JSON))
+        plain: Any = json.loads(read_file(path, str(path), MAX_FILE))
         status, reason, metrics = plain["status"], plain["reason"], plain["metrics"] or {}
         overrides = [str(one) for one in plain.get("overrides", [])]
         return overrides, Outcome(path, str(status), reason and str(reason), metrics.get("psnr"), written)

@@ -3,10 +3,10 @@
 import hashlib
 import io
 import stat
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import torch
 from torch import Tensor
@@ -54,13 +54,41 @@ def save(path: Path, content: Checkpoint) -> None:
 
     def write(file: io.BufferedRandom) -> None:
         file.write(MAGIC + b"0" * DIGEST + b"\n")
-        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, file)
+        kept = _WithFirstError(file)
+        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, cast(IO[bytes], kept))
+        if kept.error is not None:
+            raise kept.error
         file.seek(len(MAGIC) + DIGEST + 1)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(len(MAGIC))
         file.write(digest.encode())
 
     write_atomically(path, write)
+
+
+class _WithFirstError:
+    """A file that keeps the first error of its disk: torch would hide it behind an error of its own."""
+
+    def __init__(self, file: io.BufferedRandom) -> None:
+        """Write to an open file."""
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: bytes) -> int:
+        """Write bytes, or nothing after the first error, and return their number."""
+        self._attempt(lambda: self._file.write(data))
+        return len(data)
+
+    def flush(self) -> None:
+        """Flush the file, unless there was an error."""
+        self._attempt(self._file.flush)
+
+    def _attempt(self, action: Callable[[], object]) -> None:
+        try:
+            if self.error is None:
+                action()
+        except OSError as error:
+            self.error = error
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
@@ -149,6 +177,8 @@ def check_plain(value: object, most: int) -> None:
         kind = "a sparse one" if value.layout != torch.strided else f"one on '{value.device.type}'"
         if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
             raise InputError(f"checkpoint: expected dense tensors, got {kind}")
+        if value.requires_grad:
+            raise InputError("checkpoint: expected tensors of values, got one that requires a gradient")
         if value.numel() * value.element_size() > most:
             raise InputError(f"checkpoint: expected tensors of at most {most} bytes, as many as the file has, "
                              f"got one of shape {list(value.shape)!s:.80}")  # fmt: skip
