@@ -27,7 +27,7 @@ class DataConfig:
     background: str = "black"  # or white: background of images
     initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
     initial_points: int = 100_000  # random points, if the data have none
-    initial_half_width: float | None = 1.3  # random points fill [-w, w]^3; None: the cameras' common frustum
+    initial_half_width: float | None = 1.3  # of the cube of random points; None: the cameras' common frustum
 
 
 @dataclass
