@@ -36,7 +36,7 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["train.ssim_weight=2"], 1, "train.ssim_weight: expected 0 to 1"),
         (["scene.downscale=16"], 1, "scene.downscale=16: expected images of at least 11 pixels"),
         (["train.coarse=[[2,3000]]"], 1, "train.coarse, after the factor 2: expected images of at least 11 pixels"),
-        (["-m", "seed=0,1", "+launch=parallel", "launch.at_once=0"], 2, "n_jobs == 0"),
+        (["-m", "seed=0,1", "+launch=parallel", "launch.at_once=0"], 2, "launch.at_once: expected at least 1"),
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(

@@ -49,6 +49,8 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
         assert abs(view["psnr_change"]) <= view["psnr_bound"] < 0.01
     assert 0 < len(found["worst"]) <= frame.WORST
     assert "decimal of the mean PSNR" in found["verdict"]
+    assert not (run / "exactness.png").exists()  # --json prints, and writes no file
+    assert main([str(run)]) == 0
     assert (run / "exactness.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -298,7 +298,7 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path) -> None:
     path.write_text(json.dumps(crowd.record("3dgs", "trex", 1), default=str))
     assert len(status.status(status.read(tmp_path))) == 2
     assert see_through(lambda: None, [later]) == ([], False)
-    (broken,) = see_through(lambda: None, [tmp_path / plan.FOLDER / FIRST])
+    (broken,), _ = see_through(lambda: None, [tmp_path / plan.FOLDER / FIRST])
     assert broken.reason == "seed: expected >= 0, got -1"
 
 
