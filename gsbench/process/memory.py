@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from gsbench.errors import TooLargeError
+from gsbench.process import control_group
 
 # Messages of the library loader, torch, C++, system threads and OpenCV if memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
@@ -57,7 +58,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def available() -> int | None:
     """Return the bytes that the system, the control group and `ulimit -v` leave to this process, None if unknown."""
-    limits = [x for x in (_system(), _control_group(), _address_space()) if x is not None]
+    limits = [x for x in (_system(), control_group.available(), _address_space()) if x is not None]
     return min(limits, default=None)
 
 
@@ -83,14 +84,3 @@ def _address_space() -> int | None:
     except OSError:
         return None
     return max(0, limit - pages * resource.getpagesize())
-
-
-def _control_group() -> int | None:
-    folder = Path("/sys/fs/cgroup")
-    try:
-        left = int((folder / "memory.max").read_text()) - int((folder / "memory.current").read_text())
-        lines = (folder / "memory.stat").read_text().splitlines()
-    except (OSError, ValueError):  # no control group, or no limit ("max")
-        return None
-    # memory.current includes cached files, which the system can drop at any time.
-    return left + next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)

@@ -5,7 +5,8 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +33,22 @@ SAVE_S = 2.0  # seconds between two files that are sent
 QUALITY = {True: 75, False: 95}  # JPEG quality while something moves (True) and at rest (False)
 
 
+class Workers(NamedTuple):
+    """Hold the two threads that render for all browsers, each in turn.
+
+    The C library keeps the memory that a thread has freed for that thread, so that a thread a browser would hold the
+    memory of many frames for good.
+    """
+
+    frames: ThreadPoolExecutor
+    bounds: ThreadPoolExecutor  # on the error of float32, which take so long that frames must not wait for them
+
+    def stop(self) -> None:
+        """End both threads after what they are doing; what waits for them is cancelled."""
+        for pool in self:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
 class Client:
     """One browser of the viewer. Each browser has its own controls; all browsers share the models."""
 
@@ -42,8 +59,9 @@ class Client:
         scene: Scene | str,
         most_cost: float,
         start: viser.InitialCameraConfig,
+        workers: Workers,
     ) -> None:
-        """Show the controls in the browser and start the thread that renders.
+        """Show the controls in the browser and start the thread that requests frames for it.
 
         Args:
             client: viser's handle of the browser.
@@ -51,13 +69,14 @@ class Client:
             scene: the scene with its training views, or a text that says why there are none.
             most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
             start: the camera to which the browser may return.
+            workers: the threads that render for all browsers.
         """
         self.client = client
         self.controls = Controls(client, renderers, scene, start)
         self.controls.save.on_click(self._save)
         self._scene = renderers[0].run.scene
         self._saving = threading.Lock()
-        self._bounder = ThreadPoolExecutor(1)  # computes the bound on the error of float32
+        self._workers = workers
         self._bounding: Future[tuple[Frame | None, dict[str, Rounding | str]]] | None = None  # if something rests
         self.changed = self.controls.changed
         self.left = False
@@ -100,19 +119,21 @@ class Client:
                     self._bounding = None
             self.changed.clear()
             if self.left:  # tested after `clear`, so that a later call of `leave` ends the next wait
-                self._bounder.shutdown(wait=False)
                 return
             self.controls.advance()
             try:
                 if self._bounding is not None:
                     self._end_rounding()
                 else:
-                    self._show(moving)
+                    self._workers.frames.submit(self._show, moving).result()
                     if not moving:
                         self._start_rounding()
-                        self._compare()
+                        self._workers.frames.submit(self._compare).result()
             except InputError as error:
                 self.controls.costs.content = html.escape(str(error))
+            except (CancelledError, RuntimeError):
+                if not self.left:  # otherwise the viewer has stopped, and its workers take nothing
+                    raise
             self.rests = not moving and self._bounding is None
 
     def _show(self, moving: bool) -> None:
@@ -132,7 +153,7 @@ class Client:
         Another thread computes it, so that the browser is served if the user goes on.
         """
         if any(colours == FLOAT32 for _, colours in self.controls.shown()):
-            self._bounding = self._bounder.submit(self._bounded)
+            self._bounding = self._workers.bounds.submit(self._bounded)
 
     def _bounded(self) -> tuple[Frame | None, dict[str, Rounding | str]]:
         """Render a frame with the bound on the error of float32, None if no shown model has one; and what to say."""
@@ -201,18 +222,22 @@ class Client:
         if not self._saving.acquire(blocking=False):
             return
         try:
-            frame = None
-            if any(colours == FLOAT32 for _, colours in self.controls.shown()):
-                frame, _ = self._bounded()
-            frame = frame or self._combined(*self._size(self.resolution, False), self._rendered)
+            bounded = any(colours == FLOAT32 for _, colours in self.controls.shown())
+            pool = self._workers.bounds if bounded else self._workers.frames
+            image = pool.submit(self._saved, bounded).result()
             names = dict.fromkeys(renderer.name for renderer, _ in self.controls.shown())
             name = " ".join([self._scene.name, *names])
-            self.client.send_file_download(f"{name}.png", png(frame.image), save_immediately=True)
+            self.client.send_file_download(f"{name}.png", image, save_immediately=True)
             time.sleep(SAVE_S)
         except InputError as error:
             self.controls.costs.content = html.escape(str(error))
         finally:
             self._saving.release()
+
+    def _saved(self, bounded: bool) -> bytes:
+        """Return what the browser shows, with all pixels, as a PNG file; `bounded`: with the bounds of float32."""
+        frame = self._bounded()[0] if bounded else None
+        return png((frame or self._combined(*self._size(self.resolution, False), self._rendered)).image)
 
     def _camera(self, width: int, height: int) -> Camera:
         """Return the browser's camera for an image of the given size; the browser's field of view is vertical.

@@ -14,7 +14,7 @@ from gsbench.models import cameras
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Scene
 from gsbench.view import paths
-from gsbench.view.client import Client
+from gsbench.view.client import Client, Workers
 from gsbench.view.door import Door
 from gsbench.view.frame import FrameRenderer
 from gsbench.view.labels import short_names
@@ -47,6 +47,7 @@ class Viewer:
         self.scene = scene_or_reason(first, data_root)
         self.clients: dict[int, Client] = {}
         self._porter = ThreadPoolExecutor(1)  # connects and disconnects browsers in turn; viser would use 32 threads
+        self._workers = Workers(ThreadPoolExecutor(1), ThreadPoolExecutor(1))
         with door.guard():
             self.server = viser.ViserServer(host, door.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -56,11 +57,12 @@ class Viewer:
         self.server.on_client_connect(self._in_turn(self._welcome))
 
     def stop(self) -> None:
-        """Stop the web server and the threads that render for the browsers."""
+        """Stop the web server, and the threads that render for the browsers."""
         for client in list(self.clients.values()):
             client.leave()
         self.server.stop()
         self._porter.shutdown(wait=False)
+        self._workers.stop()
 
     def _stand(self, run: LoadedRun) -> None:
         """Place the first camera of every browser at the start of an orbit around the model."""
@@ -85,8 +87,9 @@ class Viewer:
         return waits
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        start = self.server.initial_camera
-        self.clients[client.client_id] = Client(client, self.renderers, self.scene, self._most_cost, start)
+        self.clients[client.client_id] = Client(
+            client, self.renderers, self.scene, self._most_cost, self.server.initial_camera, self._workers
+        )
 
     def _forget(self, client: viser.ClientHandle) -> None:
         gone = self.clients.pop(client.client_id, None)

@@ -9,10 +9,12 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import viser
 from viser import _messages
@@ -23,7 +25,8 @@ from websockets.sync.client import ClientConnection, connect
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
 from gsbench.view import __main__, door
-from gsbench.view.client import Client
+from gsbench.view import client as of_client
+from gsbench.view.client import Client, Workers
 from gsbench.view.controls import _checked
 from gsbench.view.door import Door, is_known
 from gsbench.view.viewer import Viewer
@@ -247,6 +250,41 @@ def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -
         joined(viewer)
 
 
+def test_browsers_that_do_not_read_hold_a_frame_each(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches memory that grows with the browsers: frames that wait, and a thread that renders for each of them."""
+    until(lambda: not viewer.clients)
+    threads, noise = [], np.random.default_rng(0).integers(0, 255, (600, 900, 3), np.uint8)
+
+    def labelled(*_: object) -> np.ndarray:
+        threads.append(threading.get_ident())
+        return noise
+
+    monkeypatch.setattr(of_client, "labelled", labelled)
+    with ExitStack() as stack:
+        browsers = []
+        for _ in range(8):
+            quiet = socket.create_connection(("localhost", viewer.server.get_port()))
+            quiet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            browsers.append(stack.enter_context(joined(viewer, sock=quiet, max_queue=1, close_timeout=0)))
+        for i in range(15):
+            rendered = len(threads) + len(browsers)
+            for browser in browsers:
+                browser.send(packed(CAMERA, position=[0, 0, -4 - 0.1 * i]))
+            until(lambda rendered=rendered: len(threads) >= rendered)
+        until(lambda: rests(viewer))
+        gc.collect()
+        images = [one.rgb_data for one in gc.get_objects() if type(one) is _messages.BackgroundImageMessage]
+        waiting = [len(image) for image in images if image is not None]
+        sent = [one.transport.get_write_buffer_size() for one in gc.get_objects() if type(one) is door.Connection]
+        frame = max(waiting)
+        assert frame > 100_000
+        assert len(waiting) <= 2 * 8  # one that waits and one on its way to the socket
+        assert sum(sent) < 8 * 2 * frame
+        assert len(set(threads)) == 1
+        for browser in browsers:
+            browser.socket.shutdown(socket.SHUT_RDWR)
+
+
 def test_aborted_connections_leave_no_thread(viewer: Viewer) -> None:
     """Catches a thread that renders for a browser that was cut off."""
     with joined(viewer) as browser:
@@ -283,7 +321,7 @@ def test_a_browser_that_leaves_as_a_frame_begins_ends_its_thread() -> None:
             super().clear()
 
     client.controls, client.changed, client.left, client.rests = Controls(), LeavesThen(), False, False  # type: ignore[assignment]
-    client._bounder, client._bounding = ThreadPoolExecutor(1), None
+    client._workers, client._bounding = Workers(ThreadPoolExecutor(1), ThreadPoolExecutor(1)), None
     client._show, client._compare = lambda _: None, lambda: None  # type: ignore[method-assign]
     thread = threading.Thread(target=client._work, daemon=True)
     thread.start()
