@@ -118,11 +118,12 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
     if options.video and any(side is not None and side % 2 for side in (options.width, options.height)):
         raise InputError(f"--width, --height: expected even numbers for --video, as VP9 encodes no others, got "
                          f"{options.width}, {options.height}")  # fmt: skip
-    for path in (path for path in (options.ply, options.video, options.images) if path):
-        film.check_parent(path)
-    if options.ply and options.ply.suffix.lower() != ".ply":
-        raise InputError(f"--ply: expected a file name that ends in .ply, got {options.ply}: write a PLY, which other "
-                         f"tools convert", docs="viewing.md#export")  # fmt: skip
+    if options.ply:
+        film.check_file("--ply", options.ply, ".ply")
+    if options.video:
+        film.check_file("--video", options.video, *film.SUFFIXES)
+    if options.images:
+        film.check_parent(options.images)
     if options.plys:
         check_sequence(options)
     check_device(options.device)

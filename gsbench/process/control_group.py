@@ -49,8 +49,8 @@ def _folders(root: Path) -> Iterator[tuple[str, Path]]:
         if kind not in groups or len(fields) < 5 or (kind == "cgroup" and "memory" not in re.split("[ ,]", options)):
             continue
         top = root / fields[4].lstrip("/")
-        path = PurePosixPath(groups[kind])
-        inside = path.relative_to(fields[3]) if path.is_relative_to(fields[3]) else PurePosixPath()
+        group = PurePosixPath(groups[kind])
+        inside = group.relative_to(fields[3]) if group.is_relative_to(fields[3]) else PurePosixPath()
         if ".." in inside.parts:  # the group of this process is above what this container can see
             inside = PurePosixPath()
         for folder in (inside, *inside.parents):

@@ -50,11 +50,11 @@ def serve(options: argparse.Namespace) -> None:
     from gsbench.models.registry import import_models
     from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
-    from gsbench.view.film import check_parent
+    from gsbench.view.film import check_file
     from gsbench.view.side_by_side import write_page
 
     if options.page is not None:
-        check_parent(options.page)
+        check_file("--page", options.page, ".html", ".htm")
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # viser's, when a browser leaves
     check_device(options.device)
     import_models(options.model_module)

@@ -15,6 +15,7 @@ from gsbench.models.render import render
 from gsbench.run.load import LoadedRun
 from gsbench.view.paths import Shot, resized
 
+SUFFIXES = ".mp4", ".webm", ".mkv", ".avi"  # of the files into which OpenCV's wheel writes CODEC
 CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
 
 
@@ -66,6 +67,14 @@ def write_images(images: Iterable[Pixels], folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     for i, image in enumerate(images):
         write_png(image, folder / f"{i:04d}.png")
+
+
+def check_file(option: str, path: Path, *suffixes: str) -> None:
+    """Raise InputError unless the file of an option ends in one of the suffixes and can be written into its folder."""
+    check_parent(path)
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{option}: expected a file name that ends in {' or '.join(suffixes)}, got {str(path)!a:.200}",
+                         docs="viewing.md#export")  # fmt: skip
 
 
 def check_parent(path: Path) -> None:

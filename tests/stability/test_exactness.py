@@ -49,8 +49,16 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
         assert abs(view["psnr_change"]) <= view["psnr_bound"] < 0.01
     assert 0 < len(found["worst"]) <= frame.WORST
     assert "decimal of the mean PSNR" in found["verdict"]
-    assert not (run / "exactness.png").exists()  # --json prints, and writes no file
+
+
+def test_json_writes_no_picture(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a picture that --json writes into the run's folder, which may be read-only, and one that is missing."""
+    (run / "exactness.png").unlink(missing_ok=True)
+    content = set(run.iterdir())
+    assert main([str(run), "--json"]) == 0
+    assert set(run.iterdir()) == content
     assert main([str(run)]) == 0
+    assert f"Written: {run / 'exactness.png'}" in capsys.readouterr().out
     assert (run / "exactness.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -9,8 +9,12 @@ import pytest
 
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.run.load import load_run
+from gsbench.measure.exact_views import MOST_PSNR
+from gsbench.run.checks import evaluated_views
+from gsbench.run.load import load_run, scene_of
+from gsbench.view import side_by_side
 from gsbench.view.__main__ import main
+from gsbench.view.frame import FrameRenderer, FrameRequest
 from gsbench.view.side_by_side import write_page
 
 
@@ -40,6 +44,21 @@ def test_names_are_escaped(folder: Path, other_folder: Path, tmp_path: Path) -> 
     assert html.escape(bad) in (tmp_path / "a.html").read_text()
 
 
+def test_a_view_rendered_exactly_leaves_the_mean_finite(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches one empty view by which the mean of all is infinite."""
+    run = load_run(folder)
+    views = evaluated_views(scene_of(run), run.config.scene.eval_split)
+    renderer = FrameRenderer(run, "7dgs", 1.0)
+    exact = replace(views[0], pixels=renderer.image(views[0].camera, FrameRequest(views[0].time)))
+    monkeypatch.setattr(side_by_side, "evaluated_views", lambda *_: [exact, *views[1:]])
+    write_page([run, run], tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text()
+    assert f"{MOST_PSNR:.2f} dB" in text
+    assert not re.search(r"\b(inf|nan)\b", text)
+
+
 def test_what_cannot_be_compared_is_refused(folder: Path, other_folder: Path, tmp_path: Path) -> None:
     """Catches images of two scenes beside each other, and a third run that is left out without a word."""
     run, other = load_run(folder), load_run(other_folder)
@@ -48,5 +67,6 @@ def test_what_cannot_be_compared_is_refused(folder: Path, other_folder: Path, tm
     elsewhere = replace(other, scene=replace(other.scene, fingerprint="0"))
     with pytest.raises(InputError, match="runs of one scene"):
         write_page([run, elsewhere], tmp_path / "a.html")
-    assert main([str(folder), str(other_folder), "--page", str(tmp_path / "nowhere" / "a.html")]) == 2
+    for name in ("nowhere/a.html", "a.png", "a"):
+        assert main([str(folder), str(other_folder), "--page", str(tmp_path / name)]) == 2
     assert [*tmp_path.iterdir()] == []

@@ -1,5 +1,6 @@
 """The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
 
+import errno
 import json
 import math
 import shutil
@@ -11,6 +12,7 @@ import cv2
 import pytest
 import torch
 
+from gsbench.errors import TooLargeError
 from gsbench.export import direction, main
 from gsbench.measure.images import to_bytes
 from gsbench.models import GaussianModel, Gaussians3D, Query, build, cameras
@@ -207,7 +209,9 @@ def test_the_middle_is_a_median_by_opacity() -> None:
         (("--ply", "a.ply", "--camera", "\x1b[31m"), r"\x1b[31m"),
         (("--ply", "a\0.ply", "--camera", "0"), "a file"),
         (("--ply", ".", "--camera", "0"), "a file"),
-        (("--ply", "a.spz", "--camera", "0"), "ends in .ply, got a.spz"),
+        (("--ply", "a.spz", "--camera", "0"), "ends in .ply, got 'a.spz'"),
+        (("--video", "a.ts"), "--video: expected a file name that ends in .mp4"),
+        (("--video", "a.png"), "--video: expected a file name that ends in .mp4"),
         (("--images", "a\0"), "a file"),
         (("--video", "a\0.mp4"), "a file"),
         (("--ply", "a.ply", "--direction", "," * 5000), "--direction"),
@@ -242,6 +246,43 @@ def test_what_is_asked_wrong_is_told_in_one_line(
     assert line.isprintable()
     assert len(line) < 400
     assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), RuntimeError("[enforce fail at alloc_cpu.cpp:118] DefaultCPUAllocator: can't allocate memory"),
+     OSError(errno.ENOMEM, "Cannot allocate memory"), TooLargeError("frames need 9.0 GiB of memory")],
+)  # fmt: skip
+@pytest.mark.parametrize("option", ["--ply", "--video", "--images"])
+def test_memory_that_runs_out_ends_in_one_line(
+    error: Exception, option: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a traceback for an allocation that fails while the export is at work, and a file that it leaves."""
+
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("gsbench.view.film.render", fails)
+    monkeypatch.setattr("gsbench.export.ply_of", fails)
+    name = {"--ply": "a.ply", "--video": "a.mp4", "--images": "a"}[option]
+    assert main([str(folder), option, str(tmp_path / name), "--camera", "0", *SHORT]) == 2
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
+    assert line.startswith("gsbench.export: out of memory: ")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_an_error_of_another_kind_is_no_lack_of_memory(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a mistake in gsbench that is said to be a lack of memory."""
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("expected a tensor of another shape")
+
+    monkeypatch.setattr("gsbench.export.ply_of", fails)
+    with pytest.raises(RuntimeError, match="another shape"):
+        main([str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "0"])
 
 
 def test_a_direction_has_no_length() -> None:
