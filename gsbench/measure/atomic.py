@@ -6,6 +6,7 @@ import re
 import secrets
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from io import BufferedRandom
 from pathlib import Path
 
@@ -30,9 +31,9 @@ def write_atomically(path: Path, data: bytes | Callable[[BufferedRandom], object
                 os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
         if isinstance(error, OSError):
-            _name(error, path)
+            name_file(error, path)
         raise
     if not lasting:
         return
@@ -62,13 +63,19 @@ def create_atomically(path: Path, data: bytes) -> bool:
             return _create_here(path, data)
         return True
     except OSError as error:
-        _name(error, path)
+        name_file(error, path)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
 
 
-def _name(error: OSError, path: Path) -> None:
+def _remove(temporary: Path) -> None:
+    """Remove a temporary file; a disk that refuses this, such as a read-only one, must not hide why writing failed."""
+    with suppress(OSError):
+        temporary.unlink()
+
+
+def name_file(error: OSError, path: Path) -> None:
     """Name a file in an error: that of a full disk has no name, and a user does not know the temporary file."""
     if error.errno:
         error.filename = str(path)

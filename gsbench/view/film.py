@@ -3,6 +3,7 @@
 import os
 import secrets
 from collections.abc import Generator, Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -10,12 +11,14 @@ import torch
 from tqdm import tqdm
 
 from gsbench.errors import InputError
+from gsbench.measure.atomic import name_file
 from gsbench.measure.images import Pixels, to_bytes, write_png
 from gsbench.models.render import render
 from gsbench.run.load import LoadedRun
 from gsbench.view.paths import Shot, resized
 
 SUFFIXES = ".mp4", ".webm", ".mkv", ".avi"  # of the files into which OpenCV's wheel writes CODEC
+FIRST_BYTES = 4096  # that a video needs at least
 CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
 
 
@@ -36,13 +39,17 @@ def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
     """Write images of one size as a video; if this fails, an existing file at `path` is unchanged.
 
+    OpenCV does not tell that a disk is full, so that the frames of the file are counted at the end.
+
     Raises:
-        InputError: the folder does not exist, or OpenCV cannot write this kind of file.
+        InputError: the folder does not exist, OpenCV cannot write this kind of file, or not all frames are in it.
+        OSError: the disk is read-only or full.
     """
     check_parent(path)
     part = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
-    writer, size = None, (0, 0)
+    writer, size, count = None, (0, 0), 0
     try:
+        part.write_bytes(bytes(FIRST_BYTES))  # unlike OpenCV, it tells why the disk takes no file
         for image in images:
             if writer is None:
                 size = image.shape[1], image.shape[0]
@@ -50,11 +57,29 @@ def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
                 if not writer.isOpened():
                     raise InputError(f"{path}: expected a file that OpenCV can encode, such as out.mp4")
             writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+            count += 1
         if writer is not None:
             writer.release()
+            if (written := _frame_count(part)) != count:
+                raise InputError(
+                    f"{path}: expected a video of {count} frames, {written} can be read: is the disk full?"
+                )
             os.replace(part, path)
+    except OSError as error:
+        name_file(error, path)
+        raise
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # of a read-only disk
+            part.unlink()
+
+
+def _frame_count(path: Path) -> int:
+    """Return how many frames of a video can be read."""
+    video, count = cv2.VideoCapture(str(path)), 0
+    while video.grab():
+        count += 1
+    video.release()
+    return count
 
 
 def write_images(images: Iterable[Pixels], folder: Path) -> None:

@@ -47,6 +47,23 @@ def test_a_disk_that_is_full_while_a_checkpoint_is_written_is_named(
     assert os.listdir(tmp_path) == ["checkpoint.pt"]
 
 
+@pytest.mark.parametrize("write", [atomic.write_atomically, atomic.create_atomically])
+def test_a_read_only_disk_is_named_by_the_user_s_file(
+    write: Callable[[Path, bytes], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches the removal of the temporary file, which fails there too, and whose error named that file."""
+
+    def refused(self: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    with monkeypatch.context() as patched:
+        for name in ("open", "unlink"):
+            patched.setattr(Path, name, refused)
+        with pytest.raises(OSError, match="Read-only") as caught:
+            write(tmp_path / "a.ply", b"x")
+    assert caught.value.filename == str(tmp_path / "a.ply")
+
+
 class Limited:
     """A file on a disk that has room for so many bytes."""
 

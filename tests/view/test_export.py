@@ -3,6 +3,7 @@
 import errno
 import json
 import math
+import os
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -246,6 +247,36 @@ def test_what_is_asked_wrong_is_told_in_one_line(
     assert line.isprintable()
     assert len(line) < 400
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_disk_that_refuses_a_video_is_told(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a video that lacks frames, as OpenCV does not tell that a disk is full, in the place of a whole one, and
+    an error that names a temporary file."""
+    video = tmp_path / "a.mp4"
+    words = [str(folder), "--video", str(video), *SHORT]
+
+    class Full(cv2.VideoWriter):
+        def write(self, *_: object) -> None:
+            pass
+
+    def refused(self: Path, *_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    assert main(words) == 0
+    whole = video.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(cv2, "VideoWriter", Full)
+        assert main(words) == 2
+    assert f"{video}: expected a video of 4 frames, 0 can be read" in capfd.readouterr().err
+    assert [*tmp_path.iterdir()] == [video]
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", refused)
+        patched.setattr(Path, "unlink", refused)
+        assert main(words) == 2
+    assert f"gsbench.export: {video}: Read-only file system" in capfd.readouterr().err
+    assert video.read_bytes() == whole
 
 
 @pytest.mark.parametrize(
