@@ -8,6 +8,7 @@ import shlex
 import sys
 import warnings
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
 from hydra.errors import HydraException
@@ -17,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench import usage
 from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line, printable
+from gsbench.process.ending import end_with
 from gsbench.run.stop import Stopped, listen
 from gsbench.sweep.axes import check_complete, check_words, expand
 from gsbench.sweep.callbacks import started
@@ -51,11 +53,20 @@ def entry(composed: DictConfig) -> Problem | None:
     return problem
 
 
-def main() -> None:
-    """Run the commands `python -m gsbench` and `gsbench`; print an error as one line instead of a stack trace."""
+def main() -> NoReturn:
+    """Run the commands `python -m gsbench` and `gsbench`, and end the process."""
+    end_with("gsbench", run_command)
+
+
+def run_command() -> None:
+    """Run what the command line says; print an error as one line instead of a stack trace.
+
+    Raises:
+        SystemExit: with the exit status, if it is not 0.
+    """
     register_schema()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors; they are printed in one line below
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed before the process began
         stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
     listen()
     warnings.formatwarning = _in_one_line

@@ -13,6 +13,7 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
 from gsbench.models.registry import import_models
+from gsbench.process.ending import end_with
 from gsbench.process.memory import is_out_of_memory, require
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
@@ -296,4 +297,4 @@ def find_view(scene: Scene, name: str) -> View:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.export", main)

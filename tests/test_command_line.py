@@ -279,6 +279,7 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path
         assert one.reason.startswith("step 1: ")
         assert one.metrics is None
     assert done.stderr.count("gsbench: error: square: diverged: step 1: ") == 2
+    assert "Error executing" not in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError, TooLargeError])

@@ -77,7 +77,7 @@ def main_here(*arguments: str) -> int:
     entry.started.clear()
     sys.argv = ["gsbench", *arguments]
     try:
-        entry.main()
+        entry.run_command()
     except SystemExit as end:
         return int(end.code or 0)
     finally:

@@ -17,6 +17,7 @@ from gsbench.effects import messages
 from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
 from gsbench.models.registry import import_models
+from gsbench.process.ending import end_with
 
 Answer = tuple[dict[str, Any], list[str]]  # the result of a command for JSON, and as lines
 
@@ -91,4 +92,4 @@ def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, 
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.effects", main)

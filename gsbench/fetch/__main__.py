@@ -7,6 +7,7 @@ from pathlib import Path
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line, printable
 from gsbench.fetch.sources import Source, find, sources
+from gsbench.process.ending import end_with
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -107,4 +108,4 @@ def scenes(found: dict[Path, list[str]]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.fetch", main)

@@ -9,6 +9,7 @@ from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
+from gsbench.process.ending import end_with
 from gsbench.report import against_lines, against_table, layout, live, paper_tables, select, tables
 from gsbench.report.against import DIFFERS, Comparison, compare
 from gsbench.report.latex import latex
@@ -140,4 +141,4 @@ def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.report", main)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from gsbench.errors import InputError, one_line
 from gsbench.extras import how_to_install
+from gsbench.process.ending import end_with
 
 EXTRA = ("matplotlib", "mpmath")  # the packages of the extra stability
 
@@ -109,4 +110,4 @@ def show_exactness(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.stability", main)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
+from gsbench.process.ending import end_with
 from gsbench.run import stop
 from gsbench.sweep import estimate
 from gsbench.sweep.plan import identity
@@ -172,4 +173,4 @@ def _retry(folder: Path, launch: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.sweep", main)

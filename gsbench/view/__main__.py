@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsbench.errors import InputError, one_line
 from gsbench.extras import how_to_install
+from gsbench.process.ending import end_with
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -80,4 +81,4 @@ def serve(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_with("gsbench.view", main)

@@ -1,0 +1,59 @@
+"""How a command ends whose output cannot be written: one line and an exit status, no stack trace."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_run import ROOT
+
+FULL = Path("/dev/full")
+PRINTS = "from gsbench.process.ending import end_with; end_with('gsbench.x', lambda: print('text') or {status})"
+
+
+def ended(code: list[str], **options: object) -> subprocess.CompletedProcess[str]:
+    """Run Python code in a process of its own, as it ends."""
+    return subprocess.run([sys.executable, *code], stderr=subprocess.PIPE, text=True, cwd=ROOT, **options)  # type: ignore[call-overload,no-any-return]
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("unbuffered", [[], ["-u"]])
+def test_a_full_disk_that_takes_no_output_is_told_in_one_line(unbuffered: list[str]) -> None:
+    """Catches a stack trace, or Python's own status 120 after two lines, where stdout goes to a full disk."""
+    with FULL.open("w") as full:
+        done = ended([*unbuffered, "-c", PRINTS.format(status=0)], stdout=full)
+    assert done.stderr == "gsbench.x: standard output: No space left on device\n"
+    assert done.returncode == 2
+
+
+def test_a_reader_that_has_gone_is_not_told() -> None:
+    """Catches a stack trace of `python -m gsbench.report ... | head`."""
+    code = [sys.executable, "-c", f"input(); {PRINTS.format(status=0)}"]
+    with subprocess.Popen(code, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as one:
+        assert one.stdin
+        assert one.stdout
+        assert one.stderr
+        one.stdout.close()
+        one.stdin.write(b"\n")
+        one.stdin.flush()
+        assert one.stderr.read() == b""
+    assert one.returncode == 0
+
+
+def test_the_status_is_that_of_the_command() -> None:
+    """Catches a failed command that ends as a success."""
+    assert ended(["-c", PRINTS.format(status=3)], stdout=subprocess.DEVNULL).returncode == 3
+    assert ended(["-c", PRINTS.format(status="exit(1)")], stdout=subprocess.DEVNULL).returncode == 1
+    other = "raise FileNotFoundError(2, 'gone', 'x')"
+    done = ended(["-c", f"from gsbench.process.ending import end_with\ndef main():\n    {other}\nend_with('x', main)"])
+    assert "FileNotFoundError" in done.stderr
+
+
+def test_all_commands_end_so() -> None:
+    """Catches a new command that ends in a stack trace if its output cannot be written."""
+    begin = 'if __name__ == "__main__":\n'
+    ends = {path.relative_to(ROOT): path.read_text().partition(begin)[2] for path in (ROOT / "gsbench").rglob("*.py")}
+    del ends[Path("gsbench/scenes/generate.py")]  # imports nothing of gsbench
+    assert len([end for end in ends.values() if end]) >= 8
+    for path, end in ends.items():
+        assert not end or "end_with(" in end or path == Path("gsbench/__main__.py"), path
