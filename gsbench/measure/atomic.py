@@ -10,6 +10,8 @@ from contextlib import suppress
 from io import BufferedRandom
 from pathlib import Path
 
+from gsbench.errors import InputError
+
 WITHOUT_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  # errors if hard links are not supported
 HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
 
@@ -20,8 +22,14 @@ def write_atomically(path: Path, data: bytes | Callable[[BufferedRandom], object
     `data` may be a function that writes (and may read) the file that it gets, for content too large to be in memory. If
     the folder does not exist, it is created. Readers of `path` see either the old file or the new file. If `lasting`
     is true, the file is flushed to the disk before it is renamed, so that it survives a power cut.
+
+    Raises:
+        InputError: `path` is a device, such as /dev/full.
+        OSError: the disk takes no file; the error names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: expected the name of a file, got that of a device, which a file would replace")
     temporary = _beside(path)
     try:
         with temporary.open("x+b") as file:

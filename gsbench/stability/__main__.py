@@ -48,6 +48,12 @@ def main(arguments: list[str] | None = None) -> int:
         return show_spectrum(options.checkpoint, options.out)
     if options.model:
         return show_exactness(options)
+    if not options.short:
+        try:
+            options.out.mkdir(parents=True, exist_ok=True)  # before the minutes of the audit
+        except OSError as error:
+            print(f"gsbench.stability: error: --out: {one_line(error)}", file=sys.stderr)
+            return 2
     from gsbench.stability import audit, page  # imports torch
 
     found = audit.run(long=options.long, short=options.short)
@@ -72,13 +78,14 @@ def show_spectrum(checkpoint: Path, folder: Path) -> int:
 
     try:
         found, failures = spectrum.measure(checkpoint), spectrum.failures(checkpoint)
-    except InputError as error:
-        print(f"gsbench.stability: error: {error}", file=sys.stderr)
+        picture = spectrum.draw(found, folder, "/".join(checkpoint.parts[-4:-1]))
+    except (InputError, OSError) as error:
+        print(f"gsbench.stability: error: {one_line(error)}", file=sys.stderr)
         return 2
     print(spectrum.report(found))
     for scheme, (share, worst) in failures.items():
         print(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error {worst:.1e}")
-    print(f"Written: {spectrum.draw(found, folder, '/'.join(checkpoint.parts[-4:-1]))}")
+    print(f"Written: {picture}")
     return 0
 
 

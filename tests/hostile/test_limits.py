@@ -64,6 +64,15 @@ def test_a_read_only_disk_is_named_by_the_user_s_file(
     assert caught.value.filename == str(tmp_path / "a.ply")
 
 
+def test_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    """Catches --json /dev/full, which put a file in the place of the machine's device."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe: expected the name of a file, got that of a device"):
+        atomic.write_atomically(tmp_path / "pipe", b"x")
+    assert (tmp_path / "pipe").is_fifo()
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
 class Limited:
     """A file on a disk that has room for so many bytes."""
 

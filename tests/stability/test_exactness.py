@@ -13,7 +13,7 @@ from gsbench.models.cameras import around
 from gsbench.run.load import load_run
 from gsbench.scenes import Points
 from gsbench.scenes.trained import TrainedGaussians, ply_of
-from gsbench.stability import frame, frame_report
+from gsbench.stability import frame, frame_report, spectrum
 from gsbench.stability.__main__ import main
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
@@ -49,6 +49,20 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
         assert abs(view["psnr_change"]) <= view["psnr_bound"] < 0.01
     assert 0 < len(found["worst"]) <= frame.WORST
     assert "decimal of the mean PSNR" in found["verdict"]
+
+
+@pytest.mark.parametrize("words", [(), ("--checkpoint", "checkpoint.pt")])
+def test_a_folder_that_takes_no_file_is_told(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a stack trace after the audit, or after the condition numbers, as --out is a file."""
+    monkeypatch.setattr(spectrum, "measure", lambda _: None)
+    monkeypatch.setattr(spectrum, "failures", lambda _: {})
+    monkeypatch.setattr(spectrum, "draw", lambda _, folder, __: folder.mkdir())
+    (tmp_path / "out").write_bytes(b"")
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path / 'out'}: File exists" in line
 
 
 def test_json_writes_no_picture(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
