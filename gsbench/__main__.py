@@ -67,7 +67,7 @@ def run_command() -> None:
     register_schema()
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors; they are printed in one line below
     for stream in filter(None, (sys.stdout, sys.stderr)):  # None: it was closed before the process began
-        stream.reconfigure(errors="replace")  # type: ignore[union-attr]  # a terminal in ASCII shows ? for other letters
+        stream.reconfigure(errors="replace")  # a terminal in ASCII shows ? for other letters
     listen()
     warnings.formatwarning = _in_one_line
     if "--version" in sys.argv[1:]:  # Hydra would print its own

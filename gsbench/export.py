@@ -293,7 +293,7 @@ def find_view(scene: Scene, name: str) -> View:
         if view.name == name:
             return view
     raise InputError(f"--camera: expected a training view's number, 0 to {len(scene.train) - 1}, or a view's name such "
-                     f"as {scene.train[0].name}, got '{name[:100]}'")  # fmt: skip
+                     f"as {scene.train[0].name}, got {name[:100]!a}")  # fmt: skip
 
 
 if __name__ == "__main__":

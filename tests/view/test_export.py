@@ -208,6 +208,7 @@ def test_the_middle_is_a_median_by_opacity() -> None:
         (("--ply", "a.ply", "--camera", "train/r_9"), "train/r_9"),
         (("--ply", "a.ply", "--camera", "9" * 5000), "0 to 5"),
         (("--ply", "a.ply", "--camera", "\x1b[31m"), r"\x1b[31m"),
+        (("--ply", "a.ply", "--camera", "a\nb"), r"'a\nb'"),
         (("--ply", "a\0.ply", "--camera", "0"), "a file"),
         (("--ply", ".", "--camera", "0"), "a file"),
         (("--ply", "a.spz", "--camera", "0"), "ends in .ply, got 'a.spz'"),
