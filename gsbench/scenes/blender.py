@@ -89,7 +89,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
         frame.name: digest for split in splits for frame, digest in zip(splits[split].frames, parts[split], strict=True)
     }
     digests |= {split.source.name: split.digest for split in splits.values()}
-    if os.path.lexists(root / times.TABLE):
+    if times.table_of(root):
         notes.append(f"{times.TABLE} is not read: the times are those of transforms_*.json")
     notes += [*(note for split in splits.values() for note in split.notes), *finder.notes(), *loaded.notes]
     return standard_scene(

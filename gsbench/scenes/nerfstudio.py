@@ -71,7 +71,7 @@ def _times(root: Path, split: blender.Split) -> tuple[times.Times, dict[str, str
     """
     blender.check_all_or_none([split])
     places, names = blender.places_of(split.frames), [frame.name for frame in split.frames]
-    if split.frames[0].time is None or os.path.lexists(root / times.TABLE):
+    if split.frames[0].time is None or times.table_of(root):
         viewmats = np.stack([frame.viewmat.double().numpy() for frame in split.frames])
         return times.of_images(root, names, viewmats, places, split.source)
     fields = [frame.time or 0.0 for frame in split.frames]

@@ -25,20 +25,27 @@ from gsbench.scenes.files import digest, without_suffix
 TABLE = "times.csv"
 _MAX_TABLE = 1 << 26  # bytes of times.csv
 _LARGEST = 1e30  # the largest time, in any unit
+_SMALLEST = 1e-30  # the smallest number that is read exactly: the digits of 1e-99999999 would fill the memory
 _LONGEST = 100  # digits of a number that is read exactly
 _SAME_PLACE = 6  # decimals, relative to the radius of the cameras: poses that agree to them are one place
 _CLEARLY = 10.0  # a camera moves this many times less between neighbouring times than between cameras
 _SHORT = 0.5  # times in [0, 1] that cover less may be in another unit
 _FEW = 0.1  # a file whose times lie in [0, 1], a smaller share of all times than this, has another unit than the others
 _WHOLE = re.compile(r"(?:(?<![^=/_])-)?[0-9]+")  # "-" is a sign at the start and after = / _
-_DECIMAL = re.compile(_WHOLE.pattern + r"(?:\.[0-9]+)?")
+_DECIMAL = re.compile(_WHOLE.pattern + r"(?:\.[0-9]+(?:[eE][-+][0-9]{1,2}(?![0-9]))?)?")
 _CLOCK = (
-    r"(?P<H>[01]\d|2[0-3])(?P<c>{})(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d)(?:[-_.,]?(?P<f>\d{{3}}|\d{{6}}|\d{{9}}))?(?!\d)"
+    r"(?P<H>[01]\d|2[0-3])(?P<c>{})(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d)"
+    r"(?:[-_.,]?(?P<f>\d{{3}}|\d{{6}}|\d{{9}})|[.,](?P<g>\d{{1,9}}))?(?!\d)"
 )
+_TWELVE = r"(?P<H>0?[1-9]|1[0-2])(?P<c>[-_.:])(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d).?(?P<half>[AaPp])[Mm]"
+_LETTERS = r"(?P<H>\d{1,2})h(?P<M>[0-5]?\d)m(?P<S>[0-5]?\d)s(?P<f>\d{3}|\d{6}|\d{9})?(?!\d)"
 _DATE = r"(?<!\d)(?P<Y>(?:19|20)\d\d)(?P<d>[-_.]?)(?P<m>0[1-9]|1[0-2])(?P=d)(?P<D>0[1-9]|[12]\d|3[01])"
 _MOMENTS = (
+    re.compile(_DATE + r"(?:[-_ T]| at )?" + _TWELVE, re.ASCII),  # 2023-05-01 at 1.30.59 PM
     re.compile(_DATE + r"(?:[-_ T]| at )?" + _CLOCK.format("[-_.:]?"), re.ASCII),  # 2023-05-01_12-30-59
+    re.compile(_DATE + r"(?:[-_ T]| at )?" + _LETTERS, re.ASCII),  # 2023-05-01-12h30m59s123
     re.compile(r"(?<!\d)" + _CLOCK.format("[-:]"), re.ASCII),  # 12-30-59
+    re.compile(r"(?<!\d)" + _LETTERS, re.ASCII),  # 12h30m59s
 )
 _CAMERA_WORDS = ("cam", "camera")
 _TIME_WORDS = ("frame", "f", "time", "timestamp", "t")
@@ -106,11 +113,17 @@ def of_images(
     Raises:
         InputError: as `of_table` and `of_names`.
     """
-    path = root / TABLE
-    if not os.path.lexists(path):
+    path = table_of(root)
+    if path is None:
         return of_names(names, viewmats, places, source), {}
     data = read_file(path, str(path), _MAX_TABLE)
-    return of_table(data, path, names, places), {TABLE: digest(data)}
+    return of_table(data, path, names, places), {path.name: digest(data)}
+
+
+def table_of(root: Path) -> Path | None:
+    """Return the path of times.csv in a scene's folder, in any case; None if there is none."""
+    names = sorted(name for name in os.listdir(root) if name.lower() == TABLE)
+    return root / (TABLE if TABLE in names else names[0]) if names else None
 
 
 def of_names(
@@ -167,13 +180,13 @@ def of_table(
         raise InputError(
             f"{path}: expected the first line name,time, got {','.join(columns)[:60]!a}", docs="data.md#times"
         )
-    table: dict[str, float] = {}
+    table: dict[str, Fraction] = {}
     for number, row in filled[1:]:
         cells = dict(zip(columns, row, strict=False))
         name, text = cells.get("name", ""), cells.get("time", "")
         if len(row) < len(columns) or any(row[len(columns) :]) or not name or name in table:
             raise InputError(f"{path}: line {number}: expected a name, once, and its time, got {','.join(row)[:60]!a}")
-        table[name] = _number(text.replace(",", ".") if separator == ";" else text, f"{path}: line {number}")
+        table[name] = _exact(text.replace(",", ".") if separator == ";" else text, f"{path}: line {number}")
     loose: dict[str, list[str]] = defaultdict(list)
     for name in table:
         loose[_loose(name)].append(name)
@@ -182,7 +195,7 @@ def of_table(
     if missing is not None:
         raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
                          docs="data.md#times")  # fmt: skip
-    values = [Fraction(table[name]) for name in used]
+    values = [table[name] for name in used]
     spare = len(table) - len(set(used))
     rest = f"; {spare} rows of other images are left out" if spare else ""
     others = [name for name in columns if name not in ("name", "time")]
@@ -289,7 +302,8 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
         for start, end in sorted([*spans, *([inside] if moment else [])]):
             label = name[at:start].rpartition("/")[2]
             is_moment = moment is not None and (start, end) == inside
-            value = _seconds(moment, source) if is_moment and moment else _exact(name[start:end], source)
+            value = (_seconds(moment, source) if is_moment and moment else
+                     _exact(name[start:end], f"{source}: image {name[start:end][:40]}"))  # fmt: skip
             numbers.append(_Number(value, label, is_moment))
             at = end
         found.append(numbers)
@@ -305,20 +319,25 @@ def _have_decimals(names: Sequence[str]) -> bool:
 def _seconds(moment: re.Match[str], source: Path) -> Fraction:
     """Return a date and time of day, or a time of day, in seconds."""
     parts = moment.groupdict()
-    fraction = Fraction(int(parts["f"] or 0), 10 ** len(parts["f"] or ""))
+    digits = parts.get("f") or parts.get("g") or ""
+    fraction = Fraction(int(digits or 0), 10 ** len(digits))
     try:
         year, month, day = (int(parts.get(key) or 1) for key in "YmD")
         days = date(year, month, day).toordinal()
     except ValueError:
         raise InputError(f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
                          docs="data.md#times") from None  # fmt: skip
-    return days * 86400 + int(parts["H"]) * 3600 + int(parts["M"]) * 60 + int(parts["S"]) + fraction
+    hour = int(parts["H"])
+    if half := parts.get("half"):
+        hour = hour % 12 + 12 * (half in "Pp")
+    return days * 86400 + hour * 3600 + int(parts["M"]) * 60 + int(parts["S"]) + fraction
 
 
-def _exact(text: str, source: Path) -> Fraction:
-    """Convert a number in a name exactly: nanoseconds of a clock have more digits than a float."""
-    number = _number(text, f"{source}: image {text[:40]}")
-    return Fraction(text) if len(text) < _LONGEST else Fraction(number)
+def _exact(text: str, where: str) -> Fraction:
+    """Convert a number exactly: nanoseconds of a clock have more digits than a float."""
+    number = _number(text, where)
+    is_short = len(text) < _LONGEST and abs(number) >= _SMALLEST
+    return Fraction(text) if is_short else Fraction(number)
 
 
 def _number(text: str, where: str) -> float:
@@ -359,6 +378,8 @@ def _time_among(
         named = [column for column in candidates if column.words <= {*_TIME_WORDS}]
         candidates = named if len(named) == 1 else _steadiest(candidates, changing, names, viewmats)
     if len(candidates) == 1:
+        candidates += _chapters(candidates[0], changing, names, viewmats, places)
+    if len(candidates) == 1:
         return candidates[0]
     listed = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
     raise InputError(f"{source}: image {names[0][:80]!a}: expected one number that is the time, got {listed}, which "
@@ -394,8 +415,14 @@ def _steadiest(
     poses = _relative(viewmats)
     steps = [_step(column, [other for other in changing if other is not column], names, poses) for column in candidates]
     moving = sorted((step, i) for i, step in enumerate(steps) if step is not None)
-    if moving and (len(moving) == 1 or moving[0][0] * _CLEARLY < moving[1][0]):
-        return [candidates[moving[0][1]]]
+    if moving:
+        step, best = moving[0][0], candidates[moving[0][1]]
+        others = [column for column in changing if column is not best]
+        # Two cameras of a rig stand nearer to each other than it moves: a number of few values must be clearer.
+        has_fewer = any(len(set(best.values)) < len(set(other.values)) for other in others)
+        least = step * (_CLEARLY**2 if has_fewer else _CLEARLY)
+        if len(moving) == 1 or least < moving[1][0]:
+            return [best]
     orders = [sorted(range(len(names)), key=column.values.__getitem__) for column in candidates]
     decimal = [column for column in candidates if any(value.denominator > 1 for value in column.values)]
     return decimal if not moving and len(decimal) == 1 and orders.count(orders[0]) == len(orders) else candidates
@@ -411,6 +438,32 @@ def _step(column: _Column, others: list[_Column], names: Sequence[str], poses: N
         ordered = sorted(group, key=values.__getitem__)
         lengths += [float(np.linalg.norm(poses[a] - poses[b])) for a, b in pairwise(ordered)]
     return sum(lengths) / len(lengths) if lengths else None
+
+
+def _chapters(
+    column: _Column,
+    changing: list[_Column],
+    names: Sequence[str],
+    viewmats: NDArray[np.float64],  # [N, 4, 4]
+    places: Sequence[Hashable],
+) -> list[_Column]:
+    """Return the columns of which each number goes on where the one before ends, such as chapters of a video.
+
+    There both numbers together are the time. The moving camera makes no large step from chapter to chapter.
+    """
+    others = [other for other in changing if other is not column and not other.words & {*_CAMERA_WORDS}]
+    poses, step = _relative(viewmats), _step(column, others, names, _relative(viewmats))
+    if step is None or max(Counter(places).values()) > 1:
+        return []
+    chapters = []
+    for other in others:
+        order = sorted(range(len(names)), key=lambda i: (other.values[i], column.values[i]))
+        jumps = [float(np.linalg.norm(poses[a] - poses[b])) for a, b in pairwise(order)
+                 if other.values[a] != other.values[b]]  # fmt: skip
+        repeats = len({(other.values[i], column.values[i]) for i in order}) > len(set(column.values))
+        if repeats and sum(jumps) < _CLEARLY * step * len(jumps):
+            chapters.append(other)
+    return chapters
 
 
 def _relative(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 4, 4] -> [N, 12]

@@ -99,6 +99,10 @@ MOVING: dict[str, Callable[[int], str]] = {
     "signs": lambda i: f"frame_{i - 4}.png",
     "a dash": lambda i: f"video-{i:03d}.png",
     "take 1.9": lambda i: f"scan_1.{i + 5}.png",
+    "a snapshot of VLC": lambda i: f"vlcsnap-2023-05-01-12h{30 + i * 7 // 60:02d}m{i * 7 % 60:02d}s000.png",
+    "past noon": lambda i: f"Shot 2023-05-01 at {1 if i > 4 else 12}.{(50 + 2 * i) % 60:02d}.00 PM.png",
+    "tenths of seconds": lambda i: f"00-00-{i // 2:02d}.{i % 2 * 5}.png",
+    "an exponent": lambda i: f"t_{i * 1e-3:.1e}.png",
     "index and stamp": lambda i: f"{i:04d}_{100 + i / 10:.3f}.png",
 }
 
@@ -132,6 +136,13 @@ def test_no_time() -> None:
         assert "times: none" in found.notes[0]
 
 
+def stereo(count: int) -> np.ndarray:
+    """Return poses of two cameras that stand nearer to each other than they move."""
+    viewmats = np.repeat(circle(count), 2, 0)
+    viewmats[1::2, 0, 3] -= 0.1
+    return viewmats
+
+
 REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
     "a camera's number alone": ([f"cam{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.repeat(circle(4), 2, 0),
                                 "'cam0_a.png' and 'cam0_b.png'.*a number that changes"),
@@ -142,6 +153,8 @@ REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
     "two that contradict": ([f"{i}_{(3 * i) % 7}.png" for i in range(7)], circle(7),
                             "one number that is the time, got 0, 0"),
     "of takes": ([f"{i // 5}_{i % 5}.png" for i in range(10)], np.tile(circle(1), (10, 1, 1)), "one number that is"),
+    "chapters": ([f"part{1 + i // 10}/frame_{i % 10:03d}.png" for i in range(20)], circle(40)[:20], "got 0, 1, which"),
+    "a stereo rig that drives": ([f"image_0{2 + i % 2}/{i // 2:06d}.png" for i in range(24)], stereo(12), "got 2, 0"),
     "some without": (["a.png", "b_1.png"], circle(2), "'a.png': expected a number in its name"),
     "of two forms": (["IMG_20230501_123059.jpg", "IMG_20230501_123059_1.jpg"], circle(2), "expected names of one form"),
     "endless": (["9" * 5000, "1"], circle(2), "expected a time"),
@@ -179,6 +192,7 @@ TABLES = {
     "with the folder": "name,time\nimages/a.png,1\n./b.png,2\nimages\\c.png,4\n",
     "another suffix": "name,time\na.jpg,1\nb.JPG,2\nc.jpeg,4\n",
     "quotes": '"name","time"\n"a.png","1"\n"b.png","2"\n"c.png","4"\n',
+    "nanoseconds": "name,time\na.png,1700000000000000001\nb.png,1700000000000000002\nc.png,1700000000000000004\n",
     "rows of others": "name,time\na.png,1\nb.png,2\nc.png,4\nd.png,99\n",
 }
 
@@ -207,6 +221,14 @@ def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) ->
     """Catches two images of one camera at one time, and a row of another length."""
     with pytest.raises(InputError, match=words):
         times.of_table(content.encode(), Path("times.csv"), ["a", "b", "c"], [0, 0, 0])
+
+
+def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) -> None:
+    """Catches Times.CSV that is left out in silence, and a number whose exact value has a hundred million digits."""
+    (tmp_path / "Times.CSV").write_text("name,time\na,1e-99999999\nb,1\n")
+    found, digests = times.of_images(tmp_path, ["a", "b"], circle(2), [0, 1], Path("images.txt"))
+    assert found.values == [0, 1]
+    assert list(digests) == ["Times.CSV"]
 
 
 def test_a_table_of_equal_times_is_a_still_scene() -> None:
