@@ -100,7 +100,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
         background=background,
         points=None,
         fingerprint=files.fingerprint(digests),
-        notes=(*notes, *_shared(views, parts)),
+        notes=(*notes, *shared_views(views, parts)),
     )
 
 
@@ -231,7 +231,7 @@ def check_all_or_none(splits: Iterable[Split]) -> None:
             )
 
 
-def _shared(views: dict[str, list[View]], digests: dict[str, list[str]]) -> list[str]:
+def shared_views(views: dict[str, list[View]], digests: dict[str, list[str]]) -> list[str]:
     """Return sentences on images that two splits share, with the same pose and time."""
     seen = {
         split: [(digest, view.camera.viewmat.numpy().tobytes(), view.time) for view, digest in

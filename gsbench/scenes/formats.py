@@ -19,6 +19,7 @@ _COMPRESSED = {  # by the first bytes, or by the suffix
     b"NGSP": "SPZ", b"\x1f\x8b": "gzip, as SPZ", b"PK\x03\x04": "ZIP, as SOG",
     ".spz": "SPZ", ".sog": "SOG", ".splat": "SPLAT", ".ksplat": "KSPLAT",
 }  # fmt: skip
+_PICKLE, _HEAD = b"data.pkl", 256  # name of the first file in a checkpoint of PyTorch, and where it stands
 _HARMLESS = re.compile(  # normals, colours beside f_dc_*, identities, features of segmentations
     r"n[xyz]|red|green|blue|alpha|confidence|(\w+_)?(ids?|idx|index|labels?|class|segment|cluster|instance|object)(_\d+)?|"
     r"(obj|object|ins|instance|sem|semantics?|language|clip|dino|identity)_\w+|semantics?"
@@ -27,6 +28,9 @@ _HARMLESS = re.compile(  # normals, colours beside f_dc_*, identities, features 
 
 def check_readable(path: Path, data: bytes) -> None:
     """Raise InputError if the bytes of a file that is no PLY, or its suffix, are of a compressed format."""
+    if data.startswith(b"PK\x03\x04") and _PICKLE in data[:_HEAD]:
+        raise _refused(path, "expected a PLY of 3DGS, this file is a checkpoint of PyTorch: export a PLY with the "
+                             "program that wrote it")  # fmt: skip
     for mark, form in _COMPRESSED.items():
         if data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark:
             raise _compressed(path, form)

@@ -44,6 +44,7 @@ _MOST_FLOATS = 1 << 29
 _MAX_FILE = 1 << 30  # bytes; the largest accepted image has 2^29 bytes before compression
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
+_ORIENTATION = 274  # number of the tag of EXIF
 _MAX_PIXELS = 2**26  # a PNG of a few kilobytes can claim gigabytes of pixels; no data set has more than 8192 x 8192
 
 
@@ -82,6 +83,16 @@ def photo_size(
         if image.mode != "RGB":
             raise InputError(f"{where}: expected a JPEG of RGB, got one of {image.mode}: convert it")
         return _check_size(*image.size, where)
+
+
+def is_turned(
+    data: bytes,  # of an image that was checked
+) -> bool:
+    """Return whether a JPEG has an EXIF orientation by which other programs turn or mirror it."""
+    if not data.startswith(_JPEG):
+        return False
+    with _jpeg(data, "EXIF") as image:
+        return image.getexif().get(_ORIENTATION, 1) != 1
 
 
 def png_size(

@@ -43,6 +43,9 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
     digests |= dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
     train, val, test, how = _split_views(split, finder, loaded.views)
+    by_view = dict(zip(map(id, loaded.views), loaded.digests, strict=True))
+    views = {"train": train, "val": val, "test": test}
+    parts = {part: [by_view[id(view)] for view in views[part]] for part in views}
     points = split.content.get("ply_file_path")
     initial = None
     if points is not None:
@@ -59,7 +62,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
         background=background,
         points=initial,
         fingerprint=files.fingerprint(digests | {SOURCE: split.digest}),
-        notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes),
+        notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes, *blender.shared_views(views, parts)),
         up=None,
     )
 

@@ -23,6 +23,8 @@ _PULL = 1e-4  # weight of the cameras' middle against their axes: decides where 
 _ROUNDS = 30  # of reweighted least squares
 _AHEAD = 0.5  # cosine between a camera's axis and the common point, above which the camera looks at the point
 _FAR_CAMERA = 5.0  # in units of the size and of the cameras' spread: a camera farther away has a wrong pose
+_ENOUGH_SEEN = 0.25  # share of the points below which a line says how many the training cameras see
+_FAR_POINTS = 10.0  # in units of the size: a median distance of the points above which a line asks for their units
 _MOST_PAIRS = 1 << 22  # of points and cameras whose depths are computed
 
 
@@ -54,12 +56,13 @@ def standard_scene(
         notes: what the reader tells about the files, a line each.
 
     Raises:
-        InputError: the positions of the cameras are too large for a float.
+        InputError: the positions of the cameras are too large for a float, or no camera sees a point.
     """
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
     centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
     axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
-    middle, size = place_and_size(centers, axes, _seen_points(train, points))
+    seen, share = _seen_points(name, train, points)
+    middle, size = place_and_size(centers, axes, seen)
     placement = _placement(middle, size)
     # The views of an array share their cameras.
     cameras = {id(view.camera): _placed(view.camera, placement) for view in (*train, *val, *test)}
@@ -76,8 +79,15 @@ def standard_scene(
                          f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the "
                          f"size of the scene")  # fmt: skip
     if points is not None:
+        away = float((points.means.double() - torch.from_numpy(middle)).norm(dim=1).median())
         points = Points(placement.to_standard(points.means), points.colors.float())
         far = int(far_outside(points.means).sum())
+        if share < _ENOUGH_SEEN:
+            notes = (*notes, f"the training cameras see {share:.1%} of the points: are the points in the coordinates "
+                             f"and units of the cameras?")  # fmt: skip
+        if away > _FAR_POINTS * size > 0:
+            notes = (*notes, f"half of the points lie over {_FAR_POINTS:g} times as far away as the cameras from what "
+                             f"these look at: are the points in the coordinates and units of the cameras?")  # fmt: skip
         if far:
             notes = (*notes, f"{far} of {len(points.means)} points lie far outside, and do not count for its size")
     return Scene(
@@ -166,24 +176,36 @@ def _placed(camera: Camera, placement: Placement) -> Camera:
 
 
 def _seen_points(
-    views: list[View], points: Points | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:  # [S, 3] and [S]
-    """Return points that cameras see, once for each camera, and their depths; None if a data set has no points."""
+    name: str, views: list[View], points: Points | None
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, float]:  # ([S, 3], [S]), share
+    """Return points that cameras see, once for each camera, with their depths, and the share of points that are seen.
+
+    The points are None if a data set has none.
+
+    Raises:
+        InputError: no camera sees a point, so that a training would move none.
+    """
     if points is None:
-        return None
+        return None, 1.0
     means = points.means.double()[:: max(1, math.ceil(len(points.means) * len(views) / _MOST_PAIRS))]
-    seen, depths = [], []
+    seen, depths, is_any = [], [], torch.zeros(len(means), dtype=torch.bool)
     for camera in (view.camera for view in views):
-        inside = means[is_seen(means, camera)]
+        is_inside = is_seen(means, camera)
+        is_any |= is_inside
+        inside = means[is_inside]
         seen.append(inside.numpy())
         depths.append((inside @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).numpy())
-    return np.concatenate(seen), np.concatenate(depths)
+    if not is_any.any():
+        raise InputError(f"{name}: expected initial points that a training camera sees, they see none of the "
+                         f"{len(points.means)}: are points and poses of one capture, and in the same coordinates and "
+                         f"units?", docs="data.md#where-a-scene-lies")  # fmt: skip
+    return (np.concatenate(seen), np.concatenate(depths)), float(is_any.double().mean())
 
 
 def _are_near(centers: NDArray[np.float64], size: float) -> NDArray[np.bool_]:  # [C]
     """Return which cameras are not far from the others; all if they are at one place."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    return distances <= _FAR_CAMERA * max(size, float(np.quantile(distances, 0.9)))
+    return distances <= _FAR_CAMERA * max(size, float(np.quantile(distances, 0.75)))
 
 
 def _text(position: tuple[float, float, float]) -> str:

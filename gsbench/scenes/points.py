@@ -111,6 +111,8 @@ def read_ply(path: str | Path) -> Points:
             colors = colors / np.iinfo(kind).max
         if colors.min() < 0 or colors.max() > 1:
             raise InputError(f"{path}: red green blue: expected uchar 0..255 or float 0..1, some are outside")
+    elif "f_dc_0" not in names:
+        raise InputError(f"{path}: expected colours as red green blue, or as f_dc_0..2, found {names!r:.120}: add them")
     else:
         colors = (0.5 + SH_C0 * _columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path)).clip(0, 1)
     return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)))

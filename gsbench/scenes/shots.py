@@ -67,7 +67,7 @@ def read(
     reduced = images.reduced_size(size, downscale, first.where)
     in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
-    def read_one(shot: Shot) -> tuple[View, str]:
+    def read_one(shot: Shot) -> tuple[View, str, bool]:
         data = images.read_image(shot.path, shot.where)
         lens = _lens_of_image(images.photo_size(data, shot.where), size, shot)
         decoded = images.decode_photo(data, shot.where)
@@ -81,13 +81,18 @@ def read(
         camera = Camera(shot.viewmat, torch.from_numpy(K.astype(np.float32)), image.shape[1], image.shape[0])
         alpha = None if is_kept else images.alpha_of(decoded, reduced)
         regions = None if shot.mask is None else _read_mask(shot, shot.mask, lens, reduced)
-        return View(shot.name, camera, shot.time, image, background, alpha, regions), files.digest(data)
+        view = View(shot.name, camera, shot.time, image, background, alpha, regions)
+        return view, files.digest(data), images.is_turned(data)
 
     kept = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # bytes a pixel, alpha and mask too
     threads = images.count_readers(size, len(shots), downscale, first.where, kept)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
-        views, digests = zip(*pool.map(read_one, shots), strict=True)
-    return Shots(list(views), list(digests), _notes(shots, size, reduced, downscale))
+        views, digests, turned = zip(*pool.map(read_one, shots), strict=True)
+    notes = _notes(shots, size, reduced, downscale)
+    if any(turned):
+        notes.append(f"{sum(turned)} of {len(shots)} images have an EXIF orientation, which is not applied: if the "
+                     f"program that wrote the poses applied it, turn the pixels and remove the tag")  # fmt: skip
+    return Shots(list(views), list(digests), notes)
 
 
 def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot) -> Lens:
@@ -96,7 +101,8 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
     if lens is None:
         stated, actual = f"{shot.lens.width}x{shot.lens.height}", f"{size[0]}x{size[1]}"
         raise InputError(f"{shot.where}: expected {stated} as its camera, or both sides resized by one ratio, "
-                         f"got {actual}: use the images that the camera is of, and scene.downscale")  # fmt: skip
+                         f"got {actual}: use the images that its camera is of, not turned, and scene.downscale",
+                         docs="data.md#cameras-and-images")  # fmt: skip
     if size != expected:
         raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
                          f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip

@@ -13,6 +13,7 @@ import torch
 from capture import COLOR, Capture, circle, write_image
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_run import main_here
 
@@ -170,6 +171,17 @@ def test_times_of_names(own: Path) -> None:
     scene = scenes.load(own)
     assert [view.time for view in scene.train] == [i / 8 for i in (0, 1, 2, 3, 4, 5, 6, 8)]
     assert [view.name for view in scene.test] == ["cam9/take2_90"]
+
+
+def test_an_exif_orientation_is_told(own: Path) -> None:
+    """Catches pixels that other programs turn, and gsbench does not, in silence."""
+    exif = Image.Exif()
+    exif[274] = 6
+    for i, path in enumerate(sorted((own / "images").rglob("*.png"))):
+        with Image.open(path) as image:
+            pixels = image.convert("RGB")
+        pixels.save(path, "JPEG", **({"exif": exif} if i < 3 else {}))
+    assert any(f"3 of {COUNT} images have an EXIF orientation" in note for note in scenes.load(own).notes)
 
 
 JPEG = ["jpg", "jpeg", "JPG", "JPEG"]

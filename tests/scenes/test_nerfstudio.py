@@ -126,6 +126,25 @@ def test_what_is_wrong_is_one_line(root: Path, values: dict[str, Any], words: st
     assert "\n" not in str(caught.value)
 
 
+def test_views_that_train_and_test_share_are_told(root: Path) -> None:
+    """Catches lists that overlap, and a frame that is there twice, which may be once in train and once in test."""
+    frames = json.loads((root / "transforms.json").read_text())["frames"]
+    names = [frame["file_path"] for frame in frames]
+    change(root, train_filenames=names, test_filenames=names[:2])
+    assert any("2 of 2 views of test are views of train too" in note for note in scenes.load(root).notes)
+
+
+def test_a_cloud_without_colours_says_which_are_read(root: Path) -> None:
+    """Catches a message that asks for f_dc_0 alone."""
+    lines = PLY.splitlines()
+    body = lines.index("end_header")
+    rows = [line for line in lines[:body] if "uchar" not in line] + ["end_header"]
+    rows += [" ".join(line.split()[:3]) for line in lines[body + 1 :]]
+    (root / "sparse_pc.ply").write_text("\n".join(rows))
+    with pytest.raises(InputError, match="expected colours as red green blue, or as f_dc_0"):
+        scenes.load(root)
+
+
 def test_too_few_for_a_split(root: Path) -> None:
     """Catches a scene without a test view."""
     content = json.loads((root / "transforms.json").read_text())

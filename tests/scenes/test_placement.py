@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench import load_run, load_scene
+from gsbench.errors import InputError
 from gsbench.scenes import Scene, sample
 from gsbench.scenes.placement import place_and_size
 from gsbench.scenes.points import far_outside, size_of
@@ -113,17 +114,18 @@ def test_any_scene_comes_to_a_standard_place(
         assert 0.5 * STANDARD < distances.median() < 2 * STANDARD
 
 
-def test_wrong_poses_do_not_decide(tmp_path: Path) -> None:
-    """Catches a mean and a maximum over cameras: one of 16 poses lies 10,000 units away and looks elsewhere."""
+@pytest.mark.parametrize("count", [1, 3])
+def test_wrong_poses_do_not_decide(count: int, tmp_path: Path) -> None:
+    """Catches a mean and a maximum over cameras: some of 16 poses lie 10,000 units away and look elsewhere."""
     viewmats = circle(COUNT)
-    viewmats[3, :3, 3] += [5e3, 8e3, 1e3]
+    viewmats[3 : 3 + count, :3, 3] += np.array([5e3, 8e3, 1e3]) * np.arange(1, 1 + count)[:, None]
     plain, wrong = (
         load_scene(write_capture(tmp_path / "a")),
         load_scene(write_capture(tmp_path / "b", viewmats=viewmats)),
     )
     assert wrong.placement == plain.placement
     assert wrong.extent == pytest.approx(plain.extent, rel=0.1)
-    assert any("1 of 14 training cameras lie far from the others" in note for note in wrong.notes)
+    assert any(f"{count} of 14 training cameras lie far from the others" in note for note in wrong.notes)
 
 
 def test_a_fixed_camera_has_the_size_of_its_points() -> None:
@@ -160,6 +162,17 @@ def test_far_points_do_not_count(count: int, away: float, tmp_path: Path) -> Non
     assert size_of(scene.points) == pytest.approx(size_of(Points(plain, plain)), rel=1e-3)
     assert scene.placement.is_identity
     assert any(f"{count} of {3000 + count} points lie far outside" in note for note in scene.notes)
+
+
+def test_points_of_another_place_are_told_or_refused(tmp_path: Path) -> None:
+    """Catches a training from points none of which a camera sees: 12.9 dB instead of 34 without a word."""
+    away = np.random.default_rng(1).normal([0, 500, 0], 5, (40, 3))
+    with pytest.raises(InputError, match=r"they see none of the 40: .*same coordinates"):
+        load_scene(write_capture(tmp_path / "none", points=away))
+    scene = load_scene(write_capture(tmp_path / "few", points=np.concatenate([away, np.zeros((2, 3))])))
+    assert any("see 4.8% of the points" in note for note in scene.notes)
+    scene = load_scene(write_capture(tmp_path / "far", points=away[:, [1, 0, 2]]))  # where some cameras look
+    assert any("half of the points lie over 10 times as far away" in note for note in scene.notes)
 
 
 def moved_square(root: Path, scale: float, offset: tuple[float, float, float]) -> Path:

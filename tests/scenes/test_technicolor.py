@@ -185,7 +185,7 @@ def test_points_of_colmap(root: Path) -> None:
     """Catches a track that is read as a point; text and binary give the same."""
     folder = root / "sparse" / "0"
     folder.mkdir(parents=True)
-    means = [(0.5, -1.0, 4.0), (1.5, 2.0, 5.0)]
+    means = [(0.5, -0.25, 4.0), (1.5, 2.0, 5.0)]
     rows = [colmap._POINT.pack(i, *xyz, 255, 51, 0, 0.3, i) + b"\0" * 8 * i for i, xyz in enumerate(means, 1)]
     (folder / "points3D.bin").write_bytes(len(rows).to_bytes(8, "little") + b"".join(rows))
     binary = scenes.load(root).points

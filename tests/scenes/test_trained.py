@@ -248,6 +248,14 @@ def test_a_compressed_file_says_what_opens_it(name: str, data: bytes, form: str,
     assert f"splat-transform@3.7.0 {quoted} trained.ply" in str(caught.value)
 
 
+def test_a_checkpoint_of_pytorch_is_not_called_compressed(tmp_path: Path) -> None:
+    """Catches nerfstudio's .ckpt, a ZIP, for which a converter of splats is named."""
+    path = tmp_path / "step-000029999.ckpt"
+    torch.save({"step": 1}, path)
+    with pytest.raises(InputError, match="checkpoint of PyTorch: export a PLY"):
+        read_trained(path)
+
+
 def test_a_compressed_ply_says_what_opens_it(tmp_path: Path) -> None:
     """Catches a compressed PLY of SuperSplat that is taken for a damaged one."""
     chunk = PlyElement.describe(
