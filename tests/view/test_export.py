@@ -256,9 +256,13 @@ def test_a_disk_that_refuses_a_video_is_told(
     """Catches a video that lacks frames, as OpenCV does not tell that a disk is full, in the place of a whole one, and
     an error that names a temporary file."""
     video = tmp_path / "a.mp4"
-    words = [str(folder), "--video", str(video), *SHORT]
+    words, writer_of = [str(folder), "--video", str(video), *SHORT], cv2.VideoWriter
 
-    class Full(cv2.VideoWriter):
+    class Full:  # not a subclass, whose memory OpenCV's bindings corrupt
+        def __init__(self, *arguments: object) -> None:
+            self._writer = writer_of(*arguments)
+            self.isOpened, self.release = self._writer.isOpened, self._writer.release
+
         def write(self, *_: object) -> None:
             pass
 
