@@ -102,7 +102,7 @@ MOVING: dict[str, Callable[[int], str]] = {
     "a snapshot of VLC": lambda i: f"vlcsnap-2023-05-01-12h{30 + i * 7 // 60:02d}m{i * 7 % 60:02d}s000.png",
     "past noon": lambda i: f"Shot 2023-05-01 at {1 if i > 4 else 12}.{(50 + 2 * i) % 60:02d}.00 PM.png",
     "tenths of seconds": lambda i: f"00-00-{i // 2:02d}.{i % 2 * 5}.png",
-    "an exponent": lambda i: f"t_{i * 1e-3:.1e}.png",
+    "an exponent": lambda i: f"t_{i * 3e-3:.1e}.png",
     "index and stamp": lambda i: f"{i:04d}_{100 + i / 10:.3f}.png",
 }
 
