@@ -1,4 +1,4 @@
-"""Draw README's frontier: PSNR on test against seconds of training, a line for each model, from published records.
+"""Draw README's frontier: PSNR on test against seconds of training, a line for each model, from the reference records.
 
 python docs/site/frontier_chart.py
 """

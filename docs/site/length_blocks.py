@@ -1,4 +1,4 @@
-"""Write the block of docs/results.md on long trainings: PSNR after each length, and after the one that val chooses."""
+"""Write the block of docs/results.md on long training runs: PSNR after each length, and after that chosen on val."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def lengths(published: Path) -> str:
         for model in found.group.models:
             for scene, longest in found.configuration(model, LENGTHS[8000]).runs.items():
                 runs = []
-                for variant in LENGTHS.values():  # the suite has most of the shorter trainings
+                for variant in LENGTHS.values():  # the suite has most of the shorter training runs
                     own = found.configuration(model, variant).runs if found.has(model, variant) else {}
                     of = own.get(scene) or suite[scene].configuration(model, variant).runs[scene]
                     runs.append({run.seed: run for run in of})
@@ -43,14 +43,14 @@ def lengths(published: Path) -> str:
     text = table(["scene", "model", *(f"{n:,}" for n in LENGTHS), "kept"], sorted(rows), left=2)
     own = said(f"these {len(tried)} runs", tried)
     others = (
-        f"the {len(of_suite)} runs of all models and seeds on moving scenes of the suite that have val views and are "
+        f"the {len(of_suite)} runs of all models and seeds on dynamic scenes of the suite that have val views and are "
         "measured on test, of 500, 1,000 and 2,000 iterations"
     )
     return f"{text}\n\n{own}\n\n{said(others, of_suite)}"
 
 
 def said(what: str, tried: Sequence[Sequence[Record]]) -> str:
-    """Say what the longest training and the kept one lose to the best length on test, over lists of such trainings."""
+    """Say what the longest training run and the kept one lose to the best length on test, over lists of such runs."""
     lost: dict[str, list[float]] = {"longest": [], "kept": []}
     steps = []
     for runs in tried:
@@ -61,9 +61,9 @@ def said(what: str, tried: Sequence[Sequence[Record]]) -> str:
         steps.append(done)
     mean, most = ({name: function(values) for name, values in lost.items()} for function in (fmean, max))
     return (
-        f"Over {what}, the longest training loses {mean['longest']:.2f} dB to "
-        f"the best length on average, and at most {most['longest']:.2f} dB. The kept training loses "
-        f"{mean['kept']:.2f} dB on average, and at most {most['kept']:.2f} dB. The lengths that are tried have "
+        f"Over {what}, the longest training run loses {mean['longest']:.2f} dB to "
+        f"the best length on average, and at most {most['longest']:.2f} dB. The kept one loses "
+        f"{mean['kept']:.2f} dB on average, and at most {most['kept']:.2f} dB. All lengths that are tried have "
         f"{fmean(steps):,.0f} iterations together on average."
     )
 

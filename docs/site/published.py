@@ -1,4 +1,4 @@
-"""Read published records as the reports do, and write their numbers in one form on all pages."""
+"""Read the reference records as the reports do, and write their numbers in one form on all pages."""
 
 import functools
 import math
@@ -30,7 +30,7 @@ CASES = {
     "4,000": "iterations=4000",
 }
 TIMES = ("train_s", "train_cpu_s", "fps")  # parts of the cost that depend on the machine
-PAPERS = "best_on_test=true"  # trex by the paper's protocol
+PAPERS = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
 ON_GPU = f"device=cuda,{PAPERS}"  # the same on a GPU
 LONG = "recipe=long"
 TREX100 = "downscale=8,initial_points=20000,iterations=3000"  # trex at 100 x 100 pixels
@@ -45,7 +45,7 @@ QUICK = {
 
 @dataclass(frozen=True)
 class Experiment:
-    """The published records of one experiment on one data set, with all comparisons that its report makes."""
+    """The reference records of one experiment on one data set, with all comparisons that its report makes."""
 
     group: Group
 
@@ -160,7 +160,7 @@ def overfitted(found: Experiment) -> list[str]:
 
 
 def successors(found: Experiment) -> list[tuple[float, str]]:
-    """Return PSNR and name of each successor that was run, the highest PSNR first."""
+    """Return PSNR and name of each newer method that was run, the highest PSNR first."""
     return sorted(((found.of(model).mean, model) for model in SUCCESSORS if found.has(model)), reverse=True)
 
 

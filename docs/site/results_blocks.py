@@ -1,4 +1,4 @@
-"""Write the blocks of docs/results.md: tables and sentences that follow from the published records."""
+"""Write the blocks of docs/results.md: tables and sentences that follow from the reference records."""
 
 from pathlib import Path
 from statistics import fmean
@@ -56,7 +56,7 @@ ABLATIONS = {
 
 
 def table1(published: Path) -> str:
-    """Return the table of `make table1`, and how model=auto and the successors compare."""
+    """Return the table of `make table1`, and how model=auto and newer methods compare."""
     found = experiment(published, "mini")
     rows = []
     for model in (m for m in MODELS if found.has(m)):
@@ -69,7 +69,7 @@ def table1(published: Path) -> str:
     said = (
         f"The result of `model=auto` has {100 * kept:.0f} % of the Gaussians of 7DGS and {faster:.1f} times its frame "
         f"rate. The difference in PSNR to 7DGS, {change(tested.difference, told=tested.told)} dB, is "
-        f"{'' if tested.told else 'not '}significant. Successors have "
+        f"{'' if tested.told else 'not '}significant. Newer methods have "
         f"{listing([f'{psnr:.2f} dB (`{m}`)' for psnr, m in successors(found)])}."
     )
     head = ["model", *found.group.scenes, "PSNR", "SSIM", "LPIPS-Alex", "training, s", "FPS", "Gaussians"]
@@ -93,7 +93,7 @@ def lengths(published: Path) -> str:
     parts = [table(["iterations", *MODELS], rows, left=0)]
     if newer:
         own = [costs(found, case, newer, "{psnr}, {seconds}") for case in CASES if found.has(newer[0], CASES[case])]
-        parts += ["The successors of 7DGS:", table(["iterations", *newer], own, left=0)]
+        parts += ["Newer methods:", table(["iterations", *newer], own, left=0)]
     parts += [said, table(["budget", "best", "PSNR"], answers, left=2)]
     if not any(choice.ahead for choice in chosen if choice):
         parts.append(
@@ -156,7 +156,7 @@ def ablation(published: Path) -> str:
 
 
 def recipe(published: Path) -> str:
-    """Return PSNR by scene, length and recipe: of moving scenes, of successors, and of two static scenes."""
+    """Return PSNR by scene, length and recipe: of dynamic scenes, of newer methods, and of two static scenes."""
     models = ("7dgs", "7dgs_noagr", "4dgs")
     old, trex100 = experiment(published, "old_suzanne"), experiment(published, "dnerf_trex100")
     lego100 = experiment(published, "dnerf_lego100")
@@ -180,7 +180,7 @@ def recipe(published: Path) -> str:
     said = "On the earlier suzanne, PSNR of training views after 4,000 iterations is higher than that of test views by "
     said += f"{default}, with `+recipe=long` by {long}, and with `train.lengths=4` by {chosen}.\n\n"
     newer = [m for m in SUCCESSORS if m in trex100.group.models]
-    said += "Successors, trex 100: " + ", ".join(f"`{m}` {plus_minus(trex100.of(m, TREX100))}" for m in newer) + "."
+    said += "Newer methods, trex 100: " + ", ".join(f"`{m}` {plus_minus(trex100.of(m, TREX100))}" for m in newer) + "."
     still = experiment(published, "static")
     gains = {scene: float(values.mean()) for scene, values in still.contrast("6dgs", "3dgs").items()}
     said += "\n\nOn static scenes, 6DGS differs in PSNR on test from 3DGS by "
@@ -225,7 +225,7 @@ def trex200(published: Path) -> str:
 
 
 def trex400(published: Path) -> str:
-    """Return the table of trex by the paper's own protocol, beside the paper's rows, and whether they agree."""
+    """Return the table of trex as the paper trains it, beside the paper's rows, and whether they agree."""
     found = experiment(published, "dnerf")
     rows: list[list[str]] = []
     for model in ("7dgs", "7dgs_noagr", "4dgs"):

@@ -61,28 +61,39 @@ def scenes(published: Path) -> str:
     return f"{table(['scene', 'kind', *MODELS], rows, left=2)}\n\n{said}"
 
 
-def kinds(published: Path) -> str:
-    """Return the table of what each effect changes in PSNR, by kind of scene, and what its cells say."""
+def kinds(published: Path, shown: Iterable[str] = EFFECTS) -> str:
+    """Return the table of what each effect changes in PSNR, by kind of scene, and what its cells say.
+
+    Args:
+        published: the folder of reference records.
+        shown: the names of the rows, keys of EFFECTS.
+    """
     suite = {found.group.dataset: found for found in experiments(published / "suite")}
     columns = {
-        "one moving camera": ["monocular"],
+        "monocular": ["monocular"],
         "fixed cameras": ["rig", "array"],
-        "all that move": list(MOVING),
+        "all dynamic": list(MOVING),
         "static": ["static"],
     }
     rows = [
-        [name, *(_price(chain(*(suite[kind].contrast(*pair).values() for kind in each))) for each in columns.values())]
-        for name, pair in EFFECTS.items()
-    ]
+        [
+            f"{name}: {' - '.join(f'`{model}`' for model in EFFECTS[name])}",
+            *(_price(chain(*(suite[kind].contrast(*EFFECTS[name]).values() for kind in each)))
+              for each in columns.values()),
+        ]
+        for name in shown
+    ]  # fmt: skip
     said = (
-        "A cell has the mean change of PSNR in dB, half the width of its 95 % interval over scenes, and on how many "
-        "scenes PSNR rises. Bold: the interval excludes zero (no correction for many cells)."
+        "A cell has the mean difference in PSNR of the two models in dB ± half the width of its 95 % interval over "
+        "scenes, and on how many scenes PSNR rises. *X, given Y*: both models have Y, and the first has X too. Scenes "
+        "on which one of the two models does not train are left out, so counts differ. Bold: the interval excludes "
+        "zero (no correction for many cells)."
     )
-    return f"{table(['change', *columns], rows)}\n\n{said}"
+    return f"{table(['effect', *columns], rows)}\n\n{said}"
 
 
 def lengths(published: Path) -> str:
-    """Return the tables of what models reach and what effects change after three lengths, over the moving scenes."""
+    """Return the tables of what models reach and what effects change after three lengths, over the dynamic scenes."""
     moving = [found for found in experiments(published / "suite") if found.group.dataset in MOVING]
     shared = {
         scene: found
@@ -105,8 +116,8 @@ def lengths(published: Path) -> str:
                 if scene in shared
             ))  # fmt: skip
     text = table(["iterations", *MODELS], reached, left=0)
-    said = f"Means over the {count(len(shared), 'moving scene')} on which all models train, on {machine(moving[0])}."
-    return f"{text}\n\n{said}\n\n{table(['change', *(f'{name} iterations' for name in LENGTHS)], prices)}"
+    said = f"Means over the {count(len(shared), 'dynamic scene')} on which all models train, on {machine(moving[0])}."
+    return f"{text}\n\n{said}\n\n{table(['effect', *(f'{name} iterations' for name in LENGTHS)], prices)}"
 
 
 def _price(by_scene: Iterable[Values]) -> str:
@@ -138,14 +149,14 @@ class Forecast:
 
 
 def forecasts(published: Path) -> str:
-    """Return the table of rank correlations between early statistics and prices of effects, over the moving scenes."""
+    """Return the table of rank correlations between early statistics and prices of effects, over the dynamic scenes."""
     suite = [found for found in experiments(published / "suite") if found.group.dataset in MOVING]
     asked = [
         Forecast("the time screen's z", "AGR, given time and direction", _of_auto(_z)),
         Forecast("the time screen's z", "direction, given time", _of_auto(_z)),
         Forecast("loss without direction at the end of `auto`", "direction, given time", _of_auto(_probe)),
         Forecast("share of Gaussians that `auto` refines", "AGR, given time and direction", _of_auto(_refined)),
-        *(Forecast("the same change on val after 30 % of the training", effect, _early(effect))
+        *(Forecast("the same effect on val after 30 % of the iterations", effect, _early(effect))
           for effect in ("direction, given time", "AGR, given time and direction")),
     ]  # fmt: skip
     rows, unsure = [], 0
@@ -162,7 +173,7 @@ def forecasts(published: Path) -> str:
         rows.append(
             [one.name, one.effect, f"{signed(rank)} ({signed(low)} to {signed(high)})", count(len(known), "scene")]
         )
-    text = table(["known early", "change in PSNR by", "rank correlation", "over"], rows, left=2)
+    text = table(["known early", "effect", "rank correlation", "over"], rows, left=2)
     said = f"{unsure} of {len(rows)} intervals contain zero."
     if unsure == len(rows):
         said += " No prediction is shown to work."
@@ -215,7 +226,7 @@ def _best_on_val(part: float, runs: dict[str, Record]) -> Record:
 RULES: dict[str, Choice] = {
     **{NAMES[model]: itemgetter(model) for model in ("4dgs", "7dgs_noagr", "7dgs", "auto")},
     "`model=auto effects.compare=true`": itemgetter(COMPARED),
-    **{f"the best model on val after {100 * part:.0f} % of the training": partial(_best_on_val, part)
+    **{f"the best model on val after {100 * part:.0f} % of the iterations": partial(_best_on_val, part)
        for part in (0.3, 0.5, 0.7, 1.0)},
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Write blocks of README and docs/: models and config keys from the code, results from the published records.
+"""Write blocks of README and docs/: models and config keys from the code, results from the reference records.
 
 `make docs` runs it; a test fails where a block is not what this writes.
 """
@@ -121,7 +121,7 @@ def filled(page: str, published: Path = PUBLISHED) -> str:
 
     Args:
         page: its path in the project.
-        published: the folder of published records.
+        published: the folder of reference records.
     """
     text = (ROOT / page).read_text()
     for name, write in TABLES[page].items():

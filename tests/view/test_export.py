@@ -259,6 +259,8 @@ def test_a_disk_that_refuses_a_video_is_told(
     words, writer_of = [str(folder), "--video", str(video), *SHORT], cv2.VideoWriter
 
     class Full:  # not a subclass, whose memory OpenCV's bindings corrupt
+        fourcc = writer_of.fourcc
+
         def __init__(self, *arguments: object) -> None:
             self._writer = writer_of(*arguments)
             self.isOpened, self.release = self._writer.isOpened, self._writer.release
