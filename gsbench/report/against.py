@@ -59,10 +59,9 @@ RULE = (
     "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
     "of one machine with one load (within 0.5). PSNR, Gaussians and MB agree where every run is bit-equal with the "
     "other folder's run of its seed. A row also agrees where the means are within 0.01 dB, 25 % of seconds or ms, 10 % "
-    "of Gaussians or MB; or where the 95 % interval over seeds holds zero and is no wider than ± 1 dB, 50 %, 25 %; or, "
-    "of a single run, where it is in the 95 % prediction interval of the other folder's runs and as near to their "
-    "mean. It differs where p < 0.05 after Holm over all rows; else it cannot be told. The spread over seeds is the "
-    "row's own, averaged with that of all rows, which counts as four runs. The verdict of the whole is that of PSNR: "
+    "of Gaussians or MB. Otherwise it differs where p < 0.05 after Holm over all rows. Otherwise it agrees where the "
+    "95 % interval over seeds is no wider than ± 1 dB, 50 %, 25 %, or, if a folder has a single run, where the means "
+    "are as near; else it cannot be told. The spread over seeds is the row's own, averaged with that of all rows, which counts as four runs. The verdict of the whole is that of PSNR: "
     "it differs where one row does, and agrees where all rows do."
 )
 
