@@ -61,8 +61,9 @@ RULE = (
     "other folder's run of its seed. A row also agrees where the means are within 0.01 dB, 25 % of seconds or ms, 10 % "
     "of Gaussians or MB. Otherwise it differs where p < 0.05 after Holm over all rows. Otherwise it agrees where the "
     "95 % interval over seeds is no wider than ± 1 dB, 50 %, 25 %, or, if a folder has a single run, where the means "
-    "are as near; else it cannot be told. The spread over seeds is the row's own, averaged with that of all rows, which counts as four runs. The verdict of the whole is that of PSNR: "
-    "it differs where one row does, and agrees where all rows do."
+    "are as near; else it cannot be told. The spread over seeds is the row's own, averaged with that of all rows, "
+    "which counts as four runs. The verdict of the whole is that of PSNR: it differs where one row does, and agrees "
+    "where all rows do."
 )
 
 NONE = Estimate(math.nan, 0, 0, "")
