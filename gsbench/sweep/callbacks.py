@@ -10,7 +10,7 @@ import shlex
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -62,7 +62,10 @@ class WritePlan(Callback):
         is_started = is_parallel(config.hydra) and job_return.status == JobStatus.COMPLETED  # its process writes it
         if config.hydra.mode == RunMode.MULTIRUN and not is_started:
             # `return_value` would print an error, and raise it
-            write_outcome(config, job_return._return_value, self._began)
+            composed = copy.deepcopy(config)
+            with read_write(composed), open_dict(composed):
+                del composed["hydra"]
+            write_outcome(config.hydra, composed, job_return._return_value, self._began)
 
 
 def is_parallel(hydra: HydraConf) -> bool:
@@ -70,18 +73,20 @@ def is_parallel(hydra: HydraConf) -> bool:
     return bool(hydra.runtime.choices.get("launch") == "parallel")
 
 
-def write_outcome(config: DictConfig, problem: object, began: float, at_once: int = 1) -> None:
+def write_outcome(hydra: HydraConf, composed: DictConfig, problem: object, began: float, at_once: int = 1) -> None:
     """Write the outcome of a run of a sweep that ended in this process, and print the time left of the sweep.
 
     Args:
-        config: the composed config, with Hydra's own.
+        hydra: Hydra's own config of the run.
+        composed: the config of the run, without Hydra's.
         problem: why the run did not end well; None if it did.
         began: the time at which the run started, Unix seconds.
         at_once: the number of runs at a time.
     """
-    folder = Path(config.hydra.sweep.dir)
-    plan.write_ended(folder, config.hydra.job.num, ended(config, problem, folder.parents[2], began))
-    if "submitit" not in config.hydra.launcher._target_:  # Slurm starts its jobs when it can
+    folder = Path(str(hydra.sweep.dir))
+    outcome = ended(composed, hydra.runtime.choices, problem, folder.parents[2], began)
+    plan.write_ended(folder, hydra.job.num, outcome)
+    if "submitit" not in hydra.launcher._target_:  # Slurm starts its jobs when it can
         line = time_left(folder, at_once)
         print(line, end="\n" if line else "", file=sys.stderr)
 
@@ -128,7 +133,7 @@ def time_left(folder: Path, at_once: int) -> str:
     return f"{len(outcomes)} of {total} runs have ended; about {about} left"
 
 
-def ended(config: DictConfig, problem: object, results: Path, began: float) -> Ended:
+def ended(composed: DictConfig, choices: Mapping[str, str], problem: object, results: Path, began: float) -> Ended:
     """Return the outcome of a run that ended in this process: the path of its record, or why there is none.
 
     `began` is the time (Unix seconds) at which the run started; a record that is older was kept.
@@ -139,11 +144,8 @@ def ended(config: DictConfig, problem: object, results: Path, began: float) -> E
         return Ended(None, str(problem), is_refused=True)
     from gsbench.run.identity import identify  # imports torch, which the run has loaded already
 
-    composed = copy.deepcopy(config)
-    with read_write(composed), open_dict(composed):
-        del composed["hydra"]
     try:
-        path = identify(composed, config.hydra.runtime.choices).folder / FILE_NAME
+        path = identify(composed, choices).folder / FILE_NAME
     except (InputError, OmegaConfBaseException) as error:  # the latter: a key of the run has no value
         return Ended(None, one_line(error))
     if not path.exists():

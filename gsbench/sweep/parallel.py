@@ -14,7 +14,6 @@ import time
 from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import cast
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -123,7 +122,7 @@ def _work(composed: DictConfig, request: Request, parent: int, at_once: int) -> 
         stop.listen()
         if request.signal is not None:
             raise Stopped(request.signal)
-        write_outcome(cast(DictConfig, HydraConfig.instance().cfg), do(composed), began, at_once)
+        write_outcome(HydraConfig.get(), composed, do(composed), began, at_once)
     except Stopped as stopped:
         print(f"gsbench: {stopped}", file=sys.stderr)
         sys.exit(stopped.code)

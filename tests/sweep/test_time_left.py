@@ -29,10 +29,14 @@ def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -
     assert time_left(tmp_path, 2) == ""
 
 
-def test_a_sweep_prints_the_time_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a sweep that says nothing until its end, and one that is repeated and expects its kept runs to train."""
+@pytest.mark.parametrize("launch", [[], ["+launch=parallel", "launch.at_once=1"]])
+def test_a_sweep_prints_the_time_left(launch: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Catches a sweep that says nothing until its end, one that is repeated and expects its kept runs to train, and an
+    outcome that a run of a process of its own writes without its record."""
     words = overrides(write_moving_square(tmp_path / "data"), tmp_path / "results", "model=3dgs", "train.iterations=2")
-    assert main_here("-m", *words, "seed=0,1") == 0
-    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", capsys.readouterr().err)) == 1
-    assert main_here("-m", *words, "seed=0,1") == 0
-    assert "have ended" not in capsys.readouterr().err
+    assert main_here("-m", *words, "seed=0,1", *launch) == 0
+    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", capfd.readouterr().err)) == 1
+    (folder,) = (tmp_path / "results").glob("*/.sweep/*")
+    assert [outcome.reason for outcome in plan.read_ended(folder).values()] == [None, None]
+    assert main_here("-m", *words, "seed=0,1", *launch) == 0
+    assert "have ended" not in capfd.readouterr().err
