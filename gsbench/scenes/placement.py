@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.scenes.points import far_outside, is_seen
-from gsbench.scenes.scene import STANDARD, UP, Camera, Placement, Points, Scene, View, scene_extent, up_of
+from gsbench.scenes.scene import STANDARD, UP, Placement, Points, Scene, View, scene_extent, up_of
 from gsbench.scenes.trained import TrainedGaussians
 
 _SIZE_TOLERANCE = math.sqrt(2)  # a scene keeps its size if that differs by at most this factor ..
@@ -25,6 +26,7 @@ _AHEAD = 0.5  # cosine between a camera's axis and the common point, above which
 _FAR_CAMERA = 5.0  # in units of the size and of the cameras' spread: a camera farther away has a wrong pose
 _ENOUGH_SEEN = 0.25  # share of the points below which a line says how many the training cameras see
 _FAR_POINTS = 10.0  # in units of the size: a median distance of the points above which a line asks for their units
+_COORDINATES = "are the points in the coordinates and units of the cameras?"
 _MOST_PAIRS = 1 << 22  # of points and cameras whose depths are computed
 
 
@@ -65,31 +67,20 @@ def standard_scene(
     middle, size = place_and_size(centers, axes, seen)
     placement = _placement(middle, size)
     # The views of an array share their cameras.
-    cameras = {id(view.camera): _placed(view.camera, placement) for view in (*train, *val, *test)}
+    cameras = {
+        id(view.camera): replace(view.camera, viewmat=placement.viewmat_to_standard(view.camera.viewmat))
+        for view in (*train, *val, *test)
+    }
     train, val, test = (
         [replace(view, camera=cameras[id(view.camera)]) for view in views] for views in (train, val, test)
     )
     moved = torch.stack([view.camera.viewmat for view in train])
     is_near = torch.from_numpy(_are_near(centers, size))
-    if not placement.is_identity:
-        notes = (*notes, f"trained in units of {placement.unit:g} around {_text(placement.center)}, where the "
-                         f"cameras look; PLY files and positions stay in your coordinates")  # fmt: skip
-    if not is_near.all():
-        notes = (*notes, f"{int((~is_near).sum())} of {len(train)} training cameras lie far from the others, over "
-                         f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the "
-                         f"size of the scene")  # fmt: skip
+    lines = _notes(placement, is_near)
     if points is not None:
         away = float((points.means.double() - torch.from_numpy(middle)).norm(dim=1).median())
         points = Points(placement.to_standard(points.means), points.colors.float())
-        far = int(far_outside(points.means).sum())
-        if share < _ENOUGH_SEEN:
-            notes = (*notes, f"the training cameras see {share:.1%} of the points: are the points in the coordinates "
-                             f"and units of the cameras?")  # fmt: skip
-        if away > _FAR_POINTS * size > 0:
-            notes = (*notes, f"half of the points lie over {_FAR_POINTS:g} times as far away as the cameras from what "
-                             f"these look at: are the points in the coordinates and units of the cameras?")  # fmt: skip
-        if far:
-            notes = (*notes, f"{far} of {len(points.means)} points lie far outside, and do not count for its size")
+        lines += _notes_of_points(points, share, is_far_away=away > _FAR_POINTS * size > 0)
     return Scene(
         name=name,
         train=train,
@@ -102,7 +93,7 @@ def standard_scene(
         repaired=repaired,
         up=up_of(moved) if up is None else up,
         placement=placement,
-        notes=notes,
+        notes=(*notes, *lines),
     )
 
 
@@ -170,9 +161,30 @@ def _placement(middle: NDArray[np.float64], size: float) -> Placement:
     return Placement((x, y, z), unit)
 
 
-def _placed(camera: Camera, placement: Placement) -> Camera:
-    """Return a camera in the coordinates of the training, in single precision."""
-    return replace(camera, viewmat=placement.viewmat_to_standard(camera.viewmat))
+def _notes(placement: Placement, is_near: Tensor) -> list[str]:
+    """Return sentences on a scene that is moved or rescaled, and on cameras that lie far away; `is_near`: [C] bool."""
+    notes = []
+    if not placement.is_identity:
+        notes.append(f"trained in units of {placement.unit:g} around {_text(placement.center)}, where the cameras "
+                     f"look; PLY files and positions stay in your coordinates")  # fmt: skip
+    if not is_near.all():
+        notes.append(f"{int((~is_near).sum())} of {len(is_near)} training cameras lie far from the others, over "
+                     f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the size "
+                     f"of the scene")  # fmt: skip
+    return notes
+
+
+def _notes_of_points(points: Points, share: float, *, is_far_away: bool) -> list[str]:
+    """Return sentences on points of which cameras see the given share only, or which lie far away or far outside."""
+    notes = []
+    if share < _ENOUGH_SEEN:
+        notes.append(f"the training cameras see {share:.1%} of the points: {_COORDINATES}")
+    if is_far_away:
+        notes.append(f"half of the points lie over {_FAR_POINTS:g} times as far away as the cameras from what these "
+                     f"look at: {_COORDINATES}")  # fmt: skip
+    if far := int(far_outside(points.means).sum()):
+        notes.append(f"{far} of {len(points.means)} points lie far outside, and do not count for its size")
+    return notes
 
 
 def _seen_points(
