@@ -1,8 +1,8 @@
 """Start the runs of a sweep in parallel processes of this machine, a process for each run (`+launch=parallel`).
 
-A process is a fork of one that has imported torch, so that a run does not wait for imports. If one dies, for example
-because memory ran out, the others go on. A signal to any of them stops the sweep: each run saves a checkpoint, and no
-other begins.
+A process is a fork of one that has imported torch and computed nothing: a run does not wait for imports, and there are
+no threads that a fork would lose. If one dies, for example because memory ran out, the others go on. A signal to any of
+them stops the sweep: each run saves a checkpoint, and no other begins.
 """
 
 import contextlib

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from tiny_run import main_here, overrides, write_moving_square
+from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.sweep import plan
 from gsbench.sweep.callbacks import time_left
@@ -30,13 +30,18 @@ def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("launch", [[], ["+launch=parallel", "launch.at_once=1"]])
-def test_a_sweep_prints_the_time_left(launch: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_prints_the_time_left(launch: list[str], tmp_path: Path) -> None:
     """Catches a sweep that says nothing until its end, one that is repeated and expects its kept runs to train, and an
-    outcome that a run of a process of its own writes without its record."""
+    outcome that a run of a process of its own writes without its record.
+
+    In a process of its own: `+launch=parallel` forks, and a fork of a process with threads can wait for them forever.
+    """
     words = overrides(write_moving_square(tmp_path / "data"), tmp_path / "results", "model=3dgs", "train.iterations=2")
-    assert main_here("-m", *words, "seed=0,1", *launch) == 0
-    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", capfd.readouterr().err)) == 1
+    first = gsbench("-m", *words, "seed=0,1", *launch)
+    assert first.returncode == 0, first.stderr
+    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", first.stderr)) == 1
     (folder,) = (tmp_path / "results").glob("*/.sweep/*")
     assert [outcome.reason for outcome in plan.read_ended(folder).values()] == [None, None]
-    assert main_here("-m", *words, "seed=0,1", *launch) == 0
-    assert "have ended" not in capfd.readouterr().err
+    again = gsbench("-m", *words, "seed=0,1", *launch)
+    assert again.returncode == 0, again.stderr
+    assert "have ended" not in again.stderr
