@@ -59,7 +59,7 @@ def read_trained(path: Path) -> TrainedGaussians:
 
     An opacity of exactly 0 or 1, which converters of compressed files write as an infinite logit, becomes 0.001 or
     0.999, the largest alpha that is blended. The 3D filter of Mip-Splatting becomes a part of scales and opacities.
-    Lines on stderr say both, and which columns are left out.
+    Lines on stderr say both, which columns are left out, and that a deformation network beside the file is.
 
     Raises:
         InputError: the file is not such a PLY, lacks a column, has one that may change the look and is not known, or
@@ -70,6 +70,8 @@ def read_trained(path: Path) -> TrainedGaussians:
     left_out = check_columns(names, [name for columns in _COLUMNS.values() for name in columns], path)
     if left_out:
         print(f"{path}: columns that change no image are left out: {shortened(left_out)}", file=sys.stderr)
+    if networks := _deformations(path):
+        print(f"{path}: {networks[0]} is not read: the Gaussians are those before it moves them", file=sys.stderr)
     count = sum(name.startswith("f_rest_") for name in names)
     if count not in _FILE_DEGREES:
         expected = ", ".join(map(str, _FILE_DEGREES))
@@ -136,6 +138,12 @@ def share_seen(
         outside = (centers @ sides.T < -radius[:, None]).any(1)
         unseen = unseen[outside | (2 * radius * K[0, 0] < centers[:, 2])]
     return 1 - (hidden + len(unseen)) / N
+
+
+def _deformations(path: Path) -> list[Path]:
+    """Return the files of a deformation network of a trained PLY, where 4DGaussians and Deformable 3DGS write them."""
+    root = path.absolute().parents[min(2, len(path.absolute().parents) - 1)]  # ROOT/point_cloud/iteration_N/FILE.ply
+    return [*sorted(path.parent.glob("deformation*.pth")), *sorted(root.glob("deform/iteration_*/deform.pth"))]
 
 
 def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.void]:

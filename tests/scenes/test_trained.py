@@ -170,6 +170,21 @@ def test_columns_that_change_no_image_are_named_in_one_line(tmp_path: Path, caps
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("network", ["deformation.pth", "../../deform/iteration_7/deform.pth"])
+def test_a_deformation_network_beside_the_file_is_named(
+    network: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches canonical Gaussians of 4DGaussians or Deformable 3DGS that are taken for those of the trained scene."""
+    path = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    PlyData([PlyElement.describe(with_columns(), "vertex")]).write(str(path))
+    beside = (path.parent / network).resolve()
+    beside.parent.mkdir(parents=True, exist_ok=True)
+    beside.touch()
+    assert len(read_trained(path)) == N
+    assert capsys.readouterr().err == (f"{path}: {beside} is not read: the Gaussians are those before it moves them\n")
+
+
 def test_the_filter_of_mip_splatting_is_fused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches Gaussians without their 3D filter: images are not those of Mip-Splatting's export."""
     draw = np.random.default_rng(0)
