@@ -129,7 +129,7 @@ scenes:  ## render the embedded scenes anew into build/scenes, with Blender (Pyt
 	$(PYTHON) -m venv build/blender
 	build/blender/bin/pip install --quiet --disable-pip-version-check --no-deps --require-hashes --requirement locks/blender.txt
 	for scene in moving-matte pendulum suzanne; do \
-		build/blender/bin/python gsbench/scenes/generate.py $$scene build/scenes/$$scene || exit; \
+		build/blender/bin/python tools/generate_scenes.py $$scene build/scenes/$$scene || exit; \
 	done
 
 locks:  ## resolve locks/ anew, after a change of pyproject.toml or constraints.txt; asks PyPI

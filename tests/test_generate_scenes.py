@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsbench.scenes import generate
-from gsbench.scenes.generate import RECIPES, Shot
+from tools.generate_scenes import DISTANCE, RECIPES, Shot, _pack
 
 
 @pytest.mark.parametrize("name", sorted(RECIPES))
@@ -27,7 +26,7 @@ def test_cameras_look_at_the_origin(name: str) -> None:
         turn, place = shot.pose[:3, :3], shot.pose[:3, 3]
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(turn) == pytest.approx(1)
-        np.testing.assert_allclose(turn[:, 2] * generate.DISTANCE, place, atol=1e-12)  # a camera looks along -z
+        np.testing.assert_allclose(turn[:, 2] * DISTANCE, place, atol=1e-12)  # a camera looks along -z
         assert turn[2, 1] > 0  # upright
 
 
@@ -44,7 +43,7 @@ def test_held_out_views_lie_between_training_views(name: str) -> None:
     train = [shot for shot in shots if shot.split == "train"]
     for shot in (shot for shot in shots if shot.split == "test"):
         assert within(shot, train)
-        angles = [np.degrees(np.arccos(np.clip(shot.pose[:3, 2] @ one.pose[:3, 2], -1, 1))) for one in train]
+        angles = [np.degrees(np.arccos(np.clip(shot.pose[:3, 2] @ other.pose[:3, 2], -1, 1))) for other in train]
         assert 0.1 < min(angles) < 30
 
 
@@ -61,7 +60,7 @@ def test_a_picture_is_packed_without_a_change_that_shows(tmp_path: Path) -> None
     before = np.random.default_rng(0).integers(1, 256, (8, 9, 4), dtype=np.uint8)
     before[:, :4, 3] = 0
     Image.fromarray(before).save(tmp_path / "a.png")
-    generate._pack(tmp_path / "a.png")
+    _pack(tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as image:
         after = np.array(image)
     np.testing.assert_array_equal(after[:, 4:], before[:, 4:])

@@ -1,4 +1,4 @@
-"""Render the embedded scenes with Blender: ``make scenes``, or ``python generate.py SCENE FOLDER``.
+"""Render the embedded scenes with Blender: ``make scenes``, or ``python tools/generate_scenes.py SCENE FOLDER``.
 
 The result is a folder in the D-NeRF layout, which `gsbench.scenes.load` reads, and a file scene.json that says how it
 was made and what is true of it. Needs `bpy`. Imports nothing of gsbench, as Blender needs an older numpy.
@@ -189,29 +189,25 @@ def _material(
     other: tuple[float, float, float] = (0.95, 0.95, 0.9),
 ) -> Any:
     """Return a material; with roughness 1 it has no highlight and looks the same from everywhere."""
-    made = bpy.data.materials.new("material")
-    made.use_nodes = True
-    surface = made.node_tree.nodes["Principled BSDF"]
+    material = bpy.data.materials.new("material")
+    material.use_nodes = True
+    surface = material.node_tree.nodes["Principled BSDF"]
     values = {"Base Color": (*colour, 1.0), "Roughness": roughness, "Metallic": metallic, "IOR": 1.35,
               "Transmission Weight": transmission, "Specular IOR Level": 0.0 if roughness == 1 else 0.5}  # fmt: skip
     for name, value in values.items():
         surface.inputs[name].default_value = value
     if checks:
-        pattern = made.node_tree.nodes.new("ShaderNodeTexChecker")
+        pattern = material.node_tree.nodes.new("ShaderNodeTexChecker")
         pattern.inputs["Color1"].default_value, pattern.inputs["Color2"].default_value = (*colour, 1.0), (*other, 1.0)
         pattern.inputs["Scale"].default_value = 6.0
-        made.node_tree.links.new(pattern.outputs["Color"], surface.inputs["Base Color"])
-    return made
-
-
-def _effects(*, motion: bool, view_dependent: bool) -> dict[str, bool]:
-    return {"motion": motion, "view_dependent": view_dependent}
+        material.node_tree.links.new(pattern.outputs["Color"], surface.inputs["Base Color"])
+    return material
 
 
 RECIPES = {
-    "suzanne": Recipe(orbit, glass, 96, _effects(motion=True, view_dependent=True)),
-    "moving-matte": Recipe(orbit, matte, 32, _effects(motion=True, view_dependent=False)),
-    "pendulum": Recipe(rig, pendulum, 48, _effects(motion=True, view_dependent=True)),
+    "suzanne": Recipe(orbit, glass, 96, {"motion": True, "view_dependent": True}),
+    "moving-matte": Recipe(orbit, matte, 32, {"motion": True, "view_dependent": False}),
+    "pendulum": Recipe(rig, pendulum, 48, {"motion": True, "view_dependent": True}),
 }
 
 
