@@ -1,0 +1,280 @@
+"""Read runs into tables: `runs` (a row a run), `views` (a row a view of a run) and `curves` (a row a test on val).
+
+The tables RUNS, VIEWS and CURVES below declare every column, with its unit and meaning. A number that is missing is
+NaN. Everything that compares, averages or shows results starts from these tables.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from gsbench.errors import InputError, printable
+from gsbench.measure import record as files
+from gsbench.measure.record import Record
+
+RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
+TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
+GATES = ("off", "end", "both")  # values of effects.gate
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its name with its unit, its place in record.json, its type and its meaning."""
+
+    name: str
+    place: str  # "" if the column is computed from others
+    kind: type
+    meaning: str
+    unit: float = 1.0  # the number in a record is divided by it
+
+
+RUNS = (
+    Column("experiment", "experiment", str, "the runs that are compared with each other: conf/exp"),
+    Column("dataset", "dataset", str, "the data set"),
+    Column("scene", "scene", str, "the scene"),
+    Column("model", "model", str, "the model, with _agr or _noagr if this differs from its publication"),
+    Column("variant", "variant", str, 'settings that differ from the experiment\'s, such as "iterations=10"'),
+    Column("seed", "seed", int, "the seed of the run"),
+    Column("status", "status", str, "ok, failed or diverged"),
+    Column("reason", "reason", object, "why the status is not ok"),
+    Column("psnr_db", "metrics.psnr", float, "mean over the evaluated views, all pixels and channels"),
+    Column("psnr_train_db", "metrics.psnr_train", float, "the same on as many training views"),
+    Column("psnr_val_db", "", float, "on val at the end of the run: `psnr_val`"),
+    Column("psnr_channel_mean_db", "metrics.psnr_channel_mean", float, "the mean of the three channels' PSNR"),
+    Column("psnr_best_on_val_db", "metrics.psnr_best_on_val", float, "at the iteration that was best on val"),
+    Column("psnr_best_on_test_db", "metrics.psnr_best_on_test", float, "the best on test in training, which LEAKS"),
+    Column("psnr_moving_db", "metrics.psnr_moving", float, "over the pixels that move"),
+    Column("psnr_object_db", "metrics.psnr_object", float, "over the pixels of objects"),
+    Column("psnr_float32_db", "metrics.psnr_float32", float, "the most by which float32 changes the PSNR of a view"),
+    Column("psnr_background_only_db", "metrics.psnr_background_only", float, "of the background alone"),
+    Column("ssim", "metrics.ssim", float, "scikit-image, Gaussian window"),
+    Column("lpips_alex", "metrics.lpips_alex", float, "LPIPS with AlexNet"),
+    Column("lpips_vgg", "metrics.lpips_vgg", float, "LPIPS with VGG"),
+    Column("train_s", "cost.train_s", float, "seconds of all training steps, without evaluation"),
+    Column("train_min", "", float, "the same in minutes"),
+    Column("train_cpu_s", "cost.train_cpu_s", float, "CPU-seconds of all threads in these seconds"),
+    Column("load", "cost.load", float, "mean load average of the machine in training, with this run"),
+    Column("frame_ms", "cost.render_ms.p50", float, "median milliseconds of a frame, with slicing and AGR"),
+    Column("frame_p10_ms", "cost.render_ms.p10", float, "the 10th percentile"),
+    Column("frame_p90_ms", "cost.render_ms.p90", float, "the 90th percentile"),
+    Column("fps", "cost.fps", float, "frames per second: 1000 / frame_ms"),
+    Column("gaussians", "cost.num_gaussians", float, "number of Gaussians"),
+    Column("model_mb", "cost.bytes", float, "MB of the parameters", 1e6),
+    Column("peak_mb", "cost.peak_memory", float, "MB of memory at the peak of training", 1e6),
+    Column("iterations", "", float, "iterations of the training that was kept: `iterations`"),
+    Column("averaged", "averaged", int, "last iterations over which parameters were averaged; 0: none"),
+    Column("effect_time", "effects.time", bool, "Gaussians depend on time"),
+    Column("effect_direction", "effects.direction", bool, "Gaussians depend on the view direction"),
+    Column("effect_refinement", "effects.refinement", bool, "Gaussians depend on AGR, a neural network"),
+    Column("on_demand", "", bool, "effects were removed from the model or from Gaussians"),
+    Column("gate", "", str, 'when that was, such as "gate=end"; "" where it is the model\'s default'),
+    Column("config", "provenance.config", object, "all settings, a nested dict"),
+    Column("missing", "missing", object, "why metrics are missing, a dict"),
+    Column("versions", "", str, 'Python and packages, such as "numpy 2.1, python 3.11"'),
+    Column("machine", "", str, "processor, memory and threads; times are comparable only within one"),
+    Column("device", "provenance.device", str, "the processor or GPU of the training"),
+    Column("threads", "provenance.threads", int, "threads of torch and of the kernels"),
+    Column("git_commit", "provenance.git_commit", object, 'the commit, with "-dirty" if tracked code was changed'),
+    Column("config_hash", "provenance.config_hash", str, "SHA-256 of all settings"),
+    Column("data_hash", "provenance.data_hash", str, "SHA-256 of the images and cameras"),
+    Column("time", "provenance.time", str, "when the run ended, UTC"),
+)
+PARTS = {  # of a record that differ between runs: a column for each key, such as protocol_eval_split
+    "protocol": "protocol_",  # how the run was evaluated
+    "cost.stage_s": "stage_",  # the seconds of train_s by stage: stage_raster ..
+}
+VIEWS = {  # by column, the score in record.json
+    "psnr_db": "psnr", "psnr_channel_mean_db": "psnr_channel_mean", "ssim": "ssim", "lpips_alex": "lpips_alex",
+    "lpips_vgg": "lpips_vgg", "psnr_moving_db": "psnr_moving", "psnr_object_db": "psnr_object",
+}  # fmt: skip
+CURVES = {"iteration": "iteration", "train_s": "seconds", "psnr_val_db": "psnr_val"}
+NUMBERS = [column.name for column in RUNS if column.kind is float]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The tables of some runs; `views` and `curves` have the index of their run in the column `run`.
+
+    `runs` has the columns of RUNS and PARTS, and also `path` and `record`, for what no column holds.
+    """
+
+    runs: pd.DataFrame
+    views: pd.DataFrame
+    curves: pd.DataFrame
+    faults: tuple[str, ...] = ()  # why records were left out
+
+    def of(self, kept: pd.Series) -> "Results":
+        """Return the tables of some runs, such as ``results.of(results.runs.scene == "trex")``."""
+        runs = self.runs[kept]
+        views, curves = (table[table.run.isin(runs.index)] for table in (self.views, self.curves))
+        return Results(runs, views, curves, self.faults)
+
+    @property
+    def finished(self) -> "Results":
+        """Return the tables of the runs that finished without error."""
+        return self.of(self.runs.status == "ok")
+
+    def chapters(self) -> Iterator["Results"]:
+        """Yield the tables of each experiment on each data set, with times of one machine, and with labels."""
+        for _, runs in self.runs.groupby(["experiment", "dataset"]):
+            chapter = self.of(self.runs.index.to_series().isin(runs.index))
+            yield Results(labelled(of_one_machine(chapter.runs)), chapter.views, chapter.curves, self.faults)
+
+
+def load(root: Path) -> Results:
+    """Read all records under `root`; damaged and duplicate ones are left out, and `faults` says why.
+
+    Raises:
+        InputError: the folder is missing or has no record.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: expected a folder of results, found none")
+    records, faults = [], []
+    for path in files.find(root):
+        try:
+            records.append((path, files.read(path)))
+        except InputError as error:
+            faults.append(printable(error))
+    if not records and not faults:
+        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} in it or below")
+    return tables(records, faults)
+
+
+def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
+    """Return the tables of records, sorted by RUN; of two records of one run, the first one is kept."""
+    once: dict[tuple[Any, ...], tuple[Path, Record]] = {}
+    for path, record in records:
+        run = tuple(getattr(record, name) for name in RUN)
+        if run in once:
+            faults = [*faults, printable(f"{path}: the same run as {once[run][0]}; keep one of them")]
+        else:
+            once[run] = path, record
+    kept = [once[run] for run in sorted(once)]
+    runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in kept], dtype=object)
+    first = [*(column.name for column in RUNS), "path", "record"]
+    runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
+    runs = runs.astype({column.name: column.kind for column in RUNS if column.kind is not str})
+    views = [view for i, (_, record) in enumerate(kept) for view in _views(i, record)]
+    curves = [
+        {"run": i} | {name: getattr(point, of) for name, of in CURVES.items()}
+        for i, (_, record) in enumerate(kept)
+        for point in record.curve
+    ]
+    return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
+
+
+def _table(rows: list[dict[str, Any]], texts: list[str], numbers: Mapping[str, str]) -> pd.DataFrame:
+    """Return rows as a table that has all its columns even if there is no row."""
+    return pd.DataFrame(rows, columns=["run", *texts, *numbers]).astype(dict.fromkeys(numbers, float) | {"run": int})
+
+
+def row(r: Record) -> dict[str, Any]:
+    """Return a record as a row of `runs`."""
+    values = {column.name: _at(r, column.place) for column in RUNS if column.place}
+    values |= {c.name: values[c.name] / c.unit for c in RUNS if c.unit != 1 and values[c.name] is not None}
+    values |= {"psnr_val_db": psnr_val(r), "train_min": r.cost.train_s / 60 if r.cost else math.nan}
+    values |= {"iterations": iterations(r), "machine": r.provenance.machine}
+    values |= {"on_demand": r.on_demand is not None, "gate": gating(r)}
+    values |= {"versions": ", ".join(f"{name} {version}" for name, version in sorted(r.provenance.versions.items()))}
+    for place, prefix in PARTS.items():
+        values |= {f"{prefix}{name}": value for name, value in (_at(r, place) or {}).items()}
+    return values
+
+
+def _at(of: Any, place: str) -> Any:
+    """Return the value at a dotted place of a record or of its settings; None if a part of it is missing."""
+    for name in place.split("."):
+        of = of.get(name) if isinstance(of, dict) else getattr(of, name, None)
+    return of
+
+
+def _views(run: int, r: Record) -> Iterator[dict[str, Any]]:
+    """Yield the scores of each view; a finished run without scores of views has one view without a name."""
+    for view in r.per_view:
+        yield {"run": run, "view": view.name} | {name: getattr(view, of) for name, of in VIEWS.items()}
+    if r.status == "ok" and not r.per_view:
+        yield {"run": run, "view": "", "psnr_db": (r.metrics or {}).get("psnr")}
+
+
+def psnr_val(r: Record) -> float:
+    """Return PSNR on val at the end of a run, after effects were removed from its Gaussians; NaN if not measured.
+
+    The curve ends before this removal, so the PSNR that it costs is subtracted.
+    """
+    if r.protocol.get("eval_split") == "val":
+        return _number((r.metrics or {}).get("psnr"))
+    gates = r.on_demand.gates if r.on_demand else []
+    lost = sum(gate.measured_db for gate in gates if gate.step is None and gate.checked_on == "val")
+    kept = [point for point in r.curve if r.stop is None or point.iteration == r.stop.kept]
+    return _number(kept[-1].psnr_val) - lost if kept else math.nan
+
+
+def iterations(r: Record) -> float:
+    """Return the iterations of the training that was kept; NaN if the record does not hold them."""
+    value = r.length_choice.kept if r.length_choice else _at(r.provenance.config, "train.iterations")
+    return float(value) if isinstance(value, int) else math.nan
+
+
+def gating(r: Record) -> str:
+    """Return "gate=end" or the like where a run removes effects otherwise than its model does by default, else ""."""
+    gate = _at(r.provenance.config, "effects.gate") or "off"
+    is_default = gate == (_at(r.provenance.config, "model.gate") or "off")
+    return f"gate={gate}" if gate in GATES and not is_default else ""
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs without the times of other machines than that of most finished runs, which is in `timed_on`."""
+    of = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
+    machine = str(of.machine.value_counts(sort=False).idxmax())
+    times = {name: runs[name].where(runs.machine == machine) for name in TIMES}
+    return runs.assign(**times, timed_on=machine)
+
+
+def labelled(runs: pd.DataFrame) -> pd.DataFrame:
+    """Add what a run is called.
+
+    `main`: models are compared with these settings, which most models share. `compared`: the same but for ablations and
+    the removal of effects. `series`: the curve of a figure. `label`: the row of a table.
+    """
+    shared = runs[runs.status == "ok"][["model", "variant"]].drop_duplicates().variant.value_counts()
+    main = min(shared.index, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
+    gated = (runs.gate != "") & (runs.gate.nunique() > 1)
+    series = runs.model.where(~gated, runs.model + ", " + runs.gate)
+    label = (runs.model + " " + runs.variant).str.rstrip() if runs.variant.nunique() > 1 else runs.model
+    compared = runs.variant.map(common) == common(main)
+    return runs.assign(main=runs.variant == main, compared=compared, series=series, label=label)
+
+
+def covered(runs: pd.DataFrame, by: str = "label") -> list[str]:
+    """Return the scenes that every model of finished `runs` has finished: averages are over these."""
+    ok = runs[runs.status == "ok"]
+    finished = pd.crosstab(ok.scene, ok[by]) > 0
+    return list(finished.index[finished.all(axis=1)])
+
+
+def without(variant: str, *names: str) -> str:
+    """Return a variant (a text such as "train.iterations=500,model.x=1") without some of its settings.
+
+    Args:
+        variant: settings with their values, separated by commas.
+        names: the settings to leave out, each named by the last part of its key, such as "iterations".
+    """
+    return ",".join(word for word in variant.split(",") if word.partition("=")[0].rpartition(".")[2] not in names)
+
+
+def common(variant: str) -> str:
+    """Return a variant without ablations and the removal of effects, which may differ between compared models."""
+    return without(variant, "gate", "budget_db", "ablation")
+
+
+def is_ablated(variant: str) -> bool:
+    """Tell whether a variant changes one part of a model, by a file in conf/ablation."""
+    return any(word.startswith("ablation=") and word != "ablation=none" for word in variant.split(","))
