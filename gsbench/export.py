@@ -10,7 +10,6 @@ import torch
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
-from gsbench.measure.atomic import write_atomically
 from gsbench.models.query import Query
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
@@ -18,21 +17,22 @@ from gsbench.process.memory import is_out_of_memory, require
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
-from gsbench.scenes.placement import gaussians_to_user
-from gsbench.scenes.trained import ply_of
-from gsbench.view import film, paths, sequence
-from gsbench.view.gaussians import trained_of
+from gsbench.view import video
+from gsbench.view.slice_ply import SlicePly, write_clip, write_ply
+from gsbench.view.video import check_file, check_parent
 
-PATHS = {"orbit": paths.orbit, "spiral": paths.spiral}
+PATHS = {"orbit": video.orbit, "spiral": video.spiral}
+WRITTEN = ("ply", "plys", "video", "images")  # options that name what is written
 MOST_FRAMES = 100_000
-MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are told
+LEAST_FILES = 2  # of --plys: SuperSplat takes a single file for a model that stands still
+MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are reported
 MOST_SIDE = 16_384  # pixels of a rendered image, before --supersample reduces it
 VIDEO_SIDE = 720  # pixels of the shorter side of a video whose size is not named, at least
 BYTES_OF_PIXEL = 32  # of a rendered image in float32 with its alpha, a copy of it, and 8 bits of it
 
 
-class ExportRequest(NamedTuple):
-    """Hold the loaded run, its data set and the options of an export."""
+class Export(NamedTuple):
+    """The loaded run, its data set and the options of an export."""
 
     run: LoadedRun
     scene: Scene | None  # None if the export does not need the data set
@@ -42,23 +42,20 @@ class ExportRequest(NamedTuple):
 def main(arguments: list[str] | None = None) -> int:
     """Write the PLY, the video or the images of the command line; return 0, or 2 after an error message."""
     try:
-        asked = prepare(parser().parse_args(arguments))
-        said = write_ply(asked, asked.options.ply) if asked.options.ply else []
-        if asked.options.plys:
-            said += write_sequence(asked, asked.options.plys)
-        if said and not asked.options.json:
-            print("\n".join(said))
-        if asked.options.video:
-            with closing(
-                film.frames(asked.run, shots(asked, VIDEO_SIDE), asked.options.supersample)
-            ) as images:  # closes the progress bar too
-                film.write_video(images, asked.options.video, asked.options.fps)
-        if asked.options.images:
-            with closing(film.frames(asked.run, shots(asked), asked.options.supersample)) as images:
-                film.write_images(images, asked.options.images)
-        if asked.options.json:
-            written = {name: getattr(asked.options, name) for name in ("ply", "plys", "video", "images")}
-            print(as_json({"written": written, "notes": said}))
+        export = prepare(parser().parse_args(arguments))
+        options = export.options
+        notes = [*(export_ply(export) if options.ply else []), *(export_clip(export) if options.plys else [])]
+        if notes and not options.json:
+            print("\n".join(notes))
+        if options.video:
+            shots = shots_of(export, VIDEO_SIDE)
+            with closing(video.frames(export.run, shots, options.supersample)) as images:  # closes the progress bar too
+                video.write_video(images, options.video, options.fps)
+        if options.images:
+            with closing(video.frames(export.run, shots_of(export), options.supersample)) as images:
+                video.write_images(images, options.images)
+        if options.json:
+            print(as_json({"written": {name: getattr(options, name) for name in WRITTEN}, "notes": notes}))
     except (InputError, OSError, MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
@@ -70,42 +67,33 @@ def main(arguments: list[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line of the export."""
-    made = argparse.ArgumentParser(prog="python -m gsbench.export", description=__doc__)
-    made.add_argument("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
-    made.add_argument("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
-    made.add_argument("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame of a clip over time")
-    made.add_argument(
-        "--video", type=Path, metavar="OUT.mp4", help=f"write a video along --path, {VIDEO_SIDE} pixels high or more"
-    )
-    made.add_argument("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
-    made.add_argument("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")
-    seen = made.add_mutually_exclusive_group()
-    seen.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
-    seen.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply and --plys: from afar")
-    made.add_argument(
-        "--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the views it was measured on"
-    )
-    made.add_argument("--fps", type=float, default=30, help="frames a second (30)")
-    made.add_argument("--seconds", type=float, default=4, help="length of an orbit, a spiral or --plys (4)")
-    made.add_argument("--width", type=int, metavar="PIXELS", help="of the frames (of images: the training's)")
-    made.add_argument("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
-    made.add_argument(
-        "--supersample", type=int, default=1, metavar="N", help="render N times as large, and average (1)"
-    )
-    made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
-    made.add_argument(
-        "--model-module",
-        metavar="MODULE",
-        help="that registers the run's model",
-    )
-    made.add_argument("--device", default="cpu", help="cpu or cuda")
-    made.add_argument("--json", action="store_true", help="print what was written as JSON")
-    return made
+    parser = argparse.ArgumentParser(prog="python -m gsbench.export", description=__doc__)
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
+    add("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
+    add("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame of a clip over time")
+    add("--video", type=Path, metavar="OUT.mp4", help=f"write a video along --path, {VIDEO_SIDE} pixels high or more")
+    add("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
+    add("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
+    place.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply and --plys: from afar")
+    add("--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the views it was measured on")
+    add("--fps", type=float, default=30, help="frames a second (30)")
+    add("--seconds", type=float, default=4, help="length of an orbit, a spiral or --plys (4)")
+    add("--width", type=int, metavar="PIXELS", help="of the frames (of images: the training's)")
+    add("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
+    add("--supersample", type=int, default=1, metavar="N", help="render N times as large, and average (1)")
+    add("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    add("--model-module", metavar="MODULE", help="that registers the run's model")
+    add("--device", default="cpu", help="cpu or cuda")
+    add("--json", action="store_true", help="print what was written as JSON")
+    return parser
 
 
-def prepare(options: argparse.Namespace) -> ExportRequest:
+def prepare(options: argparse.Namespace) -> Export:
     """Check the options of the export and load the run and its data set; raise InputError if this fails."""
-    if not (options.ply or options.plys or options.video or options.images):
+    if not any(getattr(options, name) for name in WRITTEN):
         raise InputError("expected --ply OUT.ply, --plys FOLDER, --video OUT.mp4 or --images FOLDER, got none of them")
     if options.time is not None and not 0 <= options.time <= 1:
         raise InputError(f"--time: expected a number in [0, 1], got {options.time}")
@@ -120,33 +108,41 @@ def prepare(options: argparse.Namespace) -> ExportRequest:
         raise InputError(f"--width, --height: expected even numbers for --video, as VP9 encodes no others, got "
                          f"{options.width}, {options.height}")  # fmt: skip
     if options.ply:
-        film.check_file("--ply", options.ply, ".ply")
+        check_file("--ply", options.ply, ".ply")
     if options.video:
-        film.check_file("--video", options.video, *film.SUFFIXES)
+        check_file("--video", options.video, *video.SUFFIXES)
     if options.images:
-        film.check_parent(options.images)
+        check_parent(options.images)
     if options.plys:
-        check_sequence(options)
+        check_clip(options)
     check_device(options.device)
     import_models(options.model_module)
     run = load_run(options.run, options.device)
-    if options.time is not None and not run.scene.has_time:
-        raise InputError(f"--time: expected a scene with times, {run.scene.name} has none: leave it out")
-    if options.plys:
-        sequence.check_time(run)
-    filming = options.video or options.images
-    needed = options.camera is not None or (filming and options.path == "test")
-    return ExportRequest(run, scene_of(run, options.data_root) if needed else None, options)
+    if not run.scene.has_time and (options.plys or options.time is not None):
+        option, instead = ("--plys", "use --ply") if options.plys else ("--time", "leave it out")
+        raise InputError(f"{option}: expected a scene with times, {run.scene.name} has none: {instead}")
+    if options.plys and "time" not in run.model.observes and not run.model.refines:
+        name = run.config.model.name
+        raise InputError(f"--plys: expected a model that changes with time, {name} does not: use --ply")
+    is_filmed = options.video or options.images
+    needs_data = options.camera is not None or (is_filmed and options.path == "test")
+    return Export(run, scene_of(run, options.data_root) if needs_data else None, options)
 
 
-def check_sequence(options: argparse.Namespace) -> None:
+def check_clip(options: argparse.Namespace) -> None:
     """Raise InputError if the options of --plys do not fit together, or if its folder has files."""
+    folder = options.plys
     if options.time is not None:
         raise InputError("--plys: expected no --time, as there is a file for each time: leave it out, or use --ply")
-    if frame_count(options) < sequence.LEAST_FILES:
-        raise InputError(f"--plys: expected at least {sequence.LEAST_FILES} files, --fps {options.fps:g} and --seconds "
+    if frame_count(options) < LEAST_FILES:
+        raise InputError(f"--plys: expected at least {LEAST_FILES} files, --fps {options.fps:g} and --seconds "
                          f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply")  # fmt: skip
-    sequence.check_folder(options.plys)
+    check_parent(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--plys: expected a folder, {folder} is a file: name another")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"--plys: expected a new or an empty folder, {folder} has files, which a viewer would take "
+                         f"for frames: name another")  # fmt: skip
 
 
 def frame_count(options: argparse.Namespace) -> int:
@@ -154,82 +150,82 @@ def frame_count(options: argparse.Namespace) -> int:
     return round(options.fps * options.seconds)
 
 
-def write_ply(asked: ExportRequest, path: Path) -> list[str]:
-    """Write a model's 3D Gaussians for one camera and time as a PLY file; return their number, time and colours."""
-    run, options = asked.run, asked.options
-    query, keep = slice_place(asked, options.time)
-    trained = gaussians_to_user(trained_of(run.model, query, keep_harmonics=keep), run.scene.placement)
-    write_atomically(path, ply_of(trained))
-    culled = len(run.model) - len(trained)
+def export_ply(export: Export) -> list[str]:
+    """Write a PLY file for one camera and time; return its number of Gaussians, time and colours in words."""
+    run, path = export.run, export.options.ply
+    query, keep = slice_place(export, export.options.time)
+    ply = write_ply(run, query, path, keep_harmonics=keep)
     when = "" if query.time is None else f" at time {float(query.time):g}"
-    said = [f"{path}: {len(trained)} Gaussians{when}, colours {colours(asked, keep)}; {culled} of {len(run.model)} are "
-            f"left out, as their opacity there is below 1/255"]  # fmt: skip
-    return said + differences(asked, path, trained.from_profiles)
+    total = len(run.model)
+    text = (f"{path}: {ply.gaussians} Gaussians{when}, colours {colours(export, keep)}; {total - ply.gaussians} of "
+            f"{total} are left out, as their opacity there is below 1/255")  # fmt: skip
+    return [text, *differences(export, path, ply)]
 
 
-def write_sequence(asked: ExportRequest, folder: Path) -> list[str]:
-    """Write a PLY file for each time of a clip, as one camera sees it; return their names, numbers and colours."""
-    places = [slice_place(asked, time) for time in paths.times(frame_count(asked.options))]
+def export_clip(export: Export) -> list[str]:
+    """Write a PLY file for each time of a clip, as one camera sees it; return names, numbers and colours in words."""
+    folder = export.options.plys
+    places = [slice_place(export, time) for time in video.times(frame_count(export.options))]
     keep = places[0][1]
-    written = sequence.write_plys(asked.run, [query for query, _ in places], folder, keep_harmonics=keep)
-    said = [f"{folder}: {written.paths[0].name} to {written.paths[-1].name} at times 0 to 1, {min(written.counts)} to "
-            f"{max(written.counts)} Gaussians each, colours {colours(asked, keep)}"]  # fmt: skip
-    return said + differences(asked, folder, written.from_profiles)
+    plys = write_clip(export.run, [query for query, _ in places], folder, keep_harmonics=keep)
+    counts = [ply.gaussians for ply in plys]
+    text = (f"{folder}: {plys[0].path.name} to {plys[-1].path.name} at times 0 to 1, {min(counts)} to {max(counts)} "
+            f"Gaussians each, colours {colours(export, keep)}")  # fmt: skip
+    return [text, *differences(export, folder, plys[0])]
 
 
-def colours(asked: ExportRequest, keep: bool) -> str:
-    """Say which colours an exported slice has; `keep`: spherical harmonics."""
-    if keep:
-        return f"harmonics of degree {asked.run.model.active.sh_degree}"
-    camera, sight = asked.options.camera, asked.options.direction
+def colours(export: Export, keep_harmonics: bool) -> str:
+    """Return in words which colours an exported slice has."""
+    if keep_harmonics:
+        return f"harmonics of degree {export.run.model.active.sh_degree}"
+    camera, sight = export.options.camera, export.options.direction
     return "as seen from " + (f"direction {sight}" if camera is None else f"camera {camera}")
 
 
-def differences(asked: ExportRequest, path: Path, from_profiles: bool) -> list[str]:
-    """Say in what the Gaussians of a PLY differ from the model's, as the format of 3DGS has no field for it."""
-    said = []
-    step = asked.run.scene.placement.float_step
+def differences(export: Export, path: Path, ply: SlicePly) -> list[str]:
+    """Return in words how a PLY's Gaussians differ from the model's, as the format of 3DGS has no field for it."""
+    notes, step = [], export.run.scene.placement.float_step
     if step > MOST_STEP:
-        said += [f"{path}: so far from the origin, single precision moves means by up to {step:.1%} of the cameras' "
-                 f"distance: subtract an offset from your poses if the picture is not sharp"]  # fmt: skip
-    if from_profiles:
-        said += [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
-                 f"3DGS has no field for b; --images and --video keep the profiles"]  # fmt: skip
-    if asked.run.config.raster.antialias:
-        said += [f"{path}: trained with raster.antialias=true, which a PLY of 3DGS cannot say: switch on antialiasing "
-                 f"(Mip-Splatting) in the viewer, or small Gaussians are too opaque"]  # fmt: skip
-    return said
+        notes += [f"{path}: so far from the origin, single precision moves means by up to {step:.1%} of the cameras' "
+                  f"distance: subtract an offset from your poses if the picture is not sharp"]  # fmt: skip
+    if ply.from_profiles:
+        notes += [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
+                  f"3DGS has no field for b; --images and --video keep the profiles"]  # fmt: skip
+    if export.run.config.raster.antialias:
+        notes += [f"{path}: trained with raster.antialias=true, which a PLY of 3DGS has no field for: switch on "
+                  f"antialiasing (Mip-Splatting) in the viewer, or small Gaussians are too opaque"]  # fmt: skip
+    return notes
 
 
-def slice_place(asked: ExportRequest, time: float | None) -> tuple[Query, bool]:
+def slice_place(export: Export, time: float | None) -> tuple[Query, bool]:
     """Return the camera centre and time of exported 3D Gaussians, and whether the PLY keeps SH colours.
 
     If the user names a camera or a direction, each Gaussian has only the colour that is seen from there. If `time` is
     None, it is that of the named view, or 0.
     """
-    run, options = asked.run, asked.options
-    if asked.scene is not None and options.camera is not None:
-        view = find_view(asked.scene, options.camera)
+    run, options = export.run, export.options
+    if export.scene is not None and options.camera is not None:
+        view = find_view(export.scene, options.camera)
         return Query.of(view.camera.to(run.config.device), view.time if time is None else time), False
     if time is None and run.scene.has_time:
         time = 0.0
     keep = options.direction is None
-    center = torch.zeros(3) if keep else paths.far_along(run, direction(options.direction))
+    center = torch.zeros(3) if keep else video.far_along(run, direction(options.direction))
     return Query.at(center.to(run.config.device), time), keep
 
 
 def direction(text: str) -> torch.Tensor:
     """Parse a direction "X,Y,Z" to a unit vector [3]; raise InputError if the text is not a direction."""
     try:
-        found = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
+        vector = torch.tensor([float(word) for word in text.split(",")], dtype=torch.float64)
     except ValueError:
-        found = torch.zeros(0)
-    if found.shape != (3,) or not 0 < found.norm() < torch.inf:
+        vector = torch.zeros(0)
+    if vector.shape != (3,) or not 0 < vector.norm() < torch.inf:
         raise InputError(f"--direction: expected three numbers X,Y,Z that are not all zero, got '{text[:100]}'")
-    return (found / found.norm()).float()
+    return (vector / vector.norm()).float()
 
 
-def shots(asked: ExportRequest, least: int | None = None) -> list[paths.Shot]:
+def shots_of(export: Export, least: int | None = None) -> list[video.Shot]:
     """Return the camera and the time of each frame of a video, in the size of --width and --height.
 
     If neither is named, frames have the size of the training's images; with `least` they are even and have at least so
@@ -238,46 +234,42 @@ def shots(asked: ExportRequest, least: int | None = None) -> list[paths.Shot]:
     Raises:
         TooLargeError: a frame needs more memory than there is.
     """
-    width, height = asked.options.width, asked.options.height
-    if width is height is None and least is not None:
-        sized = [(enlarged(camera, least), time) for camera, time in path_of(asked)]
-    else:
-        sized = [(of_size(camera, width, height), time) for camera, time in path_of(asked)]
-    pixels = asked.options.supersample**2 * max(camera.width * camera.height for camera, _ in sized)
+    options = export.options
+    shots = [(sized(camera, options.width, options.height, least), time) for camera, time in path_of(export)]
+    pixels = options.supersample**2 * max(camera.width * camera.height for camera, _ in shots)
     require(BYTES_OF_PIXEL * pixels, f"frames of {pixels:,} rendered pixels",
             "lower --width, --height or --supersample")  # fmt: skip
-    return sized
+    return shots
 
 
-def enlarged(camera: Camera, least: int) -> Camera:
-    """Return a camera with even sides, the shorter one of at least `least` pixels."""
-    scale = max(1.0, least / min(camera.width, camera.height))
-    return paths.resized(camera, *(2 * max(1, round(scale * side / 2)) for side in (camera.width, camera.height)))
-
-
-def of_size(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """Return a camera with an image of the given size; a side that is None follows from the other one, and is even."""
+def sized(camera: Camera, width: int | None, height: int | None, least: int | None) -> Camera:
+    """Return a camera of the given size; a side that is None follows in proportion, and is even."""
+    if width is None and height is None and least is None:
+        return camera
     if width is not None:
-        return paths.resized(camera, width, height or 2 * max(1, round(camera.height * width / camera.width / 2)))
-    if height is not None:
-        return paths.resized(camera, 2 * max(1, round(camera.width * height / camera.height / 2)), height)
-    return camera
+        scale = width / camera.width
+    elif height is not None:
+        scale = height / camera.height
+    else:
+        scale = max(1.0, (least or 0) / min(camera.width, camera.height))
+    even = [2 * max(1, round(scale * side / 2)) for side in (camera.width, camera.height)]
+    return video.resized(camera, width or even[0], height or even[1])
 
 
-def path_of(asked: ExportRequest) -> list[paths.Shot]:
+def path_of(export: Export) -> list[video.Shot]:
     """Return the camera and the time of each frame of a video; time runs from 0 to 1, or has the value of --time."""
-    options = asked.options
+    options = export.options
     count = frame_count(options)
-    if asked.scene is not None and options.camera is not None:
-        cameras = [find_view(asked.scene, options.camera).camera] * count
-    elif asked.scene is not None:
-        views = evaluated_views(asked.scene, asked.run.config.scene.eval_split)
+    if export.scene is not None and options.camera is not None:
+        cameras = [find_view(export.scene, options.camera).camera] * count
+    elif export.scene is not None:
+        views = evaluated_views(export.scene, export.run.config.scene.eval_split)
         return [(view.camera, view.time if options.time is None else options.time) for view in views]
     else:
-        cameras = PATHS[options.path](asked.run, count)
-    if not asked.run.scene.has_time:
+        cameras = PATHS[options.path](export.run, count)
+    if not export.run.scene.has_time:
         return [(camera, None) for camera in cameras]
-    times = paths.times(count) if options.time is None else [options.time] * count
+    times = video.times(count) if options.time is None else [options.time] * count
     return list(zip(cameras, times, strict=True))
 
 

@@ -2,7 +2,7 @@
 
 submitit starts a job by the Python of this process. A script in the sweep's folder takes its place: it starts the
 image's Python. Slurm's commands are not in an image, so a job that must be requeued asks the script by an exit status.
-submitit has no option for either: this module replaces two of its methods, as `gsbench/view/door.py` does for viser.
+submitit has no option for either: this module replaces two of its methods.
 """
 
 import functools

@@ -14,19 +14,15 @@ from gsbench.process.ending import end_with
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the viewer until Ctrl-C; return 0, or 2 after an error, which is printed on stderr in one line."""
-    made = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
-    made.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
-    made.add_argument("--page", type=Path, metavar="OUT.html", help="write a page that compares two runs, and end")
-    made.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
-    made.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
-    made.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
-    made.add_argument(
-        "--model-module",
-        metavar="MODULE",
-        help="that registers the run's model",
-    )
-    made.add_argument("--device", default="cpu", help="cpu or cuda")
-    options = made.parse_args(arguments)
+    parser = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
+    parser.add_argument("--page", type=Path, metavar="OUT.html", help="write a page that compares two runs, and end")
+    parser.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
+    parser.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
+    parser.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
+    parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    options = parser.parse_args(arguments)
     try:
         serve(options)
     except (InputError, OSError) as error:
@@ -51,8 +47,8 @@ def serve(options: argparse.Namespace) -> None:
     from gsbench.models.registry import import_models
     from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
-    from gsbench.view.film import check_file
-    from gsbench.view.side_by_side import write_page
+    from gsbench.view.comparison_page import write_page
+    from gsbench.view.video import check_file
 
     if options.page is not None:
         check_file("--page", options.page, ".html", ".htm")
@@ -68,7 +64,7 @@ def serve(options: argparse.Namespace) -> None:
 
     viewer = Viewer(runs, options.host, options.port, options.data_root)
     for renderer in viewer.renderers:
-        print(f"{renderer.name}: {', '.join(renderer.measured)} ({renderer.run.folder})")
+        print(f"{renderer.name}: {', '.join(renderer.label[1:])} ({renderer.run.folder})")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
     host = f"[{options.host}]" if ":" in options.host else options.host

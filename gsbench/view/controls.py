@@ -1,27 +1,32 @@
 """Show the controls in one browser of the viewer, and turn their values into requests for frames."""
 
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-import numpy.typing as npt
 import torch
 import viser
 
+from gsbench.measure.images import to_bytes
+from gsbench.measure.quality import evenly
 from gsbench.scenes import Scene, View
-from gsbench.view.frame import CLASS, COLOURS, IMAGE, PLAIN, FrameRenderer, FrameRequest
-from gsbench.view.frusta import Frusta
+from gsbench.view.frame import CLASS, COLOURS, FLOAT32, IMAGE, PLAIN, FrameRenderer, FrameRequest
+from gsbench.view.training_views import reduced
+from gsbench.view.viser_cameras import ViserPose
 
 PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"
-Rgb = tuple[int, int, int]  # 0 to 255
 NEAREST = "nearest training view"
 NARROW = 576  # pixels; in a narrower window viser shows the panel on the image, as on a phone
 PANEL = {"x": 15.0, "y": -15.0, "width": 400.0}  # position in pixels from the left and the bottom
+MOST_FRUSTA = 100  # if there are more training views, evenly spaced ones are shown
+THUMBNAIL = 96  # pixels of the longer side of a frustum's image
+FRUSTUM = 0.06  # size of a frustum, in scene extents
+
+Handle = TypeVar("Handle", bound=viser.GuiInputHandle[Any])
+Rgb = tuple[int, int, int]  # 0 to 255
 
 
 class ShownImage(NamedTuple):
@@ -32,150 +37,160 @@ class ShownImage(NamedTuple):
 
 
 class Controls:
-    """The controls of one browser; the event `changed` is set whenever the user changes one."""
+    """The controls of one browser; a change of any calls `on_change`."""
 
     def __init__(
         self,
         client: viser.ClientHandle,
-        renderers: Sequence[FrameRenderer],
-        scene: Scene | str,
-        start: viser.InitialCameraConfig,
+        renderers: Sequence[FrameRenderer],  # of one scene, at least one
+        scene: Scene | str,  # with its training views, or why there are none
+        start: viser.InitialCameraConfig,  # to which `reset` returns
+        on_change: Callable[[], None],
+        on_save: Callable[[], None],
     ) -> None:
-        """Show the controls in the browser.
-
-        Args:
-            client: viser's handle of the browser.
-            renderers: the renderers of the models that can be shown, at least one, all of one scene.
-            scene: the scene with its training views, or a text that says why there are none.
-            start: the camera to which `reset` returns.
-        """
         self.client = client
-        self._start = start
+        self._start, self._on_change = start, on_change
         self._initial: list[tuple[viser.GuiInputHandle[Any], Any]] = []  # the controls, and their values at the start
-        self.changed = threading.Event()
         self._renderers = {renderer.name: renderer for renderer in renderers}
         self._has_time = renderers[0].run.scene.has_time
         self._trained_background = _rgb(renderers[0].run.scene.background)
         self._frozen: torch.Tensor | None = None  # viewpoint for which Gaussians are computed; None: the camera
         self._held: float | None = None  # time for which Gaussians are computed; None: the slider's
         self._played_at = time.monotonic()
+        gui = client.gui
         with self._folded("milliseconds"):
-            self.costs = client.gui.add_html("")
-        self._add_time()
+            self.costs = gui.add_html("")
+        self.time = self._watch(gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=not self._has_time))
+        self.play = self._watch(gui.add_checkbox("play", False, disabled=not self._has_time), self._start_clock)
         with self._folded("controls"):
             self._add_effects()
             self._add_images()
             self._add_views(scene)
-            self._add_buttons()
+            gui.add_button("reset", hint="the camera and all controls").on_click(lambda _: self._reset())
+            gui.add_button("save image", hint="as it is shown, with all pixels").on_click(lambda _: on_save())
 
     def _folded(self, name: str) -> AbstractContextManager[object]:
         """Return a folder, closed at first, for a narrow window, where the panel lies on the image; otherwise none."""
         narrow = self.client.camera.image_width < NARROW
         return self.client.gui.add_folder(name, expand_by_default=False) if narrow else nullcontext()
 
-    def _add_time(self) -> None:
-        """Add a slider for the time, and a check box that plays the scene."""
-        gui = self.client.gui
-        self.time = gui.add_slider("time", 0.0, 1.0, 0.005, 0.0, disabled=not self._has_time)
-        self.play = gui.add_checkbox("play", False, disabled=not self._has_time)
-        self._watch(self.time, self._change)
-        self._watch(self.play, self._start_clock)
+    def _watch(self, control: Handle, then: Callable[[], None] | None = None) -> Handle:
+        """Call `then` when a control changes, and `on_change` if the user changed it; keep its value for `reset`."""
+
+        def react(event: viser.GuiEvent[Any]) -> None:
+            if then is not None:
+                then()
+            if event.client is not None:
+                self._on_change()
+
+        control.on_update(react)
+        self._initial.append((control, control.value))
+        return control
 
     def _add_effects(self) -> None:
         """Add controls that switch off what models depend on: time, view direction and AGR (a network)."""
-        gui, renderers = self.client.gui, self._renderers.values()
+        gui, watch, renderers = self.client.gui, self._watch, self._renderers.values()
         degree = max(renderer.trained_active.sh_degree for renderer in renderers)
+        has_agr = any(renderer.has_agr for renderer in renderers)
         with gui.add_folder("effects"):
-            self.agr = gui.add_checkbox("AGR", True, disabled=not any(renderer.has_agr for renderer in renderers))
+            self.agr = watch(gui.add_checkbox("AGR", True, disabled=not has_agr))
             hold = gui.add_checkbox("freeze time", False, disabled=not self._has_time, hint="slices stay those of now")
             freeze = gui.add_checkbox("freeze direction", False, hint="slices stay those seen from here")
-            self.degree = gui.add_slider("harmonics", 0, max(degree, 1), 1, degree, disabled=degree == 0,
-                                         hint="degree of the colours; 0: the same from everywhere")  # fmt: skip
-        self._watch(self.agr, self._change)
-        self._watch(self.degree, self._change)
-        self._watch(hold, lambda _: self._hold(hold.value))
-        self._watch(freeze, lambda _: self._freeze(freeze.value))
+            self.degree = watch(gui.add_slider("harmonics", 0, max(degree, 1), 1, degree, disabled=degree == 0,
+                                               hint="degree of the colours; 0: the same from everywhere"))  # fmt: skip
+
+        def hold_time() -> None:
+            self._held = self.now if hold.value else None
+
+        def freeze_direction() -> None:
+            position = torch.tensor(self.client.camera.position, dtype=torch.float32)
+            self._frozen = position if freeze.value else None
+
+        watch(hold, hold_time)
+        watch(freeze, freeze_direction)
 
     def _add_images(self) -> None:
         """Add controls that select the models, what the colours of their Gaussians mean, and the background."""
-        gui, names = self.client.gui, list(self._renderers)
+        gui, watch, names = self.client.gui, self._watch, list(self._renderers)
         several = len(names) > 1
         self.mode = gui.add_dropdown("show", (ONE, SIDE, WIPE), initial_value=SIDE if several else ONE)
-        first = gui.add_dropdown("model", names, visible=several)
-        colours = gui.add_dropdown("colours", COLOURS, hint="of the Gaussians; float32: the bound on the error")
-        second = gui.add_dropdown("second model", names, initial_value=names[min(1, len(names) - 1)], visible=several)
-        others = gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS, visible=several)
-        self.wipe = gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self.background = gui.add_rgb("background", self._trained_background, hint="of the colours 'image'")
+        first = watch(gui.add_dropdown("model", names, visible=several))
+        colours = watch(gui.add_dropdown("colours", COLOURS, hint="of Gaussians; float32: the bound on the error"))
+        second = watch(
+            gui.add_dropdown("second model", names, initial_value=names[1 if several else 0], visible=several)
+        )
+        others = watch(gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS,
+                                        visible=several))  # fmt: skip
+        self.wipe = watch(gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False))
+        self.background = watch(gui.add_rgb("background", self._trained_background, hint="of the colours 'image'"))
         self.legend = gui.add_html("")
         self._choices = (first, colours), (second, others)
 
-        def show(_: object) -> None:
+        def show_choices() -> None:
             second.visible = several and self.mode.value != ONE
             others.visible, self.wipe.visible = self.mode.value != ONE, self.mode.value == WIPE
-            self.changed.set()
 
-        self._watch(self.mode, show)
-        for control in (first, colours, second, others, self.wipe, self.background):
-            self._watch(control, self._change)
+        watch(self.mode, show_choices)
 
     def _add_views(self, scene: Scene | str) -> None:
         """Add controls that show the training views; they are disabled if the data set is not available."""
         gui, why = self.client.gui, scene if isinstance(scene, str) else None
-        frusta = gui.add_checkbox("training cameras", False, disabled=why is not None,
-                                  hint=why or "click on one to stand there; not side by side")  # fmt: skip
+        cameras = gui.add_checkbox("training cameras", False, disabled=why is not None,
+                                   hint=why or "click on one to stand there; not side by side")  # fmt: skip
         self.compare = gui.add_checkbox(NEAREST, False, disabled=why is not None,
                                         hint=why or "its image, the model's, and the error")  # fmt: skip
         if isinstance(scene, str):
             return
-        handles = Frusta(self.client, scene, self._go_to)
+        frusta: list[viser.CameraFrustumHandle] = []
 
-        def show_frusta(_: object) -> None:
+        def show_frusta(_: object = None) -> None:
             """Show the frusta unless two images are side by side, whose cameras are not that of the browser's scene."""
-            frusta.disabled = self.layout == SIDE
-            handles.show(frusta.value and self.layout != SIDE)
+            cameras.disabled = self.layout == SIDE
+            visible = cameras.value and not cameras.disabled
+            if visible and not frusta:
+                views = evenly(scene.train, min(MOST_FRUSTA, len(scene.train)))
+                frusta.extend(self._add_frustum(i, view, FRUSTUM * scene.extent) for i, view in enumerate(views))
+            for frustum in frusta:
+                frustum.visible = visible
 
-        show_frusta(None)
+        def show_panel() -> None:
+            panel.visible = self.compare.value
+
+        show_frusta()
         self.mode.on_update(show_frusta)
-        self._watch(frusta, show_frusta)
+        self._watch(cameras, show_frusta)
         panel = gui.add_panel(visible=False)
         with panel.add_tab(NEAREST):
             self.comparison = gui.add_html("")
         panel.float(**PANEL)
+        self._watch(self.compare, show_panel)
 
-        def show(_: object) -> None:
-            panel.visible = self.compare.value
-            self.changed.set()
+    def _add_frustum(self, number: int, view: View, size: float) -> viser.CameraFrustumHandle:
+        """Add the frustum of a training view with its image; a click on it moves camera and time there."""
+        view = view.to("cpu")
+        pose = ViserPose.of(view.camera)
+        frustum = self.client.scene.add_camera_frustum(
+            f"/training/{number}",
+            fov=pose.fov,
+            aspect=view.camera.width / view.camera.height,
+            scale=size,
+            color=(200, 120, 40),
+            image=reduced(to_bytes(view.image.numpy()), THUMBNAIL, by_longer_side=True),
+            wxyz=pose.wxyz,
+            position=pose.position,
+        )
 
-        self._watch(self.compare, show)
+        def go_there(_: object) -> None:
+            with self.client.atomic():
+                self.client.camera.position, self.client.camera.wxyz = pose.position, pose.wxyz
+            if view.time is not None:
+                self._set_time(view.time)
+            self._on_change()
 
-    def _add_buttons(self) -> None:
-        """Add a button that brings everything back to the start, and one that stores the image as a file."""
-        self.client.gui.add_button("reset", hint="the camera and all controls").on_click(self._reset)
-        self.save = self.client.gui.add_button("save image", hint="as it is shown, with all pixels")
+        frustum.on_click(go_there)
+        return frustum
 
-    def _watch(self, control: viser.GuiInputHandle[Any], callback: Callable[[object], None]) -> None:
-        """Call `callback` whenever the user changes a control, and note the value to which `reset` returns."""
-        control.on_update(callback)
-        self._initial.append((control, control.value))
-
-    # ---- what happens in the browser
-
-    def _change(self, _: object) -> None:
-        self.changed.set()
-
-    def _hold(self, on: bool) -> None:
-        """Keep showing the Gaussians of the present time, or let the time slider change them again."""
-        self._held = self.now if on else None
-        self.changed.set()
-
-    def _freeze(self, on: bool) -> None:
-        """Keep showing the Gaussians computed for the present viewpoint, or let them follow the camera again."""
-        position = torch.tensor(np.asarray(self.client.camera.position), dtype=torch.float32)
-        self._frozen = position if on else None
-        self.changed.set()
-
-    def _reset(self, _: object) -> None:
+    def _reset(self) -> None:
         """Return to the camera and the controls of the start; the clip stops before its time is set."""
         for control, value in reversed(self._initial):
             control.value = value
@@ -184,39 +199,32 @@ class Controls:
             camera.position, camera.look_at, camera.fov = self._start.position, self._start.look_at, self._start.fov
             if self._start.up is not None:
                 camera.up_direction = self._start.up
-        self.changed.set()
+        self._on_change()
 
-    def _start_clock(self, _: object) -> None:
+    def _set_time(self, value: float) -> None:
+        self.time.value = value  # type: ignore[misc]  # viser declares it read-only to mypy
+
+    def _start_clock(self) -> None:
         self._played_at = time.monotonic()
-        self.changed.set()
-
-    def _go_to(self, position: npt.NDArray[np.float64], wxyz: npt.NDArray[np.float64], time: float | None) -> None:
-        """Move the browser's camera and time to those of a training view."""
-        with self.client.atomic():
-            self.client.camera.position, self.client.camera.wxyz = position, wxyz
-        if time is not None:
-            self.time.value = time  # type: ignore[misc]  # viser declares it read-only to mypy
-        self.changed.set()
 
     def advance(self) -> None:
         """Move the time slider forward while the scene is played."""
-        now = time.monotonic()
+        before = self._played_at
+        self._start_clock()
         if self.play.value:
-            on = (now - self._played_at) / PLAYED_S
-            self.time.value = (self.now + on) % 1.0  # type: ignore[misc]  # as above
-        self._played_at = now
+            self._set_time((self.now + (self._played_at - before) / PLAYED_S) % 1.0)
 
     # ---- the requests; a browser may send any value
 
     @property
     def now(self) -> float:
         """Return the time of the slider, in [0, 1]."""
-        return _within(self.time.value, 0.0, 1.0)
+        return _share(self.time.value)
 
     @property
     def wiped(self) -> float:
         """Return the fraction of the image width, in [0, 1], at which a wipe between two images has its edge."""
-        return _within(self.wipe.value, 0.0, 1.0)
+        return _share(self.wipe.value)
 
     @property
     def layout(self) -> str:
@@ -232,22 +240,21 @@ class Controls:
             for model, colours in choices
         ]
 
-    def request(self, colours: str) -> FrameRequest:
-        """Return the request for a frame at the present time, with the settings of the controls and with `colours`.
+    @property
+    def shows_float32(self) -> bool:
+        """Whether an image is the bound on the error of float32."""
+        return any(colours == FLOAT32 for _, colours in self.shown())
 
-        For `float32` the image is requested, whose error it is about.
-        """
+    def request(self, colours: str) -> FrameRequest:
+        """Return the request for a frame with the present settings; for `float32` of the image whose error it is."""
         request = self._request_at(self.now, colours if colours in PLAIN else IMAGE)
-        background = _checked(self.background.value)
-        if background in (None, self._trained_background):
+        background = self.background.value
+        if background == self._trained_background or not _is_rgb(background):
             return request
         return request._replace(background=torch.tensor(background) / 255)
 
     def request_of(self, view: View) -> FrameRequest:
-        """Return the request for a frame at the time of a training view, with the settings of the controls.
-
-        Its background is that of the training, as that of the training view.
-        """
+        """Return the request for a frame at the time of a training view, on the background of the training."""
         return self._request_at(view.time, IMAGE)
 
     def _request_at(self, time: float | None, colours: str) -> FrameRequest:
@@ -264,11 +271,10 @@ def _rgb(color: Sequence[float]) -> Rgb:
     return red, green, blue
 
 
-def _checked(color: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Return a colour of a browser, or None if it is not one."""
-    return color if len(color) == 3 and all(0 <= value <= 255 for value in color) else None
+def _is_rgb(color: tuple[int, ...]) -> bool:
+    return len(color) == 3 and all(0 <= value <= 255 for value in color)
 
 
-def _within(value: float, low: float, high: float) -> float:
-    """Clamp a value to [low, high]; NaN becomes low."""
-    return low if math.isnan(value) else min(max(value, low), high)
+def _share(value: float) -> float:
+    """Clamp a value to [0, 1]; NaN becomes 0."""
+    return 0.0 if math.isnan(value) else min(max(value, 0.0), 1.0)

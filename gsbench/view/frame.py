@@ -1,14 +1,19 @@
-"""Render and time one frame of the viewer: one model as the browser requests it, or two models in one image."""
+"""Render and time one frame of the viewer: a model as the controls ask for it, or two models in one image."""
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from gsbench.effects.gate import most_cost
 from gsbench.effects.picture import cost_colors, effect_set_colors
+from gsbench.kernels.tape import Differentiable, Tape
 from gsbench.measure.images import Pixels, inferno, to_bytes
+from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
@@ -16,9 +21,14 @@ from gsbench.models.twins import doubled, exact_model
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
-from gsbench.view.labels import measured
-from gsbench.view.rounding import Rounding, check_exactness, rounding
-from gsbench.view.stages import RASTER, SLICE, StageWatch, part_of
+from gsbench.view.float32_error import Float32Error, check_exactness, float32_error
+from gsbench.view.labels import measurements, short_names
+
+SLICE, RASTER = "slice", "raster"  # compute the 3D Gaussians at a time and a viewpoint, and rasterize them
+STAGES = {SLICE: ("AGR", "conditioning", "colours"), RASTER: ("projection", "binning", "blending")}
+# By the name of a kernel operation: the stage that ends after it, and the stage that ends before it.
+_ENDS = {"refine": "AGR", "show_colors": "colours", "project": "projection", "blend": "blending"}
+_FOLLOWS = {"show_colors": "conditioning", "blend": "binning"}
 
 DIVIDER = (255, 255, 255)  # RGB of the line between two models
 IMAGE, CLASS, COST = PLAIN = ("image", "class", "cost")  # meanings of the Gaussians' colours
@@ -28,57 +38,80 @@ EVERY_DEGREE = 3  # the highest SH degree of any model
 
 
 class FrameRequest(NamedTuple):
-    """The settings of a requested frame: time, viewpoint of the Gaussians, AGR (a network) or not, SH, colours."""
+    """The settings of a requested frame."""
 
     time: float | None  # in [0, 1]; None if the scene is static
-    center: torch.Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
+    center: Tensor | None = None  # [3], viewpoint for which Gaussians are computed; None: the camera's
     agr: bool = True  # whether AGR (neural refinement) is on, if the model has it
     sh_degree: int = EVERY_DEGREE  # highest SH degree of the colours
     colours: str = IMAGE  # one of PLAIN
-    background: torch.Tensor | None = None  # [3] RGB in [0, 1], of the colours IMAGE; None: that of the training
+    background: Tensor | None = None  # [3] RGB in [0, 1], of the colours IMAGE; None: that of the training
 
 
 class FrameCost(NamedTuple):
     """The milliseconds that one model takes for a frame, by stage."""
 
     name: str  # of the model
-    ms: dict[str, float]  # by stage, in their order
+    ms: dict[str, float]  # by stage, in their order; a part that torch computes is a single stage
 
     def of(self, part: str) -> float:
-        """Return the milliseconds of one part of a frame: to compute conditional 3D Gaussians, or to rasterize them."""
-        return sum(ms for stage, ms in self.ms.items() if part_of(stage) == part)
+        """Return the milliseconds of SLICE or RASTER."""
+        return sum(ms for stage, ms in self.ms.items() if stage == part or stage in STAGES[part])
 
 
 class Frame(NamedTuple):
-    """A rendered image, and the milliseconds that each model in it took."""
+    """A rendered image, and the milliseconds of each model in it."""
 
     image: Pixels  # [H, W, 3] RGB
-    costs: tuple[FrameCost, ...]  # of each model in it
+    costs: tuple[FrameCost, ...] = ()
 
     def ms(self, part: str) -> float:
-        """Return the milliseconds of one part of a frame, summed over its models; see `FrameCost.of`."""
+        """Return the milliseconds of SLICE or RASTER, summed over the models."""
         return sum(cost.of(part) for cost in self.costs)
 
 
-class FrameRenderer:
-    """Renders the frames of one run's model, one frame at a time.
+class StageWatch(Tape):
+    """Times the stages of a frame: ``with StageWatch(device) as watch: ...; watch.end(SLICE); ...; watch.end(RASTER)``.
 
-    The renderer switches parts of the model, such as AGR (a network), on and off for each frame. Therefore it cannot
-    render two frames at once.
+    The watch takes the place of the tape that records kernel calls for the backward pass, so it sees when each kernel
+    begins and ends. It records no call, so there are no gradients.
     """
 
-    def __init__(self, run: LoadedRun, name: str, most_cost: float) -> None:
-        """Prepare to render the model of a run; nothing is rendered yet.
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self._laps = Laps(device)
 
-        Args:
-            run: the run with the model to render.
-            name: the name of the run, which no other one has.
-            most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
-                The value is the same for all models that are compared.
-        """
-        self.run = run
-        self.name = name
-        self.measured = measured(run)
+    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+        """Run a kernel; if a stage of the frame ends just before or just after this kernel, store the stage's time."""
+        if operation.name in _FOLLOWS:
+            self._laps.end(_FOLLOWS[operation.name])
+        outputs, _ = operation.run(tensors, numbers)
+        if operation.name in _ENDS:
+            self._laps.end(_ENDS[operation.name])
+        return outputs
+
+    def end(self, part: str) -> None:
+        """End SLICE or RASTER: the time since its last stage belongs to that stage; without stages it is one."""
+        last = STAGES[part][-1]
+        self._laps.end(last if self._laps.has(last) else part)
+
+    @property
+    def ms(self) -> dict[str, float]:
+        """Return the milliseconds of each stage that was measured."""
+        return {name: 1000 * seconds for name, seconds in self._laps.seconds.items()}
+
+
+class FrameRenderer:
+    """Renders the frames of one run's model, one at a time, as it switches parts of the model on and off for each."""
+
+    def __init__(
+        self,
+        run: LoadedRun,
+        name: str,  # which no other run has
+        most_cost: float,  # ns that the most expensive Gaussian of all compared models adds to a frame: the brightest
+    ) -> None:
+        self.run, self.name, self.most_cost = run, name, most_cost
+        self.label = (name, *measurements(run))
         self.trained_active = run.model.active
         self.has_agr = run.model.refinement is not None
         self.counts = run.model.count_by_effects()  # number of Gaussians by the set of their effects
@@ -99,11 +132,11 @@ class FrameRenderer:
         shown = inferno(image[..., 0].cpu().numpy()) if request.colours == COST else to_bytes(image.cpu().numpy())
         return Frame(shown, (FrameCost(self.name, ms),))
 
-    def image(self, camera: Camera, request: FrameRequest) -> torch.Tensor:
+    def image(self, camera: Camera, request: FrameRequest) -> Tensor:
         """Render the image of a camera as floats, [H, W, 3], from which PSNR can be computed."""
         return self._timed_image(camera, request)[0].cpu()
 
-    def rounding(self, camera: Camera, request: FrameRequest) -> Rounding:
+    def float32_error(self, camera: Camera, request: FrameRequest) -> Float32Error:
         """Bound the error of float32 in each pixel of the image of a camera; other frames can be rendered meanwhile.
 
         Raises:
@@ -118,10 +151,11 @@ class FrameRenderer:
                 run.model.active = self._exact.active = self._active(request)
                 single = run.model.slice(Query.at(camera.center if center is None else center, request.time))
             query = Query.at(doubled(camera).center if center is None else center.double(), request.time)
-            return rounding(self._exact, single, query, camera, self._background(request), run.config.raster.antialias)
+            background = self._background(request)
+            return float32_error(self._exact, single, query, camera, background, run.config.raster.antialias)
 
-    def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[torch.Tensor, dict[str, float]]:
-        """Render the image of a camera, and return it with the milliseconds of each stage."""
+    def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[Tensor, dict[str, float]]:
+        """Return the image of a camera, [H, W, 3], and the milliseconds of each stage."""
         run, device = self.run, self.run.config.device
         camera = camera.to(device)
         center = camera.center if request.center is None else request.center.to(device)
@@ -137,16 +171,22 @@ class FrameRenderer:
             watch.end(RASTER)
             return image[0], watch.ms
 
-    def _background(self, request: FrameRequest) -> torch.Tensor:
-        """Return the background colour of a requested frame, [3]; a legend explains the colours on that of its own."""
+    def _background(self, request: FrameRequest) -> Tensor:
+        """Return the background colour of a frame, [3]; colours with a legend keep the background of that legend."""
         usual = self._backgrounds[request.colours]
         return usual if request.background is None or request.colours != IMAGE else request.background.to(usual)
 
     def _active(self, request: FrameRequest) -> ActiveComponents:
-        """Return the active parts of the model, such as AGR (a network), without those that the user switches off."""
+        """Return the parts of the model that are on in a frame: as trained, without those that are switched off."""
         trained = self.trained_active
         degree = min(request.sh_degree, trained.sh_degree)
         return replace(trained, refine=request.agr and trained.refine, sh_degree=degree)
+
+
+def renderers_of(runs: Sequence[LoadedRun]) -> list[FrameRenderer]:
+    """Return a renderer for each of several runs that are compared: distinct names, one colour scale of costs."""
+    most = max(most_cost(run.model) for run in runs)
+    return [FrameRenderer(run, name, most) for run, name in zip(runs, short_names(runs), strict=True)]
 
 
 def beside(left: Frame, right: Frame) -> Frame:

@@ -1,4 +1,4 @@
-"""Name runs by what tells them apart, and write on an image which run it shows and what was measured of it."""
+"""Name runs by what differs between them, and write on an image which run it shows and what was measured of it."""
 
 import functools
 import math
@@ -28,10 +28,10 @@ def short_names(runs: Sequence[LoadedRun]) -> list[str]:
     """Return a name for each run: its model, and the words of its variant that not all of the runs have.
 
     Where these are equal, words of its other folders follow, those of seedK first, until no two runs have one name.
-    Runs that no word tells apart have their folders as names.
+    Runs that no word distinguishes have their folders as names.
     """
     names = [[label_of(run.config)] for run in runs]
-    for parts in zip_longest(*(_parts(run.folder) for run in runs), fillvalue=""):
+    for parts in zip_longest(*(_folders_by_weight(run.folder) for run in runs), fillvalue=""):
         words = [part.split(",") for part in parts]
         shared = set.intersection(*map(set, words))
         for name, its in zip(names, words, strict=True):
@@ -41,20 +41,20 @@ def short_names(runs: Sequence[LoadedRun]) -> list[str]:
     return [str(run.folder) for run in runs]
 
 
-def _parts(folder: Path) -> list[str]:
-    """Return the names in EXPERIMENT/SCENE/MODEL,VARIANT/seedK that tell runs apart, the most telling one first."""
+def _folders_by_weight(folder: Path) -> list[str]:
+    """Return the names in EXPERIMENT/SCENE/MODEL,VARIANT/seedK, those first that a user knows runs by."""
     *outer, model, seed = ("", *Path(os.path.abspath(folder)).parts)
     return [model, seed, *reversed(outer)]
 
 
-def measured(run: LoadedRun) -> Label:
+def measurements(run: LoadedRun) -> Label:
     """Return what was measured of a run, in rows: PSNR of the evaluated views, Gaussians, MB and iterations."""
-    steps, whole = f"{run.step:,}", f"{run.config.train.iterations:,}"
+    steps, planned = f"{run.step:,}", f"{run.config.train.iterations:,}"
     return (
         _psnr(run),
         f"{len(run.model):,} Gaussians",
         f"{run.model.stored_bytes() / 1e6:,.2f} MB",
-        f"{steps} iterations" if steps == whole else f"{steps} of {whole} iterations",
+        f"{steps} iterations" if steps == planned else f"{steps} of {planned} iterations",
     )
 
 
@@ -71,9 +71,9 @@ def _psnr(run: LoadedRun) -> str:
 
 
 def labelled(image: Pixels, edge: int, left: Label, right: Label | None = None) -> Pixels:
-    """Return an image with a label on each side of `edge`, a column; `right` is None where one image is shown alone.
+    """Return an image with a label at the top on each side of the column `edge`; `right` is None for one image alone.
 
-    Labels are at the top, and as large in any resolution of the window's image.
+    Labels are as large in any resolution of the window's image.
     """
     height, width = image.shape[:2]
     size = max(LEAST_SIZE, min(math.sqrt(width * height) / 64, width / 28))
@@ -87,12 +87,12 @@ def labelled(image: Pixels, edge: int, left: Label, right: Label | None = None) 
 
 @functools.lru_cache(maxsize=64)
 def _ink(label: Label, size: float) -> Pixels:
-    """Draw the rows of a label, [h, w]: 255 is ink, 0 is paper."""
+    """Draw the rows of a label, the first one bold, [h, w]: 255 is ink, 0 is paper."""
     fonts = [ImageFont.truetype(FONTS / name, size) for name in ("DejaVuSans-Bold.ttf", "DejaVuSans.ttf")]
     rows = [(text, fonts[i > 0]) for i, text in enumerate(label)]
     margin, line = size / 2, 1.3 * size
-    wide = math.ceil(max(font.getlength(text) for text, font in rows) + 2 * margin)
-    paper = Image.new("L", (wide, math.ceil(line * len(rows) + 2 * margin)))
+    width = math.ceil(max(font.getlength(text) for text, font in rows) + 2 * margin)
+    paper = Image.new("L", (width, math.ceil(line * len(rows) + 2 * margin)))
     for i, (text, font) in enumerate(rows):
         ImageDraw.Draw(paper).text((margin, margin + i * line), text, fill=255, font=font)
     return np.asarray(paper)

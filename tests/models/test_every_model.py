@@ -24,7 +24,7 @@ from gsbench.scenes.trained import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.train.penalties import MeanOpacity, MeanSize
 from gsbench.train.penalties.base import Penalty
-from gsbench.view.gaussians import has_harmonics, trained_of
+from gsbench.view.slice_ply import has_harmonics, trained_of
 
 N = 12
 GIVEN: dict[Any, Any] = {float: 0.5, int: 1, bool: True}  # for an option without a default, by its type

@@ -18,7 +18,7 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import rasterize_slice, render
 from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
-from gsbench.view.gaussians import trained_of
+from gsbench.view.slice_ply import trained_of
 
 N = 6
 SEEN = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)

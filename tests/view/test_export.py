@@ -1,13 +1,15 @@
-"""The command `python -m gsbench.export`: what it writes, and everything that can be asked wrong."""
+"""The command `python -m gsbench.export`: PLY files, a clip of them, videos and images, and what can be asked wrong."""
 
 import errno
 import json
 import math
 import os
 import shutil
+import stat
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -18,120 +20,225 @@ from gsbench.export import direction, main
 from gsbench.measure.images import to_bytes
 from gsbench.models import GaussianModel, Gaussians3D, Query, build, cameras
 from gsbench.models.render import render
-from gsbench.run.load import load_run
+from gsbench.run.load import LoadedRun, load_run
 from gsbench.run.setup import load_scene
 from gsbench.scenes import Points
-from gsbench.scenes.trained import read_trained
-from gsbench.view import film, paths
+from gsbench.scenes.trained import TrainedGaussians, ply_of, read_trained
+from gsbench.view import slice_ply, video
 
-SHORT = ("--seconds", "0.5", "--fps", "8")
+FOUR = ("--seconds", "0.5", "--fps", "8")
+ALONG = ("--direction", "0,0,-1")
+PLAIN_SLICE = GaussianModel.slice
 
 
-@pytest.mark.parametrize("place", [("--camera", "2"), ("--direction", "0,0,-1", "--time", "0.5")])
+def exports(run: Path, *words: object) -> bool:
+    """Whether the command with these words does its work; the working folder is the test's."""
+    return main([str(run), *map(str, words)]) == 0
+
+
+def replace_run(monkeypatch: pytest.MonkeyPatch, run: LoadedRun) -> None:
+    """Let the command load this run."""
+    monkeypatch.setattr("gsbench.export.load_run", lambda *_: run)
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+# ---- PLY files
+
+
+@pytest.mark.parametrize("place", [("--camera", "2"), (*ALONG, "--time", "0.5")])
 def test_a_ply_says_what_it_holds(
     place: tuple[str, ...], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a count of what is left out that is not that of the file."""
-    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place]) == 0
+    assert exports(folder, "--ply", "a.ply", *place)
     kept, total = len(read_trained(tmp_path / "a.ply")), len(load_run(folder).model)
-    said = capsys.readouterr().out
-    assert f": {kept} Gaussians at time" in said
-    assert f"{total - kept} of {total} are left out" in said
-    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), *place, "--json"]) == 0
+    text = capsys.readouterr().out
+    assert f": {kept} Gaussians at time" in text
+    assert f"{total - kept} of {total} are left out" in text
+    assert exports(folder, "--ply", "a.ply", *place, "--json")
     printed = json.loads(capsys.readouterr().out)
-    assert printed["written"] == {"ply": str(tmp_path / "a.ply"), "plys": None, "video": None, "images": None}
-    assert printed["notes"] == said.splitlines()
+    assert printed["written"] == {"ply": "a.ply", "plys": None, "video": None, "images": None}
+    assert printed["notes"] == text.splitlines()
 
 
-def test_a_ply_says_that_it_has_no_profiles(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("option", [("--ply", "a.ply"), ("--plys", "a", *FOUR)])
+def test_a_ply_says_how_it_differs_from_the_model(
+    option: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches Beta profiles that are lost without a word, and a word about them where there are none."""
-    plain, asked = GaussianModel.slice, [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "2"]
-    assert main(asked) == 0
-    assert "profiles" not in capsys.readouterr().out
+    """Catches Beta profiles or an antialiasing filter that are lost without a word, and a word where there are none."""
 
-    def shaped(self: GaussianModel, query: Query) -> Gaussians3D:
-        seen = plain(self, query)
-        return seen._replace(shapes=torch.full_like(seen.opacities, 2.0))
+    def with_profiles(self: GaussianModel, query: Query) -> Gaussians3D:
+        gaussians = PLAIN_SLICE(self, query)
+        return gaussians._replace(shapes=torch.full_like(gaussians.opacities, 2.0))
 
-    monkeypatch.setattr(GaussianModel, "slice", shaped)
-    assert main(asked) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert len(said) == 2
-    assert "a.ply: their alpha profiles (1 - r^2)^b are now the Gaussians" in said[1]
+    assert exports(folder, *option, *ALONG)
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    if option[1] == "a":
+        shutil.rmtree("a")
+    run = load_run(folder)
+    run.config.raster.antialias = True
+    replace_run(monkeypatch, run)
+    monkeypatch.setattr(GaussianModel, "slice", with_profiles)
+    assert exports(folder, *option, *ALONG)
+    _, profiles, filtered = capsys.readouterr().out.splitlines()
+    assert f"{option[1]}: their alpha profiles (1 - r^2)^b are now the Gaussians" in profiles
+    assert f"{option[1]}: trained with raster.antialias=true" in filtered
 
 
-def test_a_ply_says_that_viewers_must_antialias(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("place", [("--camera", "2"), ALONG, ()])
+def test_each_file_of_a_clip_is_the_slice_of_its_time(
+    place: tuple[str, ...], folder: Path, other_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a PLY that other viewers show with too opaque Gaussians, without a word."""
-    asked = [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "2"]
-    assert main(asked) == 0
-    assert "antialias" not in capsys.readouterr().out
-    loaded = load_run(folder)
-    loaded.config.raster.antialias = True
-    monkeypatch.setattr("gsbench.export.load_run", lambda *_: loaded)
-    assert main(asked) == 0
-    assert "a.ply: trained with raster.antialias=true" in capsys.readouterr().out
+    """Catches a time that is left out or repeated, a named view's time in every file, and lost harmonics."""
+    run = folder if place else other_folder
+    (tmp_path / "clip").mkdir()
+    assert exports(run, "--plys", "clip", *place, *FOUR, "--json")
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["written"]["plys"] == "clip"
+    written = sorted((tmp_path / "clip").iterdir())
+    assert [path.name for path in written] == ["frame0000.ply", "frame0001.ply", "frame0002.ply", "frame0003.ply"]
+    for path, time in zip(written, ("0", "0.3333333333333333", "0.6666666666666666", "1"), strict=True):
+        assert exports(run, "--ply", "a.ply", "--time", time, *place)
+        assert path.read_bytes() == (tmp_path / "a.ply").read_bytes()
+    assert len({path.read_bytes() for path in written}) == 4
+    counts = [len(read_trained(path)) for path in written]
+    (text,) = printed["notes"]
+    assert f"frame0000.ply to frame0003.ply at times 0 to 1, {min(counts)} to {max(counts)} Gaussians" in text
+    assert ("harmonics" in text) == (not place)
 
 
-def test_a_video_has_its_frames(folder: Path, tmp_path: Path) -> None:
-    """Catches a video that cannot be read, or with another length, size or rate than was asked for."""
-    path = tmp_path / "a.mp4"
-    assert main([str(folder), "--video", str(path), *SHORT]) == 0
-    video = cv2.VideoCapture(str(path))
-    count = 0
-    while video.read()[0]:
-        count += 1
-    assert (count, video.get(cv2.CAP_PROP_FPS)) == (4, 8)
-    assert [*tmp_path.iterdir()] == [path]
+def test_names_of_a_long_clip_sort(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches numbers of different width, which viewers sort wrongly."""
+    monkeypatch.setattr(slice_ply, "write_ply", lambda _, __, path, **___: path.name)
+    names: Any = slice_ply.write_clip(load_run(folder), [None] * 10_001, tmp_path / "a", keep_harmonics=False)  # type: ignore[list-item]
+    assert sorted(names) == names
+    assert (names[0], names[-1]) == ("frame00000.ply", "frame10000.ply")
+
+
+@pytest.mark.parametrize("still", ["scene", "model"])
+def test_what_stands_still_is_sent_to_a_single_ply(
+    still: str, other_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a clip of equal files, and --time without effect in a scene without times."""
+    run = load_run(other_folder)
+    if still == "scene":
+        run = replace(run, scene=replace(run.scene, has_time=False))
+    else:
+        monkeypatch.setattr(type(run.model), "observes", ())
+    replace_run(monkeypatch, run)
+    assert not exports(other_folder, "--plys", "clip", *FOUR)
+    text = capsys.readouterr().err
+    assert f"expected a {still} " in text
+    assert "use --ply" in text
+    if still == "scene":
+        assert not exports(other_folder, "--ply", "a.ply", "--time", "0.5")
+        assert "--time: expected a scene with times" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_frame_appears_when_it_is_whole(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches half a frame after a kill: while a file is flushed, there are only the earlier frames, all whole."""
+    plain, present = os.fsync, []
+
+    def watching(descriptor: int) -> None:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            present.append([len(read_trained(path)) for path in sorted((tmp_path / "clip").glob("*.ply"))])
+        plain(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watching)
+    assert exports(folder, "--plys", "clip", *ALONG, *FOUR)
+    assert [len(counts) for counts in present] == [0, 1, 2, 3]
+    assert all(counts == present[-1][: len(counts)] for counts in present)
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt(), None])
+def test_a_clip_that_fails_leaves_nothing(
+    failure: BaseException | None, is_there: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a short clip that looks like a whole one, a folder of the user's that is removed, and a time not named.
+
+    Without a failure of the disk the model fades out at the end.
+    """
+    calls = []
+
+    def failing(trained: TrainedGaussians) -> bytes:
+        calls.append(trained)
+        if len(calls) == 3 and failure is not None:
+            raise failure
+        return ply_of(trained)
+
+    def fading(self: GaussianModel, query: Query) -> Gaussians3D:
+        gaussians = PLAIN_SLICE(self, query)
+        assert query.time is not None
+        return gaussians._replace(opacities=gaussians.opacities * (query.time < 0.9))
+
+    monkeypatch.setattr(slice_ply, "ply_of", failing)
+    if failure is None:
+        monkeypatch.setattr(GaussianModel, "slice", fading)
+    if is_there:
+        (tmp_path / "clip").mkdir()
+    with pytest.raises(KeyboardInterrupt) if isinstance(failure, KeyboardInterrupt) else nullcontext():
+        assert not exports(folder, "--plys", "clip", *ALONG, *FOUR)
+    assert len(calls) == 3
+    assert ("no Gaussian can be seen from this place at time 1:" in capsys.readouterr().err) == (failure is None)
+    assert [*tmp_path.rglob("*")] == ([tmp_path / "clip"] if is_there else [])
+
+
+def test_a_direction_has_no_length() -> None:
+    """Catches a slice seen from the middle of the model, as a long or a short direction is rounded to none."""
+    for text in ("0,3,4", "0,3e38,4e38", "0,3e-45,4e-45"):
+        torch.testing.assert_close(direction(text), torch.tensor([0, 0.6, 0.8]))
+
+
+# ---- videos and images
 
 
 @pytest.mark.parametrize("path", ["test", "orbit", "spiral"])
 def test_images_are_what_the_model_renders(path: str, folder: Path, tmp_path: Path) -> None:
     """Catches swapped colours, and test views that are rendered at other times than their own."""
-    assert main([str(folder), "--images", str(tmp_path / "a"), "--path", path, *SHORT]) == 0
+    assert exports(folder, "--images", "a", "--path", path, *FOUR)
     images = [cv2.imread(str(file)) for file in sorted((tmp_path / "a").iterdir())]
     run = load_run(folder)
     if path != "test":
         assert len(images) == 4
         assert any((image != images[0]).any() for image in images)
         return
-    views = load_scene(run.config).test
-    assert len(images) == len(views)
-    for image, view in zip(images, views, strict=True):
+    for image, view in zip(images, load_scene(run.config).test, strict=True):
         rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
-        expected = to_bytes(rendered.numpy())
-        assert (image[:, :, ::-1] == expected).all()
+        assert (image[:, :, ::-1] == to_bytes(rendered.numpy())).all()
 
 
 def test_time_runs_once_unless_it_stands_still(folder: Path, tmp_path: Path) -> None:
     """Catches a clip that is cut off, and --time without effect."""
     for more, differ in (((), True), (("--time", "0.5"), False)):
         out = tmp_path / f"still{differ}"
-        assert main([str(folder), "--images", str(out), "--camera", "train/r_0", *SHORT, *more]) == 0
+        assert exports(folder, "--images", out, "--camera", "train/r_0", *FOUR, *more)
         first, *others = [cv2.imread(str(file)) for file in sorted(out.iterdir())]
         assert any((image != first).any() for image in others) == differ
 
 
-@pytest.mark.parametrize(
-    ("words", "size"),
-    [
-        (("--width", "34"), (34, 34)),
-        (("--height", "24"), (24, 24)),
-        (("--width", "40", "--height", "20", "--supersample", "3"), (40, 20)),
-    ],
-)
-def test_frames_have_the_size_that_is_asked_for(
-    words: tuple[str, ...], size: tuple[int, int], folder: Path, tmp_path: Path
-) -> None:
-    """Catches sides that are swapped, and one that has not the proportion of the training's images."""
-    assert main([str(folder), "--video", str(tmp_path / "a.mp4"), "--images", str(tmp_path / "a"), *SHORT, *words]) == 0
-    assert {cv2.imread(str(file)).shape for file in (tmp_path / "a").iterdir()} == {(size[1], size[0], 3)}
-    read, frame = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()
-    assert read
-    assert frame.shape == (size[1], size[0], 3)
+def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) -> None:
+    """Catches a video of another length, rate or size, and a side that has not the proportion of the training's."""
+    for words, size in (
+        (("--width", 34), (34, 34)),
+        (("--height", 24), (24, 24)),
+        (("--width", 40, "--height", 20, "--supersample", 3), (40, 20)),
+    ):
+        assert exports(folder, "--video", "a.mp4", "--images", "a", *FOUR, *words)
+        assert {cv2.imread(str(file)).shape for file in (tmp_path / "a").iterdir()} == {(size[1], size[0], 3)}
+        read = cv2.VideoCapture("a.mp4")
+        frames = []
+        while (step := read.read())[0]:
+            frames.append(step[1].shape)
+        assert frames == [(size[1], size[0], 3)] * 4
+        assert read.get(cv2.CAP_PROP_FPS) == 8
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "a.mp4"]
 
 
 @pytest.mark.parametrize(
@@ -140,30 +247,31 @@ def test_frames_have_the_size_that_is_asked_for(
      ((80, 160), (720, 1440))],
 )  # fmt: skip
 def test_a_video_is_large_enough_to_be_looked_at(
-    size: tuple[int, int], expected: tuple[int, int], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    size: tuple[int, int], expected: tuple[int, int], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a stamp of 80 pixels, sides that VP9 cannot encode, other proportions, and PNGs of another size."""
     run = load_run(folder)
-    run = replace(run, scene=replace(run.scene, width=size[0], height=size[1]))
-    monkeypatch.setattr("gsbench.export.load_run", lambda *_: run)
-    written: dict[Path, set[tuple[int, int]]] = {}
-    monkeypatch.setattr(film, "frames", lambda _, shots, __: iter(shots))
+    replace_run(monkeypatch, replace(run, scene=replace(run.scene, width=size[0], height=size[1])))
+    written: dict[str, set[tuple[int, int]]] = {}
+    monkeypatch.setattr(video, "frames", lambda _, shots, __: iter(shots))
     for name in ("write_video", "write_images"):
-        monkeypatch.setattr(film, name, lambda images, path, *_: written.update(
-            {path: {(camera.width, camera.height) for camera, _ in images}}))  # fmt: skip
+        monkeypatch.setattr(video, name, lambda images, path, *_: written.update(
+            {str(path): {(camera.width, camera.height) for camera, _ in images}}))  # fmt: skip
     monkeypatch.setattr("gsbench.export.closing", nullcontext)
-    assert main([str(folder), "--video", str(tmp_path / "a.mp4"), "--images", str(tmp_path / "a"), *SHORT]) == 0
-    assert written == {tmp_path / "a.mp4": {expected}, tmp_path / "a": {size}}
+    assert exports(folder, "--video", "a.mp4", "--images", "a", *FOUR)
+    assert written == {"a.mp4": {expected}, "a": {size}}
 
 
 def test_another_size_shows_the_same(folder: Path) -> None:
     """Catches a larger image that is a crop, a wide one that is stretched, and a centre that moves."""
     run = load_run(folder)
-    (camera,) = paths.orbit(run, 1)
+    (camera,) = video.orbit(run, 1)
     plain, fine, wide, averaged = (
-        torch.from_numpy(next(film.frames(run, [(one, 0.5)], n))).double() / 255
-        for one, n in ((camera, 1), (paths.resized(camera, 48, 48), 1), (paths.resized(camera, 16, 8), 1), (camera, 3))
-    )
+        torch.from_numpy(next(video.frames(run, [(sized, 0.5)], n))).double() / 255
+        for sized, n in (
+            (camera, 1), (video.resized(camera, 48, 48), 1), (video.resized(camera, 16, 8), 1), (camera, 3)
+        )
+    )  # fmt: skip
     blocks = fine.reshape(16, 3, 16, 3, 3).mean((1, 3))
     assert (plain - plain.mean((0, 1))).abs().mean() > 0.02
     torch.testing.assert_close(averaged, blocks, rtol=0, atol=1 / 255)
@@ -176,10 +284,10 @@ def test_an_orbit_looks_at_the_model(folder: Path, up: tuple[float, float, float
     """Catches cameras that look away, stand on their heads, are left-handed or turn about another axis."""
     run = load_run(folder)
     run = replace(run, scene=replace(run.scene, up=list(up)))
-    for camera in paths.orbit(run, 5):
+    for camera in video.orbit(run, 5):
         height = (camera.center - cameras.middle(run.model)) @ torch.tensor(up)
         assert float(height) == pytest.approx(run.scene.extent * math.sin(cameras.ELEVATION), rel=1e-4)
-    for camera in (*paths.orbit(run, 5), *paths.spiral(run, 5), paths.around(run, 0.0, 1.5707963)):
+    for camera in (*video.orbit(run, 5), *video.spiral(run, 5), video.around(run, 0.0, 1.5707963)):
         rotation = camera.viewmat[:3, :3]
         torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
         assert torch.linalg.det(rotation) > 0
@@ -198,65 +306,72 @@ def test_the_middle_is_a_median_by_opacity() -> None:
     torch.testing.assert_close(cameras.middle(model), torch.full((3,), 3.0))
 
 
+# ---- what fails
+
+PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
+
+
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "text"),
     [
         ((), "--ply OUT.ply"),
-        (("--ply", "a.ply"), "--direction"),
-        (("--ply", "a.ply", "--camera", "6"), "0 to 5"),
-        (("--ply", "a.ply", "--camera", "²"), "0 to 5"),
-        (("--ply", "a.ply", "--camera", "train/r_9"), "train/r_9"),
-        (("--ply", "a.ply", "--camera", "9" * 5000), "0 to 5"),
-        (("--ply", "a.ply", "--camera", "\x1b[31m"), r"\x1b[31m"),
-        (("--ply", "a.ply", "--camera", "a\nb"), r"'a\nb'"),
+        (PLY, "--direction"),
+        ((*PLY, "--camera", "6"), "0 to 5"),
+        ((*PLY, "--camera", "²"), "0 to 5"),
+        ((*PLY, "--camera", "train/r_9"), "train/r_9"),
+        ((*PLY, "--camera", "9" * 5000), "0 to 5"),
+        ((*PLY, "--camera", "\x1b[31m"), r"\x1b[31m"),
+        ((*PLY, "--camera", "a\nb"), r"'a\nb'"),
         (("--ply", "a\0.ply", "--camera", "0"), "a file"),
         (("--ply", ".", "--camera", "0"), "a file"),
         (("--ply", "a.spz", "--camera", "0"), "ends in .ply, got 'a.spz'"),
-        (("--video", "a.ts"), "--video: expected a file name that ends in .mp4"),
-        (("--video", "a.png"), "--video: expected a file name that ends in .mp4"),
-        (("--images", "a\0"), "a file"),
-        (("--video", "a\0.mp4"), "a file"),
-        (("--ply", "a.ply", "--direction", "," * 5000), "--direction"),
-        (("--ply", "a.ply", "--direction", "1e300,1e300,1e300"), "--direction"),
-        (("--ply", "a.ply", "--camera", "0", "--data-root", "/nowhere"), "--data-root"),
-        (("--ply", "a.ply", "--direction", "0,0,0"), "--direction"),
-        (("--ply", "a.ply", "--direction", "1,x"), "--direction"),
-        (("--ply", "a.ply", "--time", "1.5"), "--time"),
-        (("--ply", "a.ply", "--time", "nan"), "--time"),
         (("--ply", "nowhere/a.ply"), "nowhere"),
+        ((*PLY, "--direction", "," * 5000), "--direction"),
+        ((*PLY, "--direction", "1e300,1e300,1e300"), "--direction"),
+        ((*PLY, "--direction", "0,0,0"), "--direction"),
+        ((*PLY, "--direction", "1,x"), "--direction"),
+        ((*PLY, "--camera", "0", "--data-root", "/nowhere"), "--data-root"),
+        ((*PLY, "--time", "1.5"), "--time"),
+        ((*PLY, "--time", "nan"), "--time"),
+        ((*PLY, "--device", "gpu"), "device"),
+        (("--video", "a.ts"), "--video: expected a file name that ends in .mp4"),
+        (("--video", "a\0.mp4"), "a file"),
+        (("--images", "a\0"), "a file"),
         (("--images", "nowhere/a"), "nowhere"),
-        (("--video", "a.nothing"), "a.nothing"),
-        (("--video", "a.mp4", "--fps", "0"), "--fps"),
-        (("--video", "a.mp4", "--seconds", "inf"), "--seconds"),
-        (("--ply", "a.ply", "--device", "gpu"), "device"),
-        (("--video", "a.mp4", "--width", "0"), "--width"),
-        (("--video", "a.mp4", "--height", "-1"), "--height"),
-        (("--video", "a.mp4", "--width", "9000", "--supersample", "2"), "at most 16384"),
-        (("--video", "a.mp4", "--supersample", "0"), "--supersample"),
-        (("--video", "a.mp4", "--width", "33"), "even numbers"),
+        ((*VIDEO, "--fps", "0"), "--fps"),
+        ((*VIDEO, "--seconds", "inf"), "--seconds"),
+        ((*VIDEO, "--width", "0"), "--width"),
+        ((*VIDEO, "--height", "-1"), "--height"),
+        ((*VIDEO, "--width", "9000", "--supersample", "2"), "at most 16384"),
+        ((*VIDEO, "--supersample", "0"), "--supersample"),
+        ((*VIDEO, "--width", "33"), "even numbers"),
+        (CLIP, "--direction"),
+        ((*CLIP, *ALONG, "--time", "0.5"), "--time"),
+        ((*CLIP, *ALONG, "--fps", "1", "--seconds", "1.4"), "at least 2 files"),
+        (("--plys", "nowhere/clip", *ALONG), "nowhere"),
+        (("--plys", "full", *ALONG), "full has files"),
+        (("--plys", "full/file", *ALONG), "is a file"),
     ],
 )
-def test_what_is_asked_wrong_is_told_in_one_line(
-    words: tuple[str, ...], said: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_what_is_asked_wrong_is_answered_in_one_line(
+    words: tuple[str, ...], text: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Catches a stack trace, a message that does not name the option, and a file that is left behind."""
-    monkeypatch.chdir(tmp_path)
-    assert main([str(folder), *words]) == 2
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    assert not exports(folder, *words)
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
-    assert said in line
+    assert text in line
     assert line.isprintable()
     assert len(line) < 400
-    assert [*tmp_path.iterdir()] == []
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "full", tmp_path / "full" / "file"]
 
 
-def test_a_disk_that_refuses_a_video_is_told(
+def test_a_disk_that_refuses_a_video_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a video that lacks frames, as OpenCV does not tell that a disk is full, in the place of a whole one, and
-    an error that names a temporary file."""
-    video = tmp_path / "a.mp4"
-    words, writer_of = [str(folder), "--video", str(video), *SHORT], cv2.VideoWriter
+    """Catches a video that lacks frames, as OpenCV does not report a full disk, and an error of a temporary file."""
+    path, writer_of = tmp_path / "a.mp4", cv2.VideoWriter
 
     class Full:  # not a subclass, whose memory OpenCV's bindings corrupt
         fourcc = writer_of.fourcc
@@ -271,85 +386,60 @@ def test_a_disk_that_refuses_a_video_is_told(
     def refused(self: Path, *_: object) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
 
-    assert main(words) == 0
-    whole = video.read_bytes()
+    assert exports(folder, "--video", path, *FOUR)
+    whole = path.read_bytes()
     with monkeypatch.context() as patched:
         patched.setattr(cv2, "VideoWriter", Full)
-        assert main(words) == 2
-    assert f"{video}: expected a video of 4 frames, 0 can be read" in capfd.readouterr().err
-    assert [*tmp_path.iterdir()] == [video]
+        assert not exports(folder, "--video", path, *FOUR)
+    assert f"{path}: expected a video of 4 frames, 0 can be read" in capfd.readouterr().err
+    assert [*tmp_path.iterdir()] == [path]
     with monkeypatch.context() as patched:
         patched.setattr(Path, "write_bytes", refused)
         patched.setattr(Path, "unlink", refused)
-        assert main(words) == 2
-    assert f"gsbench.export: {video}: Read-only file system" in capfd.readouterr().err
-    assert video.read_bytes() == whole
+        assert not exports(folder, "--video", path, *FOUR)
+    assert f"gsbench.export: {path}: Read-only file system" in capfd.readouterr().err
+    assert path.read_bytes() == whole
 
 
-@pytest.mark.parametrize(
-    "error",
-    [MemoryError(), RuntimeError("[enforce fail at alloc_cpu.cpp:118] DefaultCPUAllocator: can't allocate memory"),
-     OSError(errno.ENOMEM, "Cannot allocate memory"), TooLargeError("frames need 9.0 GiB of memory")],
-)  # fmt: skip
-@pytest.mark.parametrize("option", ["--ply", "--video", "--images"])
+@pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4"), ("--images", "a")])
 def test_memory_that_runs_out_ends_in_one_line(
-    error: Exception, option: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """Catches a traceback for an allocation that fails while the export is at work, and a file that it leaves."""
+    """Catches a traceback for an allocation that fails, a file that it leaves, and a mistake of gsbench called so."""
+    errors = [
+        RuntimeError("expected a tensor of another shape"),
+        MemoryError(),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:118] DefaultCPUAllocator: can't allocate memory"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        TooLargeError("frames need 9.0 GiB of memory"),
+    ]
 
     def fails(*_: object) -> None:
-        raise error
+        raise errors[-1]
 
-    monkeypatch.setattr("gsbench.view.film.render", fails)
-    monkeypatch.setattr("gsbench.export.ply_of", fails)
-    name = {"--ply": "a.ply", "--video": "a.mp4", "--images": "a"}[option]
-    assert main([str(folder), option, str(tmp_path / name), "--camera", "0", *SHORT]) == 2
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
-    assert line.startswith("gsbench.export: out of memory: ")
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
-def test_an_error_of_another_kind_is_no_lack_of_memory(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a mistake in gsbench that is said to be a lack of memory."""
-
-    def fails(*_: object) -> None:
-        raise RuntimeError("expected a tensor of another shape")
-
-    monkeypatch.setattr("gsbench.export.ply_of", fails)
+    monkeypatch.setattr("gsbench.view.video.render", fails)
+    monkeypatch.setattr("gsbench.view.slice_ply.ply_of", fails)
+    while len(errors) > 1:
+        assert not exports(folder, *words, "--camera", "0", *FOUR)
+        (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
+        assert line.startswith("gsbench.export: out of memory: ")
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+        errors.pop()
     with pytest.raises(RuntimeError, match="another shape"):
-        main([str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "0"])
-
-
-def test_a_direction_has_no_length() -> None:
-    """Catches a slice seen from the middle of the model, as a long or a short direction is rounded to none."""
-    for text in ("0,3,4", "0,3e38,4e38", "0,3e-45,4e-45"):
-        torch.testing.assert_close(direction(text), torch.tensor([0, 0.6, 0.8]))
-
-
-def test_a_scene_without_times_has_none_to_ask_for(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches --time without effect."""
-    run = load_run(folder)
-    static = replace(run, scene=replace(run.scene, has_time=False))
-    monkeypatch.setattr("gsbench.export.load_run", lambda *_: static)
-    assert main([str(folder), "--ply", str(tmp_path / "a.ply"), "--direction", "0,0,1", "--time", "0.5"]) == 2
-    assert "--time: expected a scene with times" in capsys.readouterr().err
+        exports(folder, *words, "--camera", "0", *FOUR)
 
 
 def test_a_folder_without_a_checkpoint_and_other_data_are_refused(
     folder: Path, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches images of one scene that are taken for another's, and a stack trace for a wrong path."""
-    assert main([str(tmp_path), "--ply", str(tmp_path / "a.ply")]) == 2
+    assert not exports(tmp_path, *PLY)
     assert "checkpoint.pt" in capsys.readouterr().err
     shutil.copytree(square, tmp_path / "moved")
-    asked = [str(folder), "--ply", str(tmp_path / "a.ply"), "--camera", "0", "--data-root", str(tmp_path / "moved")]
-    assert main(asked) == 0
+    words = (*PLY, "--camera", "0", "--data-root", tmp_path / "moved")
+    assert exports(folder, *words)
     transforms = tmp_path / "moved" / "square" / "transforms_train.json"
     transforms.write_text(transforms.read_text().replace("0.7", "0.8"))
-    assert main(asked) == 2
+    assert not exports(folder, *words)
     assert "expected the data of the training" in capsys.readouterr().err

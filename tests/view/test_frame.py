@@ -1,34 +1,51 @@
-"""A frame of the viewer: what is switched is one client's, colours and costs are right, two models share an image."""
+"""A frame of the viewer: its settings are its own, costs and the bound on float32 are right, two models share it."""
 
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from models.small import lively
 
+from gsbench import kernels
 from gsbench.config import Config
 from gsbench.effects import picture
 from gsbench.effects.gate import most_cost
+from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
-from gsbench.measure.images import to_bytes
+from gsbench.measure.images import Pixels, rounding_image, to_bytes
 from gsbench.models import Query
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.render import rasterize_slice, render
+from gsbench.models.twins import exact_model, render_twins
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
-from gsbench.view import paths
-from gsbench.view.__main__ import main
-from gsbench.view.client import camera_at
-from gsbench.view.frame import CLASS, COST, Frame, FrameCost, FrameRenderer, FrameRequest, beside, wiped
-from gsbench.view.resolution import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Resolution
-from gsbench.view.stages import RASTER, SLICE, STAGES
+from gsbench.view import video
+from gsbench.view.float32_error import check_exactness
+from gsbench.view.frame import (
+    CLASS,
+    COST,
+    RASTER,
+    SLICE,
+    STAGES,
+    Frame,
+    FrameCost,
+    FrameRenderer,
+    FrameRequest,
+    beside,
+    wiped,
+)
 
 SIZE = 40
+BLACK = torch.zeros(3)
+NOW = FrameRequest(0.4)
+needs_kernels = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
 
 
 def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> FrameRenderer:
@@ -37,9 +54,8 @@ def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> 
     model.set_active(ActiveComponents(3, True, True))
     model.effect_sets = effect_sets
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
-    return FrameRenderer(
-        LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0")), "7dgs", most_cost(model)
-    )
+    run = LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0"))
+    return FrameRenderer(run, "7dgs", most_cost(model))
 
 
 def of_every_effect_set() -> EffectSets:
@@ -50,72 +66,68 @@ def of_every_effect_set() -> EffectSets:
 
 
 @pytest.fixture(scope="module")
-def one() -> FrameRenderer:
+def agr() -> FrameRenderer:
     return renderer()
 
 
-def seen_from(azimuth: float, one: FrameRenderer) -> Camera:
-    return paths.around(one.run, azimuth, 0.3)
+def camera_of(azimuth: float, agr: FrameRenderer) -> Camera:
+    return video.around(agr.run, azimuth, 0.3)
 
 
-def test_a_frame_is_the_models_image(one: FrameRenderer) -> None:
+def image_of(model: Any, camera: Camera) -> Pixels:
+    return to_bytes(render(model, camera, 0.4, BLACK).cpu().numpy())
+
+
+def test_a_frame_is_the_models_image(agr: FrameRenderer) -> None:
     """Catches a viewer that shows another picture than the one that is measured, and times of zero."""
-    camera = seen_from(0.5, one)
-    frame = one.render(camera, FrameRequest(0.4))
-    assert (frame.image == to_bytes(render(one.run.model, camera, 0.4, torch.zeros(3)).cpu().numpy())).all()
+    camera = camera_of(0.5, agr)
+    frame = agr.render(camera, NOW)
+    assert (frame.image == image_of(agr.run.model, camera)).all()
     assert frame.image.max() > 30
     assert frame.ms(SLICE) > 0
     assert frame.ms(RASTER) > 0
 
 
-def test_a_frozen_direction_slices_from_there_and_draws_from_here(one: FrameRenderer) -> None:
-    """Catches a frozen slice that is also drawn from its old place, or that is not frozen."""
-    here, there = seen_from(0.5, one), seen_from(2.0, one)
-    frozen = one.render(here, FrameRequest(0.4, there.center)).image
-    gaussians = one.run.model.slice(Query.at(there.center, 0.4))
-    expected = to_bytes(rasterize_slice(gaussians, here, torch.zeros(3), AUTO).image[0].cpu().numpy())
-    assert (frozen == expected).all()
-    assert (frozen != one.render(here, FrameRequest(0.4)).image).any()
+def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
+    """Catches AGR, a degree or a viewpoint without effect, or that the next frame still has, or that training had not.
 
-
-def test_agr_is_switched_for_one_frame(one: FrameRenderer) -> None:
-    """Catches a client that switches AGR off for all others, or on where the training had not yet."""
-    camera = seen_from(0.5, one)
-    on, off, again = (one.render(camera, FrameRequest(0.4, agr=agr)).image for agr in (True, False, True))
-    assert (on != off).any()
-    assert (on == again).all()
-    early = renderer()
-    early.trained_active = replace(early.trained_active, refine=False)
-    assert (early.render(camera, FrameRequest(0.4)).image == off).all()
-
-
-def test_harmonics_are_cut_for_one_frame(one: FrameRenderer) -> None:
-    """Catches colours that still change with the direction at degree 0, and a cut that the next frame still has."""
-    camera = seen_from(0.5, one)
-    images = [one.render(camera, FrameRequest(0.4, sh_degree=degree)).image for degree in (0, 1, 3)]
-    assert (one.render(camera, FrameRequest(0.4)).image == images[2]).all()
-    flat = lively("7dgs_agr", count=80).float()
+    A frozen viewpoint slices from there and draws from here.
+    """
+    here, there = camera_of(0.5, agr), camera_of(2.0, agr)
+    plain = agr.render(here, NOW).image
+    gaussians = agr.run.model.slice(Query.at(there.center, 0.4))
+    frozen = to_bytes(rasterize_slice(gaussians, here, BLACK, AUTO).image[0].cpu().numpy())
+    flat = lively("7dgs_agr", count=80).float().requires_grad_(False)
     flat.splats["shN"].data.zero_()
-    assert (to_bytes(render(flat.requires_grad_(False), camera, 0.4, torch.zeros(3)).cpu().numpy()) == images[0]).all()
-    assert len({image.tobytes() for image in images}) == 3
+    changed = {
+        "viewpoint": agr.render(here, FrameRequest(0.4, there.center)).image,
+        "AGR": agr.render(here, FrameRequest(0.4, agr=False)).image,
+        "degree 0": agr.render(here, FrameRequest(0.4, sh_degree=0)).image,
+        "degree 1": agr.render(here, FrameRequest(0.4, sh_degree=1)).image,
+    }
+    assert (changed["viewpoint"] == frozen).all()
+    assert (changed["degree 0"] == image_of(flat, here)).all()
+    assert len({image.tobytes() for image in (plain, *changed.values())}) == 5
+    assert (agr.render(here, NOW).image == plain).all()
     early = renderer()
-    early.trained_active = replace(early.trained_active, sh_degree=1)
-    assert (early.render(camera, FrameRequest(0.4)).image == images[1]).all()
+    for name, trained in (("AGR", {"refine": False}), ("degree 1", {"sh_degree": 1})):
+        early.trained_active = replace(agr.trained_active, **trained)
+        assert (early.render(here, NOW).image == changed[name]).all()
 
 
 @pytest.mark.parametrize("effect_sets", [None, of_every_effect_set()], ids=["without effect sets", "with effect sets"])
 def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets | None) -> None:
     """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background."""
-    made = renderer(effect_sets=effect_sets)
-    camera = seen_from(0.5, made)
-    panels = picture.draw(made.run.model, camera, 0.4, torch.zeros(3))[picture.LINE :]
+    gated = renderer(effect_sets=effect_sets)
+    camera = camera_of(0.5, gated)
+    panels = picture.draw(gated.run.model, camera, 0.4, BLACK)[picture.LINE :]
     factor = -(-picture.LEAST_WIDTH // SIZE)
     step = factor * SIZE + picture.GAP
     for i, colours in enumerate(("image", CLASS, COST)):
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
-        assert (made.render(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
-    assert made.counts == made.run.model.count_by_effects()
-    assert all(made.counts[name] == 16 for name in NAMES) == (effect_sets is not None)
+        assert (gated.render(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
+    assert gated.counts == gated.run.model.count_by_effects()
+    assert all(gated.counts[name] == 16 for name in NAMES) == (effect_sets is not None)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +143,7 @@ def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets
     ],
 )
 def test_a_kernels_time_is_its_stages(
-    one: FrameRenderer, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch
+    agr: FrameRenderer, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches time that counts for another stage, or for none."""
     run, slow = Library._run, 0.02
@@ -142,20 +154,19 @@ def test_a_kernels_time_is_its_stages(
         run(library, name, *values)
 
     monkeypatch.setattr(Library, "_run", run_slowly)
-    (cost,) = one.render(seen_from(0.5, one), FrameRequest(0.4)).costs
+    (cost,) = agr.render(camera_of(0.5, agr), NOW).costs
     assert tuple(cost.ms) == (*STAGES[SLICE], *STAGES[RASTER])
     assert max(cost.ms, key=lambda name: cost.ms[name]) == stage
     assert cost.ms[stage] >= 1000 * slow
 
 
-def test_what_torch_computes_alone_is_not_divided() -> None:
+def test_what_torch_computes_alone_is_not_divided(agr: FrameRenderer) -> None:
     """Catches stages of zero milliseconds, and time that is not counted, without kernels."""
-    made = renderer(REFERENCE)
-    (cost,) = made.render(seen_from(0.5, made), FrameRequest(0.4)).costs
+    (cost,) = renderer(REFERENCE).render(camera_of(0.5, agr), NOW).costs
     assert list(cost.ms) == [SLICE, RASTER]
     assert cost.of(SLICE) == cost.ms[SLICE] > 0
     assert cost.of(RASTER) == cost.ms[RASTER] > 0
-    (without_agr,) = renderer().render(seen_from(0.5, made), FrameRequest(0.4, agr=False)).costs
+    (without_agr,) = agr.render(camera_of(0.5, agr), FrameRequest(0.4, agr=False)).costs
     assert "AGR" not in without_agr.ms
 
 
@@ -176,39 +187,65 @@ def test_two_models_share_an_image() -> None:
     assert (wiped(left, right, 8).image == 10).all()
 
 
-def test_resolution_falls_while_the_camera_moves() -> None:
-    """Catches a large window that stutters, a frame at rest that stays coarse, and a size of zero."""
-    resolution = Resolution()
-    for _ in range(3):  # 1 us a pixel and 10 ms a slice: 30,000 pixels
-        width, height = resolution.size(1000, 500, limited=True)
-        resolution.took(width * height, 10.0, width * height / 1000)
-    assert width * height == pytest.approx(1000 * (MOVING_MS - 10), rel=0.02)
-    assert width / height == pytest.approx(2, rel=0.02)
-    assert resolution.size(1000, 500, limited=False) == (1000, 500)
-    width, height = resolution.size(8000, 4000, limited=False)
-    assert width * height == pytest.approx(MOST_PIXELS, rel=0.01)
-    resolution.took(100, 500.0, 900.0)
-    width, height = resolution.size(1000, 500, limited=True)
-    assert width * height == pytest.approx(LEAST_PIXELS, rel=0.02)
-    assert min(resolution.size(1, 3000, limited=True)) >= 1
+# ---- the bound on the error of float32
 
 
-def test_a_browsers_camera_is_ours(one: FrameRenderer) -> None:
-    """Catches a pose that is inverted, mirrored or with the horizontal field of view."""
-    camera = seen_from(0.7, one)
-    flip = camera.viewmat[:3, :3].T.double()
-    w = float((1 + flip.trace()).sqrt()) / 2
-    x, y, z = (float(flip[i, j] - flip[j, i]) / (4 * w) for i, j in ((2, 1), (0, 2), (1, 0)))
-    vertical = 2 * np.arctan(SIZE / 2 / float(camera.K[1, 1]))
-    again = camera_at(camera.center.double().numpy(), np.array([w, x, y, z]), vertical, SIZE, SIZE)
-    torch.testing.assert_close(again.viewmat, camera.viewmat, atol=1e-5, rtol=0)
-    torch.testing.assert_close(again.K, camera.K)
+@needs_kernels
+def test_the_bound_is_that_of_the_stability_command(agr: FrameRenderer) -> None:
+    """Catches a bound of another view, time or unit, and a summary of other pixels."""
+    near = camera_of(0.5, agr)
+    camera = replace(near, K=near.K * torch.tensor([0.3, 0.3, 1.0]))  # a wide angle: some pixels show nothing
+    error = agr.float32_error(camera, NOW)
+    exact = render_twins(agr.run.model, exact_model(agr.run.model), camera, 0.4, BLACK, False).exact
+    bound, covered = 255 * exact.bound, exact.culprit >= 0
+    assert (error.image == rounding_image(bound.numpy())).all()
+    assert 0.2 < float(covered.double().mean()) < 0.95
+    assert error.image.max() > 50
+    assert error.largest == pytest.approx(float(bound.max()))
+    assert error.median == pytest.approx(float(bound[covered].median()))
+    assert error.undecided == pytest.approx(float(exact.undecided.double().mean()))
+    assert error.seconds > 0
 
 
-def test_a_folder_without_a_checkpoint_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a stack trace, and a server that serves nothing."""
-    assert main([str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"gsbench.view: {tmp_path}: expected the folder of a run")
-    assert main([str(tmp_path), "--port", "0"]) == 2
-    assert "--port" in capsys.readouterr().err
+@needs_kernels
+def test_both_precisions_have_the_settings_of_the_browser(agr: FrameRenderer) -> None:
+    """Catches a setting that only one of the two slices has, whose difference would count as rounding."""
+    camera, there = camera_of(0.5, agr), camera_of(2.0, agr)
+    plain = agr.float32_error(camera, NOW)
+    for settings in ({"center": there.center}, {"agr": False}, {"sh_degree": 0}):
+        changed = agr.float32_error(camera, NOW._replace(**settings))
+        assert (plain.image != changed.image).any()
+        assert changed.median < 0.1
+    assert (agr.float32_error(camera, NOW).image == plain.image).all()
+
+
+def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a bound of images that another backend renders."""
+    with pytest.raises(InputError, match="CPU kernels"):
+        renderer(REFERENCE).float32_error(camera_of(0.5, agr), NOW)
+    on_gpu: Any = SimpleNamespace(splats={"means": torch.empty(2, 3, device="meta")}, backend=AUTO)
+    with pytest.raises(InputError, match="--device cpu"):
+        check_exactness(on_gpu)
+    monkeypatch.setattr(kernels, "available", lambda: False)
+    with pytest.raises(InputError, match="reinstall"):
+        check_exactness(agr.run.model)
+
+
+@needs_kernels
+def test_a_model_that_does_not_compute_in_float64_has_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a user's model whose error is not an InputError, or that answers in float32 and counts as exact."""
+    agr = renderer()
+    camera, single = camera_of(0.5, agr), agr.run.model.slice(Query.at(BLACK, 0.4))
+    slice_of = type(agr.run.model).slice
+
+    def fails(model: Any, query: Query) -> Any:
+        if model is agr.run.model:
+            return slice_of(model, query)
+        raise TypeError("only float32")
+
+    monkeypatch.setattr(type(agr.run.model), "slice", fails)
+    with pytest.raises(InputError, match="does not compute in float64: only float32"):
+        agr.float32_error(camera, NOW)
+    monkeypatch.setattr(type(agr.run.model), "slice", lambda *_: single)
+    with pytest.raises(InputError, match="expected Gaussians of torch"):
+        agr.float32_error(camera, NOW)

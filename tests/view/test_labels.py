@@ -1,21 +1,16 @@
-"""Labels of the viewer's images: short names that tell runs apart, what was measured, where a label is written."""
+"""Labels of the viewer's images: short names of runs, what was measured, where a label is written."""
 
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from gsbench.measure import record
 from gsbench.run.load import LoadedRun, load_run
-from gsbench.view.client import Client, camera_at
-from gsbench.view.controls import ONE, SIDE, WIPE
-from gsbench.view.labels import labelled, measured, short_names
+from gsbench.view.labels import labelled, measurements, short_names
 
 ROWS = "7dgs", "18.48 dB PSNR on test", "4,187 Gaussians"
 
@@ -45,36 +40,34 @@ def other(other_folder: Path) -> LoadedRun:
         (["r/a", "r/a"], ["r/a", "r/a"]),
     ],
 )  # fmt: skip
-def test_names_are_what_tells_runs_apart(folders: list[str], names: list[str], run: LoadedRun) -> None:
-    """Catches a name that all runs have, two runs with one name, and words that tell nothing."""
+def test_names_are_what_distinguishes_runs(
+    folders: list[str], names: list[str], run: LoadedRun, other: LoadedRun
+) -> None:
+    """Catches a name that all runs have, two runs with one name, and words beside models that differ."""
     assert short_names([replace(run, folder=Path(folder)) for folder in folders]) == names
-
-
-def test_models_are_named_alone_where_they_differ(run: LoadedRun, other: LoadedRun) -> None:
-    """Catches a seed or a length beside a model that is named already."""
-    named = [replace(one, folder=Path(f"mini/square/{name},iterations=9/seed0"))
-             for one, name in ((run, "7dgs"), (other, "4dgs"))]  # fmt: skip
-    assert short_names(named) == ["7dgs", "4dgs"]
+    models = {"7dgs": run, "4dgs": other}
+    named = [replace(loaded, folder=Path(f"r/s/{name},iterations=9/seed0")) for name, loaded in models.items()]
+    assert short_names(named) == list(models)
 
 
 def test_a_label_says_what_was_measured(run: LoadedRun, tmp_path: Path) -> None:
     """Catches numbers of another run, a size in other units than the report's, and a record that hides a failure."""
-    told = record.read(run.folder / record.FILE_NAME)
-    assert told.metrics is not None
-    assert told.cost is not None
-    rows = (f"{told.metrics['psnr']:.2f} dB PSNR on test", f"{told.cost.num_gaussians:,} Gaussians",
-            f"{told.cost.bytes / 1e6:.2f} MB")  # fmt: skip
-    assert measured(run) == (*rows, "20 iterations")
+    kept = record.read(run.folder / record.FILE_NAME)
+    assert kept.metrics is not None
+    assert kept.cost is not None
+    rows = (f"{kept.metrics['psnr']:.2f} dB PSNR on test", f"{kept.cost.num_gaussians:,} Gaussians",
+            f"{kept.cost.bytes / 1e6:.2f} MB")  # fmt: skip
+    assert measurements(run) == (*rows, "20 iterations")
     interrupted = replace(run, step=7, folder=tmp_path)
-    assert measured(interrupted) == ("no PSNR on test yet", *rows[1:], "7 of 20 iterations")
+    assert measurements(interrupted) == ("no PSNR on test yet", *rows[1:], "7 of 20 iterations")
     copy = tmp_path / record.FILE_NAME
     shutil.copy(run.folder / record.FILE_NAME, copy)
     plain = json.loads(copy.read_text())
     plain["metrics"]["psnr"], plain["missing"]["psnr"] = None, "not a number"
     copy.write_text(json.dumps(plain))
-    assert measured(interrupted)[0] == "no PSNR on test"
+    assert measurements(interrupted)[0] == "no PSNR on test"
     copy.write_text("{}")
-    assert measured(interrupted)[0] == "record.json is not valid"
+    assert measurements(interrupted)[0] == "record.json is not valid"
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
@@ -103,33 +96,3 @@ def test_labels_are_cut_at_the_border_and_keep_their_size_on_the_screen() -> Non
     tall = [float((labelled(np.full((n, 2 * n, 3), 255, np.uint8), n, ROWS, ROWS) != 255).any((1, 2)).sum()) / n
             for n in (300, 600, 1200)]  # fmt: skip
     assert tall == pytest.approx([tall[0]] * 3, rel=0.05)
-
-
-def browser_of(run: LoadedRun, layout: str, width: int, height: int) -> Client:
-    """A browser without a connection, whose window is `width` times `height` pixels and whose camera looks along z."""
-    client: Any = object.__new__(Client)
-    client.client = SimpleNamespace(camera=SimpleNamespace(
-        position=(0, 0, -4), wxyz=(1, 0, 0, 0), fov=0.7, image_width=width, image_height=height))  # fmt: skip
-    client.controls = SimpleNamespace(layout=layout)
-    client._scene = run.scene
-    return client  # type: ignore[no-any-return]
-
-
-@pytest.mark.parametrize("window", [(1200, 900), (900, 1200), (2400, 600), (390, 844)])
-@pytest.mark.parametrize("size", [(16, 16), (32, 18), (18, 32)])
-def test_each_half_shows_the_whole(window: tuple[int, int], size: tuple[int, int], run: LoadedRun) -> None:
-    """Catches a half that is cut at its sides, pixels that are not square, and another camera for one whole image."""
-    run = replace(run, scene=replace(run.scene, width=size[0], height=size[1]))
-    width, height = window[0] // 2, window[1]
-    camera = browser_of(run, SIDE, *window)._camera(width, height)
-    corners = torch.tensor([[x * size[0] / size[1], y] for x in (-1, 1) for y in (-1, 1)])  # of what 0.7 radians see
-    seen = torch.cat([np.tan(0.35) * corners, torch.ones(4, 1)], 1).double() @ camera.K.double().T
-    assert float(seen.min()) >= -1e-3
-    assert float(seen[:, 0].max()) <= width + 1e-3
-    assert float(seen[:, 1].max()) <= height + 1e-3
-    assert min(width - seen[:, 0].max(), height - seen[:, 1].max()) == pytest.approx(0, abs=1e-2)  # no smaller
-    assert camera.K[0, 0] == camera.K[1, 1]
-    for layout in (ONE, WIPE):
-        whole = browser_of(run, layout, *window)._camera(*window)
-        plain = camera_at(np.array([0, 0, -4]), np.array([1, 0, 0, 0]), 0.7, *window)
-        assert (whole.K == plain.K).all()

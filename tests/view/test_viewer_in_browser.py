@@ -15,8 +15,7 @@ from chromium import launched
 from gsbench.errors import InputError
 from gsbench.kernels.backends import REFERENCE
 from gsbench.run.load import load_run
-from gsbench.view.frame import FrameRenderer
-from gsbench.view.stages import STAGES
+from gsbench.view.frame import STAGES, FrameRenderer
 from gsbench.view.viewer import Viewer
 
 pytestmark = pytest.mark.slow
@@ -38,9 +37,9 @@ def free_port():
 
 @pytest.fixture(scope="module")
 def viewer(folder, other_folder):
-    made = Viewer([load_run(folder), load_run(other_folder)], "localhost", free_port())
-    yield made
-    made.stop()
+    viewer = Viewer([load_run(folder), load_run(other_folder)], "localhost", free_port())
+    yield viewer
+    viewer.stop()
 
 
 @pytest.fixture
@@ -73,7 +72,7 @@ def settle(page):
     shown = []
     for _ in range(80):
         page.wait_for_timeout(250)
-        rests = all(client.rests and not client.changed.is_set() for client in page.viewer.clients.values())
+        rests = all(client.rests and not client.changed.is_set() for client in page.viewer.browsers.values())
         shown = [*shown, page.screenshot(clip=PICTURE)] if rests and page.locator(f"text={SHARP}").count() else []
         if len(shown) > 2 and shown[-1] == shown[-2] == shown[-3]:
             return shown[-1]
@@ -230,15 +229,15 @@ def test_the_bound_on_float32_is_shown_when_nothing_moves(visit, viewer, monkeyp
     assert page.get_by_text("largest bound").count()
     turn(page)
     assert len({start, bound, settle(page)}) == 3
-    released, compute = threading.Event(), FrameRenderer.rounding
+    released, compute = threading.Event(), FrameRenderer.float32_error
 
     def slowly(renderer, camera, request):
         released.wait(60)
         return compute(renderer, camera, request)
 
-    monkeypatch.setattr(FrameRenderer, "rounding", slowly)
+    monkeypatch.setattr(FrameRenderer, "float32_error", slowly)
     turn(page)
-    page.wait_for_selector("text=is being computed", timeout=20_000)
+    page.wait_for_selector("text=its bound follows", timeout=20_000)
     choose(page, "colours", "image")
     plain = settle(page)  # although the bound is not ready
     assert not legend.count()
@@ -386,18 +385,17 @@ def test_training_cameras_are_shown_except_side_by_side(visit):
 
 
 def test_two_browsers_have_controls_of_their_own_and_one_may_leave(visit, viewer):
-    """Catches a slider that moves everybody's picture, and a thread that renders for a browser that is gone."""
+    """Catches a slider that moves everybody's picture, and frames for a browser that is gone."""
     one, two = visit(), visit()
-    deadline = time.monotonic() + 20
-    assert len(viewer.clients) == 2
+    assert len(viewer.browsers) == 2
     start = settle(two)
     slide(one, "time", 1)
     assert settle(one) != start
     assert settle(two) == start
-    threads = [client.thread for client in viewer.clients.values()]
     one.close()
-    while len(viewer.clients) > 1 or sum(thread.is_alive() for thread in threads) > 1:
-        assert time.monotonic() < deadline + 20, "the browser that left is still served"
+    deadline = time.monotonic() + 40
+    while len(viewer.browsers) > 1:
+        assert time.monotonic() < deadline, "the browser that left is still served"
         time.sleep(0.2)
     slide(two, "time", 1)
     assert settle(two) != start

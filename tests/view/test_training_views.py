@@ -1,4 +1,4 @@
-"""The training view nearest to a camera: which one it is, and how a model is compared with it."""
+"""Training views: which one is nearest to a camera, how a model is compared with it, and images made smaller."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
-from gsbench.view.nearest import MOST_WIDTH, TrainingViews, compare
+from gsbench.view.training_views import MOST_WIDTH, TrainingViews, compare
 
 EXTENT = 4.0
 
@@ -30,9 +30,9 @@ def camera(x: float, *, towards: float = 0.0) -> Camera:
     )
 
 
-def scene(*seen: tuple[Camera, float | None]) -> Scene:
+def scene(*cameras_and_times: tuple[Camera, float | None]) -> Scene:
     """A scene with these training views, called by their number."""
-    views = [View(str(i), one, time, torch.zeros(8, 8, 3)) for i, (one, time) in enumerate(seen)]
+    views = [View(str(i), one, time, torch.zeros(8, 8, 3)) for i, (one, time) in enumerate(cameras_and_times)]
     return Scene("line", views, [], [], (0.0, 0.0, 0.0), EXTENT, None, "0")
 
 
@@ -41,10 +41,10 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
     views = TrainingViews(scene((camera(0.0), 0.0), (camera(1.0), 0.0), (camera(0.0, towards=0.5), 0.0)))
     assert views.nearest(camera(0.2), 0.0).view.name == "0"
     assert views.nearest(camera(0.9), 0.0).view.name == "1"
-    found = views.nearest(camera(0.5, towards=0.6), 0.0)
-    assert found.view.name == "2"
-    assert found.distance == pytest.approx(0.5)
-    assert found.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
+    nearest = views.nearest(camera(0.5, towards=0.6), 0.0)
+    assert nearest.view.name == "2"
+    assert nearest.distance == pytest.approx(0.5)
+    assert nearest.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
 
 
 def test_places_count_in_extents() -> None:

@@ -1,5 +1,6 @@
-"""Render a model along a path of cameras, and write the frames as a video or as PNG files."""
+"""Move a camera around a model, render it along that path, and write the frames as a video or as PNG files."""
 
+import math
 import os
 import secrets
 from collections.abc import Generator, Iterable
@@ -8,24 +9,76 @@ from pathlib import Path
 
 import cv2
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import name_file
 from gsbench.measure.images import Pixels, to_bytes, write_png
+from gsbench.models import cameras
+from gsbench.models.cameras import ELEVATION
 from gsbench.models.render import render
 from gsbench.run.load import LoadedRun
-from gsbench.view.paths import Shot, resized
+from gsbench.scenes import Camera
 
+HIGHEST = math.radians(60)  # elevation at the end of a spiral
+TURNS = 2  # of a spiral
+FAR_AWAY = 1e4  # in scene extents; view directions then differ by at most about 1e-4 radians
 SUFFIXES = ".mp4", ".webm", ".mkv", ".avi"  # of the files into which OpenCV's wheel writes CODEC
 FIRST_BYTES = 4096  # that a video needs at least
 CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's wheel, unlike one for H.264
 
+Shot = tuple[Camera, float | None]  # a frame of a video: its camera and its time
+
+
+def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
+    """Return a camera that looks at the middle of a model from one scene extent, about as far as training cameras.
+
+    Args:
+        run: the run of the model.
+        azimuth: the angle about the up direction of the scene, radians.
+        elevation: the angle above the horizon, radians.
+    """
+    size = run.scene.width, run.scene.height
+    return cameras.around(run.model, run.scene.extent, *size, azimuth, elevation, run.scene.up)
+
+
+def orbit(run: LoadedRun, frames: int) -> list[Camera]:
+    """Return cameras on one full circle around a model; the last camera does not repeat the first."""
+    return [around(run, 2 * math.pi * i / frames, ELEVATION) for i in range(frames)]
+
+
+def spiral(run: LoadedRun, frames: int) -> list[Camera]:
+    """Return cameras on a spiral that goes twice around a model and rises from the horizon."""
+    return [around(run, 2 * math.pi * TURNS * part, HIGHEST * part) for part in times(frames)]
+
+
+def times(frames: int) -> list[float]:
+    """Return the times of a video's frames: 0 to 1 in equal steps."""
+    return [i / max(1, frames - 1) for i in range(frames)]
+
+
+def far_along(run: LoadedRun, direction: Tensor) -> Tensor:
+    """Return a viewpoint [3] that is so far away that all Gaussians are seen along the same `direction` [3]."""
+    return cameras.middle(run.model) - FAR_AWAY * run.scene.extent * torch.nn.functional.normalize(direction, dim=0)
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera with another image size and the same horizontal field of view.
+
+    Pixels stay as wide as high: with another aspect ratio, the image shows less or more above and below.
+    """
+    scale = width / camera.width
+    K = camera.K.clone()
+    K[:2] *= scale
+    K[1, 2] += (height - scale * camera.height) / 2
+    return Camera(camera.viewmat, K, width, height)
+
 
 def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator[Pixels, None, None]:
-    """Yield rendered images, one for each shot (a camera and a time), as uint8 [H, W, 3] RGB.
+    """Yield the rendered image of each shot, [H, W, 3] RGB; a progress bar is shown on stderr.
 
-    Each pixel is the mean of supersample x supersample rendered ones. A progress bar is shown on stderr.
+    Each pixel is the mean of supersample x supersample rendered ones.
     """
     background = torch.tensor(run.scene.background).to(run.config.device)
     with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
@@ -39,17 +92,16 @@ def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator
 def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
     """Write images of one size as a video; if this fails, an existing file at `path` is unchanged.
 
-    OpenCV does not tell that a disk is full, so that the frames of the file are counted at the end.
+    OpenCV does not report that a disk is full, so that the frames of the file are counted at the end.
 
     Raises:
-        InputError: the folder does not exist, OpenCV cannot write this kind of file, or not all frames are in it.
+        InputError: OpenCV cannot write this kind of file, or not all frames are in it.
         OSError: the disk is read-only or full.
     """
-    check_parent(path)
     part = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
-    writer, size, count = None, (0, 0), 0
+    writer, count = None, 0
     try:
-        part.write_bytes(bytes(FIRST_BYTES))  # unlike OpenCV, it tells why the disk takes no file
+        part.write_bytes(bytes(FIRST_BYTES))  # unlike OpenCV, it reports why the disk takes no file
         for image in images:
             if writer is None:
                 size = image.shape[1], image.shape[0]
@@ -60,9 +112,9 @@ def write_video(images: Iterable[Pixels], path: Path, fps: float) -> None:
             count += 1
         if writer is not None:
             writer.release()
-            if (written := _frame_count(part)) != count:
+            if (readable := _frame_count(part)) != count:
                 raise InputError(
-                    f"{path}: expected a video of {count} frames, {written} can be read: is the disk full?"
+                    f"{path}: expected a video of {count} frames, {readable} can be read: is the disk full?"
                 )
             os.replace(part, path)
     except OSError as error:
@@ -83,12 +135,7 @@ def _frame_count(path: Path) -> int:
 
 
 def write_images(images: Iterable[Pixels], folder: Path) -> None:
-    """Write images as 0000.png, 0001.png and so on into a folder, which is made if its parent exists.
-
-    Raises:
-        InputError: the parent folder does not exist.
-    """
-    check_parent(folder)
+    """Write images as 0000.png, 0001.png and so on into a folder, which is created if its parent exists."""
     folder.mkdir(exist_ok=True)
     for i, image in enumerate(images):
         write_png(image, folder / f"{i:04d}.png")

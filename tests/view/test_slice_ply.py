@@ -16,7 +16,7 @@ from gsbench.raster import rasterize
 from gsbench.scenes import Camera
 from gsbench.scenes.trained import ply_of
 from gsbench.schedule import ActiveComponents
-from gsbench.view.gaussians import decompose, trained_of
+from gsbench.view.slice_ply import decompose, trained_of
 
 SIZE = 48
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])

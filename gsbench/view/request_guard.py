@@ -1,7 +1,7 @@
 """Guard the port of the viewer: refuse requests from other web sites, and drop messages that its page never sends.
 
-viser listens through the library `websockets`, but has no parameters for the options that this protection needs.
-`Door.guard` sets these options.
+viser listens through the library `websockets`, and has no parameters for the options that this protection needs (viser
+1.1.1: `ViserServer(host, port, label, verbose)`). `RequestGuard.active` sets these options.
 """
 
 import asyncio
@@ -15,23 +15,23 @@ from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 import websockets.asyncio.server as websockets_server
+from msgspec import Meta
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from gsbench.errors import InputError, one_line
 
-MOST_BROWSERS = 16  # connected at once; each has a thread that renders for it
+MOST_BROWSERS = 16  # connected at once
 MOST_BYTES = 4096  # of a message; messages of the page have about 300
 MOST_PORTS = 1000  # ports that are tried
 FURTHEST = 1e9  # world units from the origin
 MOST_PIXELS = 16384  # of a side of a browser's window
-FIELDS_OF_VIEW = 0.01, 3.1  # radians
 
 # viser's page draws fewer pixels for good after it was slow for some seconds, unless its address has their number.
 ENTRANCE = """\
@@ -44,32 +44,24 @@ location.replace(address);
 </script>
 """
 
-Three = tuple[float, float, float]
+Length = Annotated[float, Meta(ge=-FURTHEST, le=FURTHEST)]
+Vector = tuple[Length, Length, Length]
+Side = Annotated[int, Meta(ge=0, le=MOST_PIXELS)]
 Answer = Response | None | Awaitable[Response | None]
 
 
 class ViewerCameraMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
-    """The message with the pose of a browser's camera, as viser's page sends it."""
+    """The pose of a browser's camera, as viser's page sends it; numbers in ranges from which an image can be made."""
 
     wxyz: tuple[float, float, float, float]
-    position: Three
-    fov: float
+    position: Vector
+    fov: Annotated[float, Meta(ge=0.01, le=3.1)]  # radians
     near: float
     far: float
-    image_height: int
-    image_width: int
-    look_at: Three
-    up_direction: Three
-
-    def is_usable(self) -> bool:
-        """Tell whether an image can be rendered from this camera pose."""
-        lengths = (*self.position, *self.look_at, *self.up_direction)
-        return (
-            all(abs(length) <= FURTHEST for length in lengths)  # false for NaN
-            and 0.9 < math.hypot(*self.wxyz) < 1.1
-            and FIELDS_OF_VIEW[0] <= self.fov <= FIELDS_OF_VIEW[1]
-            and all(0 <= pixels <= MOST_PIXELS for pixels in (self.image_width, self.image_height))
-        )
+    image_height: Side
+    image_width: Side
+    look_at: Vector
+    up_direction: Vector
 
 
 class Values(msgspec.Struct, forbid_unknown_fields=True):
@@ -84,29 +76,20 @@ class GuiUpdateMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     uuid: str
     updates: Values
 
-    def is_usable(self) -> bool:
-        """Tell whether the value is text, a colour or a finite number."""
-        value = self.updates.value
-        return isinstance(value, str) or all(map(math.isfinite, value if isinstance(value, tuple) else (value,)))
-
 
 class SceneNodeClickMessage(msgspec.Struct, tag=True, forbid_unknown_fields=True):
     """The message that the user has clicked on the frustum of a training camera."""
 
     name: str
     instance_index: int | None
-    ray_origin: Three
-    ray_direction: Three
+    ray_origin: tuple[float, float, float]
+    ray_direction: tuple[float, float, float]
     screen_pos: tuple[float, float]
     modifier: str | None
     owner: str = ""
 
-    def is_usable(self) -> bool:
-        """Return True, because the values of this message are not used."""
-        return True
 
-
-KNOWN = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNodeClickMessage)
+DECODER = msgspec.msgpack.Decoder(ViewerCameraMessage | GuiUpdateMessage | SceneNodeClickMessage)
 
 
 def is_known(message: object) -> bool:
@@ -114,9 +97,15 @@ def is_known(message: object) -> bool:
     if not isinstance(message, bytes):
         return False
     try:
-        return KNOWN.decode(message).is_usable()
+        decoded = DECODER.decode(message)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
+    match decoded:
+        case ViewerCameraMessage(wxyz=wxyz):
+            return 0.9 < math.hypot(*wxyz) < 1.1
+        case GuiUpdateMessage(updates=Values(value=float() as value)):
+            return math.isfinite(value)
+    return True
 
 
 class Connection(ServerConnection):
@@ -129,7 +118,7 @@ class Connection(ServerConnection):
         return message
 
 
-class Door:
+class RequestGuard:
     """The port on which the viewer listens, and the host names by which a browser may reach it."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -143,7 +132,7 @@ class Door:
             InputError: it is not possible to listen on this host, or no port is free.
         """
         with ThreadPoolExecutor(1) as pool:  # a notebook has an event loop in the main thread
-            addresses, self.port = pool.submit(asyncio.run, _free(host, port)).result()
+            addresses, self.port = pool.submit(asyncio.run, _free_port(host, port)).result()
         self._hosts = {host.lower(), *addresses}
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
         if self._is_open:  # every machine on the network can connect, by any address of this machine
@@ -151,12 +140,11 @@ class Door:
         self._guards = False
 
     @contextmanager
-    def guard(self) -> Iterator[None]:
+    def active(self) -> Iterator[None]:
         """Guard a viser server that is started inside this context.
 
-        viser has no option for a check of requests. It looks up the function `websockets.asyncio.server.serve` when its
-        server starts. This context replaces that function by one with the check, and restores it at the end. gsbench
-        changes one other library: submitit, in `gsbench/sweep/container.py`.
+        viser looks up the function `websockets.asyncio.server.serve` when its server starts. This context replaces that
+        function by one with the check, and restores it at the end.
 
         Raises:
             InputError: this version of viser does not use that function, so its server would accept requests from any
@@ -165,9 +153,9 @@ class Door:
         original = websockets_server.serve
 
         def serve(*arguments: Any, process_request: Callable[..., Answer], **options: Any) -> Any:
-            asyncio.get_running_loop().set_exception_handler(_say)
+            asyncio.get_running_loop().set_exception_handler(_print_error)
             self._guards = True
-            options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent()}
+            options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent_logger()}
 
             def check(connection: ServerConnection, request: Request) -> Answer:
                 return self._refusal(connection, request) or _entrance(request) or process_request(connection, request)
@@ -189,12 +177,12 @@ class Door:
         resolves to this machine's address; such a request has that name in its `Host` header.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not self._is_ours(hosts[0]):
+        if len(hosts) != 1 or not self._is_this_server(hosts[0]):
             return False
-        own = hosts[0].lower()
-        return all(origin.lower() in (f"http://{own}", f"https://{own}") for origin in origins)
+        host = hosts[0].lower()
+        return all(origin.lower() in (f"http://{host}", f"https://{host}") for origin in origins)
 
-    def _is_ours(self, host: str) -> bool:
+    def _is_this_server(self, host: str) -> bool:
         """Tell whether `host`, with or without a port, is a name of this server; a tunnel may change the port."""
         try:
             parts = urlsplit(f"//{host}")
@@ -212,29 +200,30 @@ class Door:
     def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the HTTP response to a request that is refused; None if the request is admitted."""
         if not self.admits(request.headers):
-            return _answer(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
+            return _response(HTTPStatus.FORBIDDEN, "a viewer of gsbench answers its own page alone: see --host")
         if request.headers.get_all("Upgrade") and len(connection.server.connections) >= MOST_BROWSERS:
-            return _answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are connected, which is the most")
+            text = f"{MOST_BROWSERS} browsers are connected, which is the most"
+            return _response(HTTPStatus.SERVICE_UNAVAILABLE, text)
         return None
 
 
-async def _free(host: str, port: int) -> tuple[list[str], int]:
+async def _free_port(host: str, port: int) -> tuple[list[str], int]:
     """Return the addresses of a host name on this machine, and the first port that is free on all of them."""
-    asked = f"--host: expected an address or a name of this machine, such as localhost, got {host[:100]!a}"
+    expected = f"--host: expected an address or a name of this machine, such as localhost, got {host[:100]!a}"
     if not host or "\0" in host:
-        raise InputError(asked)
+        raise InputError(expected)
     loop = asyncio.get_running_loop()
-    for tried in range(port, min(port + MOST_PORTS, 65536)):
+    for number in range(port, min(port + MOST_PORTS, 65536)):
         try:
-            server = await loop.create_server(asyncio.Protocol, host, tried)
+            server = await loop.create_server(asyncio.Protocol, host, number)
         except (OSError, ValueError) as error:  # ValueError: not a valid name
             if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
                 continue
-            raise InputError(f"{asked}, port {tried}: {one_line(error)}") from None
-        addresses = [str(one.getsockname()[0]) for one in server.sockets]
+            raise InputError(f"{expected}, port {number}: {one_line(error)}") from None
+        addresses = [str(listener.getsockname()[0]) for listener in server.sockets]
         server.close()
         await server.wait_closed()
-        return addresses, tried
+        return addresses, number
     raise InputError(f"--port: expected a free one among the {MOST_PORTS} from {port} on, got none")
 
 
@@ -243,25 +232,24 @@ def _entrance(request: Request) -> Response | None:
     parts = urlsplit(request.path)
     if parts.path != "/" or "fixedDpr" in parse_qs(parts.query) or request.headers.get_all("Upgrade"):
         return None
-    return _answer(HTTPStatus.OK, ENTRANCE, "text/html")
+    return _response(HTTPStatus.OK, ENTRANCE, "text/html")
 
 
-def _answer(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
-    """Return an HTTP response with some text."""
+def _response(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Cache-Control": "no-store"})
     return Response(status, status.phrase, headers, f"{text}\n".encode())
 
 
-def _silent() -> logging.Logger:
+def _silent_logger() -> logging.Logger:
     """Return a silent logger for `websockets`, which otherwise prints a traceback if a client does not speak HTTP."""
-    logger = logging.getLogger("gsbench.view.door")
+    logger = logging.getLogger("gsbench.view.request_guard")
     logger.propagate = False
     logger.addHandler(logging.NullHandler())
     return logger
 
 
-def _say(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _print_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Print an error in viser's thread as one line, for example if a control gets an invalid value."""
     error = context.get("exception")
-    said = f"{type(error).__name__}: {one_line(error)}" if error else context["message"]
-    print(f"gsbench.view: a browser's message or connection was dropped: {said}", file=sys.stderr)
+    text = f"{type(error).__name__}: {one_line(error)}" if error else context["message"]
+    print(f"gsbench.view: a browser's message or connection was dropped: {text}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Compute the bound on the error of float32 in each pixel of a frame, and say why where there is none."""
+"""Bound the error of float32 in each pixel of a frame, and say why where there is no such bound."""
 
 import time
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from gsbench.models.twins import exact_view
 from gsbench.scenes import Camera
 
 
-class Rounding(NamedTuple):
+class Float32Error(NamedTuple):
     """The bound on the error of float32 in a frame: its image, and a summary in steps of 8 bits, 1/255."""
 
     image: Pixels  # [H, W, 3] RGB, on the scale of `gsbench.measure.images.rounding_image`
@@ -37,23 +37,15 @@ def check_exactness(model: GaussianModel) -> None:
 
 
 @torch.inference_mode()
-def rounding(
-    exact: GaussianModel,
-    single: Gaussians3D,
-    query: Query,
+def float32_error(
+    exact: GaussianModel,  # the model in float64, used by one thread at a time
+    single: Gaussians3D,  # the slice of the float32 model that the image shows
+    query: Query,  # the viewpoint and the time of that slice, float64
     camera: Camera,
     background: Tensor,  # [3] float32
     antialias: bool,
-) -> Rounding:
+) -> Float32Error:
     """Bound the error of each pixel of a float32 image.
-
-    Args:
-        exact: the model in float64; used by one thread at a time.
-        single: the slice of the float32 model that the image shows.
-        query: the viewpoint and the time of that slice, float64.
-        camera: the camera of the image.
-        background: the background colour.
-        antialias: whether opacities are scaled, as in `gsbench.raster.rasterize`.
 
     Raises:
         InputError: the model does not compute in float64, or a Gaussian has a value that is not finite.
@@ -65,12 +57,12 @@ def rounding(
         raise
     except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
         raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
-    found = exact_view(gaussians, single, camera, background, antialias)
-    bound = STEPS * found.bound
-    return Rounding(
+    view = exact_view(gaussians, single, camera, background, antialias)
+    bound = STEPS * view.bound
+    return Float32Error(
         rounding_image(bound.numpy()),
         largest=float(bound.max()),
-        median=STEPS * found.median_bound,
-        undecided=float(found.undecided.double().mean()),
+        median=STEPS * view.median_bound,
+        undecided=float(view.undecided.double().mean()),
         seconds=time.perf_counter() - start,
     )

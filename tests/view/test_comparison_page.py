@@ -12,10 +12,10 @@ from gsbench.measure import record
 from gsbench.measure.exact_views import MOST_PSNR
 from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
-from gsbench.view import side_by_side
+from gsbench.view import comparison_page
 from gsbench.view.__main__ import main
+from gsbench.view.comparison_page import write_page
 from gsbench.view.frame import FrameRenderer, FrameRequest
-from gsbench.view.side_by_side import write_page
 
 
 def test_it_shows_both_runs_and_their_errors(folder: Path, other_folder: Path, tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_a_view_rendered_exactly_leaves_the_mean_finite(
     views = evaluated_views(scene_of(run), run.config.scene.eval_split)
     renderer = FrameRenderer(run, "7dgs", 1.0)
     exact = replace(views[0], pixels=renderer.image(views[0].camera, FrameRequest(views[0].time)))
-    monkeypatch.setattr(side_by_side, "evaluated_views", lambda *_: [exact, *views[1:]])
+    monkeypatch.setattr(comparison_page, "evaluated_views", lambda *_: [exact, *views[1:]])
     write_page([run, run], tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text()
     assert f"{MOST_PSNR:.2f} dB" in text

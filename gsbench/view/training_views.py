@@ -1,4 +1,4 @@
-"""Find the training view nearest to a camera, and compare it with the models' renders of this view."""
+"""Find the training view nearest to a camera, and compare views of the data with the models' renders of them."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
 
 SAME = 1e-3  # in extents plus radians; closer views count as the same viewpoint
-MOST_WIDTH = 480  # width in pixels to which larger images are reduced
+MOST_WIDTH = 480  # pixels, to which the images of a comparison are reduced
 
 
 class Nearest(NamedTuple):
@@ -38,7 +38,7 @@ class TrainingViews:
     """The training views of a scene, which can be searched by position and view direction."""
 
     def __init__(self, scene: Scene) -> None:
-        """Store the cameras and the times of a scene's training views; no image is read."""
+        """Keep the cameras and the times; no image is read."""
         self._views, self._extent, self._unit = scene.train, max(scene.extent, 1e-12), scene.placement.unit
         cameras = [view.camera.to("cpu") for view in scene.train]
         self._centers = torch.stack([camera.center for camera in cameras])  # [V, 3]
@@ -49,10 +49,6 @@ class TrainingViews:
         """Return the training view with the smallest sum of distance (in scene extents) and angle (in radians).
 
         If several views are about equally near, the view nearest in time is returned.
-
-        Args:
-            camera: the camera for which the nearest view is searched.
-            time: the time in [0, 1]; None if the scene has no time.
         """
         distances = (self._centers - camera.center).norm(dim=-1)
         angles = torch.arccos((self._forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
@@ -63,30 +59,24 @@ class TrainingViews:
 
 
 def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewComparison:
-    """Render a model from the camera of a training view, and compute the error as in the run's evaluation.
-
-    Args:
-        renderer: the renderer of the model.
-        view: the training view to compare with.
-        request: the time at which to render, and the other settings of the controls.
-    """
+    """Render a model from the camera of a view, and compute the error as in the run's evaluation."""
     view = view.to("cpu")
     image = renderer.image(view.camera, request)
     shown = quantise(image) if renderer.run.config.protocol.quantise else image
-    error = error_image(shown.numpy(), view.image.numpy())
     return ViewComparison(
         renderer.name,
-        _small(to_bytes(view.image.cpu().numpy())),
-        _small(to_bytes(shown.cpu().numpy())),
-        _small(error),
+        reduced(to_bytes(view.image.cpu().numpy()), MOST_WIDTH),
+        reduced(to_bytes(shown.cpu().numpy()), MOST_WIDTH),
+        reduced(error_image(shown.numpy(), view.image.numpy()), MOST_WIDTH),
         capped_psnr(shown, view.image),
     )
 
 
-def _small(image: Pixels) -> Pixels:
-    """Shrink an image to MOST_WIDTH pixels if it is wider."""
+def reduced(image: Pixels, most: int, *, by_longer_side: bool = False) -> Pixels:
+    """Reduce an image to `most` pixels of width, or of its longer side; a smaller image stays as it is."""
     height, width = image.shape[:2]
-    if width <= MOST_WIDTH:
+    factor = most / (max(height, width) if by_longer_side else width)
+    if factor >= 1:
         return image
-    size = MOST_WIDTH, max(1, round(height * MOST_WIDTH / width))
+    size = max(1, round(factor * width)), max(1, round(factor * height))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
