@@ -1,213 +1,230 @@
-"""Declare the type and the default of every key of the YAML files in conf/, so that Hydra refuses an unknown key.
+"""Declare every key of the YAML files in conf/ with its facts, so that Hydra refuses an unknown key.
 
-This module does not import torch, so that `--help` and the message about a wrong key appear at once.
+A key is one line here, see `gsbench.config_key`. The keys of a training hook stand in the hook's own module: it
+declares a dataclass with `@joins("train")`, and this module imports all modules of gsbench/train/hooks/. Such a module
+imports torch and this module only in functions or for type checkers, as this module imports only Python's own library:
+`--help` and the message about a wrong key appear at once, and reports need neither torch nor Hydra.
 """
 
-from dataclasses import dataclass, field
+import importlib
+import pkgutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from gsbench.config_key import REQUIRED, extended, group, key
 
 HERE = Path(__file__).parent
 CONF = HERE / "conf" if (HERE / "conf").is_dir() else HERE.parent / "conf"  # in a wheel, else in a checkout
+
+for _hook in pkgutil.iter_modules([str(HERE / "train" / "hooks")]):
+    importlib.import_module(f"gsbench.train.hooks.{_hook.name}")
 
 
 @dataclass
 class DataConfig:
     """Describe a data set; an experiment (`+exp=`) sets these keys."""
 
-    dataset: str = MISSING  # name in tables
-    paper_dataset: str | None = None  # name in the paper's tables
-    root: str = MISSING  # folder of the scenes' folders, or pkg://MODULE
-    published: str = ""  # where to get the data
-    scenes: list[str] = field(default_factory=list)  # scenes of scene=all
-    repair: list[str] | None = None  # damaged images replaced by the frame before (Technicolor)
-    background: str = "black"  # or white: background of images
-    initial_lambda: float = 0.5  # initial lambda_t and lambda_d of 7DGS
-    initial_points: int = 100_000  # random points, if the data have none
-    initial_half_width: float | None = 1.3  # of the cube of random points; None: the cameras' common frustum
+    dataset: str = key(REQUIRED, "name in tables", role="measuring")
+    paper_dataset: str | None = key(None, "name in the paper's tables", role="measuring")
+    root: str = key(REQUIRED, "folder of the scenes' folders, or pkg://MODULE", role="place")
+    published: str = key("", "where to get the data", role="place")
+    scenes: list[str] = key([], "scenes of scene=all", role="place")
+    repair: list[str] | None = key(None, "damaged images replaced by the frame before (Technicolor)")
+    background: str = key("black", "background of images", choices=("black", "white"))
+    initial_lambda: float = key(0.5, "initial lambda_t and lambda_d of 7DGS")
+    initial_points: int = key(100_000, "random points, if the data have none", low=4)
+    initial_half_width: float | None = key(1.3, "of the cube of random points; null: the cameras' common frustum",
+                                           low=1e-6, high=1e6)  # fmt: skip
 
 
 @dataclass
 class SceneConfig:
     """Choose one scene of the data set."""
 
-    name: str = MISSING  # folder in data.root
-    released_as: str | None = None  # folder in the published data, if another
-    downscale: int = 1  # divisor of the image size
-    resize: str | None = None  # its filter; None: area; pillow: bicubic on 8 bits, as 3DGS
-    eval_split: str = "test"  # or val (D-NeRF lego)
-    val_every: int | None = None  # every n-th training view is of val, where the data have no val; None: none
-    frames: list[int] | None = None  # first and last frame (Technicolor); None: all
+    name: str = key(REQUIRED, "folder in data.root")
+    released_as: str | None = key(None, "folder in the published data, if another", role="place")
+    downscale: int = key(1, "divisor of the image size", low=1, high=10_000)
+    resize: str | None = key(None, "its filter; null: area; pillow: bicubic on 8 bits, as 3DGS", choices=("pillow",))
+    eval_split: str = key("test", "evaluated views; val for D-NeRF lego", choices=("test", "val"))
+    val_every: int | None = key(None, "every n-th training view is of val, where the data have no val", low=2)
+    frames: list[int] | None = key(None, "first and last frame (Technicolor); null: all")
 
 
 @dataclass
 class InitConfig:
     """Start the training from the Gaussians of a PLY file: `+init.ply=FILE`."""
 
-    ply: str | None = None  # trained 3D Gaussians in the format of 3DGS
-    ply_sha256: str | None = None  # hash of that file; computed if not given
+    ply: str | None = key(None, "trained 3D Gaussians in the format of 3DGS", role="place")
+    ply_sha256: str | None = key(None, "hash of that file; computed if not set")
 
 
 @dataclass
 class LearningRate:
     """Set a learning rate that falls log-linearly from `start` to `end` over the run."""
 
-    start: float = MISSING
-    end: float | None = None  # None: constant
-    per_extent: bool = False  # multiplied by the radius of the scene's cameras
-    per_run: bool = False  # multiplied by sqrt(recipe_iterations / iterations)
+    start: float = key(REQUIRED, "at the first step", low=0)
+    end: float | None = key(None, "at the last step; null: constant", low=0)
+    per_extent: bool = key(False, "multiplied by the radius of the scene's cameras")
+    per_run: bool = key(False, "multiplied by sqrt(recipe_iterations / iterations)")
 
 
 @dataclass
 class ModelConfig:
     """Choose the model and its settings."""
 
-    name: str = MISSING  # name of the model's class
-    module: str | None = None  # Python module of your own model
-    published_with_agr: bool = False  # whether the published method has AGR
-    agr: bool = "${.published_with_agr}"  # type: ignore[assignment]  # default of the key agr
-    agr_octaves: int = 4  # octaves of AGR's time encoding
-    sh_degree: int = 3  # SH degree, 0 to 3
-    min_opacity: float = 0.005  # Gaussians of lower opacity are pruned
-    gate: str = "off"  # default of effects.gate
-    candidates: dict[str, Any] = field(default_factory=dict)  # choices of model=auto
-    compared: dict[str, Any] = field(default_factory=dict)  # more choices of it with effects.compare=true
-    lr: dict[str, LearningRate] = field(default_factory=dict)  # learning rate of each parameter group
-    options: dict[str, Any] = field(default_factory=dict)  # arguments of the model's class
+    name: str = key(REQUIRED, "name of the model's class")
+    module: str | None = key(None, "Python module of your own model")
+    published_with_agr: bool = key(False, "whether the published method has AGR")
+    agr: bool = key("${.published_with_agr}", "default of the key agr")
+    agr_octaves: int = key(4, "octaves of AGR's time encoding", low=0, high=32)
+    sh_degree: int = key(3, "SH degree", low=0, high=3)
+    min_opacity: float = key(0.005, "Gaussians of lower opacity are pruned", low=0, high=0.25)  # resets: to twice it
+    gate: str = key("off", "default of effects.gate", role="place", choices=("off", "end", "both"))
+    candidates: dict[str, Any] = key({}, "choices of model=auto")
+    compared: dict[str, Any] = key({}, "more choices of it with effects.compare=true", needs="effects.compare")
+    lr: dict[str, LearningRate] = key({}, "learning rate of each parameter group")
+    options: dict[str, Any] = key({}, "arguments of the model's class")
 
 
 @dataclass
 class DensifyConfig:
     """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
 
-    kind: str = "gradient"  # gradient (3DGS), mcmc (relocation) or multiview (FastGS)
-    start: int = 500  # step after which densification starts
-    stop: int = 15_000  # step at which densification ends
-    every: int = 100  # least number of steps between two rounds
-    rounds: int | None = None  # most rounds of a run; None: 36
-    reset_every: int = 3_000  # steps between two opacity resets
-    grad_threshold: float = 2e-4  # least mean gradient of a 2D mean, in units of half the image
-    clone_below: float = 0.01  # clone if the largest scale is below this share of the extent, else split
-    prune_above: float = 0.1  # prune if the largest scale is above this share of the extent, after an opacity reset
-    thin_to: float | None = None  # share of Gaussians that stay after `stop`, by blend weight; None: all
-    max_gaussians: int | None = None  # most Gaussians at full resolution; None: one for 64 training pixels
-    noise: float = 5e5  # of mcmc: factor of the noise on means; 0: none
+    kind: str = key("gradient", "of 3DGS, by relocation, or of FastGS",
+                    choices=("gradient", "mcmc", "multiview"), absent="gradient")  # fmt: skip
+    start: int = key(500, "step after which densification starts", low=0)
+    stop: int = key(15_000, "step at which densification ends", low=0)
+    every: int = key(100, "least number of steps between two rounds", low=1)
+    rounds: int | None = key(None, "most rounds of a run; null: 36", low=1)
+    reset_every: int = key(3_000, "steps between two opacity resets", low=1)
+    grad_threshold: float = key(2e-4, "least mean gradient of a 2D mean, in units of half the image", low=0)
+    clone_below: float = key(0.01, "clone if the largest scale is below this share of the extent, else split", low=0)
+    prune_above: float = key(0.1, "prune if it is above this share, after an opacity reset", low=0)
+    thin_to: float | None = key(None, "share of Gaussians that stay after `stop`, by blend weight", low=1e-3, high=1)
+    max_gaussians: int | None = key(None, "most Gaussians at full resolution; null: one for 64 training pixels", low=4)
+    noise: float = key(5e5, "of mcmc: factor of the noise on means; 0: none", low=0, absent=5e5)
 
 
 @dataclass
 class PenaltyConfig:
     """Set one loss term."""
 
-    weight: float = 0.0  # 0: no term
-    start: int = 0  # first step
-    stop: int | None = None  # step after the last; None: never
+    weight: float = key(0.0, "factor of the term; 0: none", low=0, absent=0)
+    start: int = key(0, "first step", low=0, absent=0)
+    stop: int | None = key(None, "step after the last; null: never", low=0)
 
 
 @dataclass
 class PenaltiesConfig:
     """Add terms to every view's loss."""
 
-    opacity: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean opacity
-    size: PenaltyConfig = field(default_factory=PenaltyConfig)  # mean scale in space, in parts of the scene's extent
-    strain: PenaltyConfig = field(default_factory=PenaltyConfig)  # how fast neighbours move apart, for their distance
+    opacity: PenaltyConfig = group(PenaltyConfig, "mean opacity")
+    size: PenaltyConfig = group(PenaltyConfig, "mean scale in space, in parts of the scene's extent")
+    strain: PenaltyConfig = group(PenaltyConfig, "how fast neighbours move apart, for their distance")
 
 
+@extended("train")
 @dataclass
 class TrainConfig:
     """Set the schedule and the loss. Steps are given for `recipe_iterations` iterations, and scaled to `iterations`."""
 
-    iterations: int = 30_000  # steps of this run
-    recipe_iterations: int = 30_000  # length of the run that other steps refer to
-    batch_size: int = 4  # views in a step
-    ssim_weight: float = 0.2  # loss = (1 - w) L1 + w (1 - SSIM)
-    sh_every: int = 1_000  # steps until the SH degree rises by one
-    refine_from: int = 3_000  # step from which AGR acts and learns
-    lambda_from: int = 15_000  # step from which lambda_t and lambda_d learn
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
-    cooldown_from: int | None = None  # step from which learning rates fall to a tenth; None: never
-    average_from: int | None = None  # parameters averaged from this step on end the run if better on val; None: never
-    coarse: list[list[int]] | None = None  # [[4, 3000]]: a quarter of the width until step 3,000
-    penalties: PenaltiesConfig = field(default_factory=PenaltiesConfig)
-    curve_points: int = 20  # measurements on val during the run
-    lengths: int | None = None  # 4: also train 1/2, 1/4 and 1/8 of the iterations, and keep the best on val; None: no
-    patience: float | None = None  # share of the iterations without a better PSNR on val that ends a run; None: never
-    checkpoint_minutes: float = 2.0  # minutes between two checkpoints
+    iterations: int = key(30_000, "steps of this run", low=1)
+    recipe_iterations: int = key(30_000, "length of the run that other steps refer to", low=1)
+    batch_size: int = key(4, "views in a step", low=1, high=10_000)
+    ssim_weight: float = key(0.2, "loss = (1 - w) L1 + w (1 - SSIM)", low=0, high=1)
+    sh_every: int = key(1_000, "steps until the SH degree rises by one", low=1)
+    refine_from: int = key(3_000, "step from which AGR acts and learns", low=0)
+    lambda_from: int = key(15_000, "step from which lambda_t and lambda_d learn", low=0)
+    densify: DensifyConfig = group(DensifyConfig)
+    cooldown_from: int | None = key(None, "step from which learning rates fall to a tenth", low=0)
+    average_from: int | None = key(None, "parameters averaged from this step on end the run if better on val", low=0)
+    coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until step 3,000")
+    penalties: PenaltiesConfig = group(PenaltiesConfig)
+    curve_points: int = key(20, "measurements on val during the run", low=1, high=10_000)  # a page can draw so many
+    lengths: int | None = key(None, "4: also train 1/2, 1/4 and 1/8 of the iterations, and keep the best on val",
+                              low=2, high=8)  # fmt: skip
+    patience: float | None = key(None, "share of the iterations without a better PSNR on val that ends a run",
+                                 low=0.01, high=1)  # fmt: skip
+    checkpoint_minutes: float = key(2.0, "time between two checkpoints", unit="minutes", low=0, role="place")
 
 
 @dataclass
 class RasterConfig:
     """Choose how images are rendered."""
 
-    backend: str = "auto"  # or reference, cpu, cuda (docs/glossary.md)
-    antialias: bool = False  # Mip-Splatting: scale opacities for the 2D filter
+    backend: str = key("auto", "docs/glossary.md", choices=("auto", "reference", "cpu", "cuda"))
+    antialias: bool = key(False, "Mip-Splatting: scale opacities for the 2D filter")
 
 
 @dataclass
 class ProtocolConfig:
     """Choose how results are measured."""
 
-    name: str = MISSING  # gsbench, published or dgs2026
-    quantise: bool = False  # measure renders rounded to 8 bits
-    best_on_test: bool = False  # also record the best test PSNR (a leak)
-    lpips_alex: str | None = None  # file of AlexNet's weights; None: in $TORCH_HOME/hub/checkpoints
-    lpips_vgg: str | None = None  # file of VGG16's weights
-    renders: int = 30  # least number of timed renders
-    pictures: int = 3  # test views in pictures.png
+    name: str = key(REQUIRED, "gsbench, published or dgs2026")
+    quantise: bool = key(False, "measure renders rounded to 8 bits")
+    best_on_test: bool = key(False, "also record the best test PSNR (a leak)", role="training")  # while it trains
+    lpips_alex: str | None = key(None, "file of AlexNet's weights; null: in $TORCH_HOME/hub/checkpoints", role="place")
+    lpips_vgg: str | None = key(None, "file of VGG16's weights", role="place")  # checked by their hash
+    renders: int = key(30, "least number of timed renders", low=30, high=1_000_000)
+    pictures: int = key(3, "test views in pictures.png", low=0, high=10_000)
 
 
 @dataclass
 class EffectsConfig:
-    """Remove time, direction and AGR (a network) from Gaussians that do not need them (docs/effects.md)."""
+    """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
-    gate: str = "${model.gate}"  # off; end: after the training; both: also during it
-    budget_db: float = 0.05  # dB of PSNR on val that the removal at the end may cost
-    compare: bool = False  # choose the model of model=auto by PSNR on val, after 70 % of the steps
+    gate: str = key("${model.gate}", "end: after the training; both: also during it",
+                    choices=("off", "end", "both"), absent="off")  # fmt: skip
+    budget_db: float = key(0.05, "PSNR on val that the removal at the end may cost", unit="dB", low=0, high=10,
+                           needs="effects.gate")  # fmt: skip
+    compare: bool = key(False, "choose the model of model=auto by PSNR on val, after 70 % of the steps", absent=False)
 
 
 @dataclass
 class LaunchConfig:
     """Launch runs here (`+launch=local`), in parallel processes (`parallel`) or as Slurm jobs (`slurm`)."""
 
-    at_once: int = -1  # runs at a time; -1: one for each CPU (parallel) or all (slurm)
-    partition: str | None = None  # this and all keys below: Slurm only
-    minutes: int = 240  # time limit of a job; longer runs continue in another
-    cpus: int = 4  # CPUs of a job
-    gpus: int | None = None  # GPUs of a job; use device=cuda
-    memory: str = "8G"  # memory of a job, as in sbatch
-    setup: str = ":"  # shell line before the run: `module load cuda`
-    requeues: int = 20  # most jobs in which a run may continue
-    signal_seconds: int = 120  # seconds before the time limit at which a job saves
-    container: str | None = None  # Apptainer image in which jobs run; None: none
-    container_command: str = "apptainer exec"  # what runs a command in it
-    sbatch: dict[str, Any] = field(default_factory=dict)  # other options of sbatch: +launch.sbatch.account=NAME
+    at_once: int = key(-1, "runs at a time; -1: one for each CPU (parallel) or all (slurm)")
+    partition: str | None = key(None, "this and all keys below: Slurm only")
+    minutes: int = key(240, "time limit of a job; longer runs continue in another", unit="minutes")
+    cpus: int = key(4, "CPUs of a job")
+    gpus: int | None = key(None, "GPUs of a job; use device=cuda")
+    memory: str = key("8G", "memory of a job, as in sbatch")
+    setup: str = key(":", "shell line before the run: `module load cuda`")
+    requeues: int = key(20, "most jobs in which a run may continue")
+    signal_seconds: int = key(120, "time before the limit at which a job saves", unit="seconds")
+    container: str | None = key(None, "Apptainer image in which jobs run")
+    container_command: str = key("apptainer exec", "what runs a command in it")
+    sbatch: dict[str, Any] = key({}, "other options of sbatch: +launch.sbatch.account=NAME")
 
 
+@extended("")
 @dataclass
 class Config:
     """Configure one run, or with `scene=all` a run for each scene of the data set."""
 
-    experiment: str = MISSING  # name of the +exp= file
-    seed: int = 0  # seed of every random number
-    device: str = "cpu"  # or cuda, cuda:1
-    agr: bool = "${model.agr}"  # type: ignore[assignment]  # whether the model has AGR, the neural refinement
-    optim: str = "adam"  # or sparse_adam: updates only visible Gaussians
-    results: str = "results"  # folder of all results
-    resume: bool = True  # false: start over
-    log: str | None = None  # also send the curve to tensorboard, wandb or mlflow
-    model: ModelConfig = field(default_factory=ModelConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    data: DataConfig = field(default_factory=DataConfig)
-    init: InitConfig = field(default_factory=InitConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
-    raster: RasterConfig = field(default_factory=RasterConfig)
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
-    effects: EffectsConfig = field(default_factory=EffectsConfig)
-    launch: LaunchConfig = field(default_factory=LaunchConfig)
+    experiment: str = key(REQUIRED, "name of the +exp= file", role="measuring")
+    seed: int = key(0, "seed of every random number", low=0, high=2**63 - 1)
+    device: str = key("cpu", "or cuda, cuda:1")
+    agr: bool = key("${model.agr}", "whether the model has AGR, the neural refinement")
+    optim: str = key("adam", "sparse_adam updates only visible Gaussians", choices=("adam", "sparse_adam"))
+    results: str = key("results", "folder of all results", role="launching")
+    resume: bool = key(True, "false: start over", role="launching")
+    log: str | None = key(None, "also send the curve to tensorboard, wandb or mlflow", role="launching")
+    model: ModelConfig = group(ModelConfig)
+    scene: SceneConfig = group(SceneConfig)
+    data: DataConfig = group(DataConfig)
+    init: InitConfig = group(InitConfig)
+    train: TrainConfig = group(TrainConfig)
+    raster: RasterConfig = group(RasterConfig)
+    protocol: ProtocolConfig = group(ProtocolConfig, role="measuring")
+    effects: EffectsConfig = group(EffectsConfig)
+    launch: LaunchConfig = group(LaunchConfig, role="launching")
 
 
 def register_schema() -> None:
     """Let Hydra check conf/config.yaml and its groups against the dataclasses of this module."""
+    from hydra.core.config_store import ConfigStore
+
     ConfigStore.instance().store(name="schema", node=Config)

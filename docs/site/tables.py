@@ -3,24 +3,23 @@
 `make docs` runs it; a test fails where a block is not what this writes.
 """
 
-import dataclasses
 import inspect
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+import config_tables
 import hydra
 import length_blocks
 import readme_blocks
 import results_blocks
 import suite_blocks
 import torch
-from omegaconf import MISSING, DictConfig
+from omegaconf import DictConfig
 
-from gsbench.config import CONF, Config, register_schema
+from gsbench.config import CONF, register_schema
 from gsbench.models import find
 from gsbench.models.base import GaussianModel
 from gsbench.run.setup import build
@@ -68,50 +67,10 @@ def numbers(composed: DictConfig) -> int:
     return sum(parameter[0].numel() for parameter in model.splats.values())
 
 
-def config() -> str:
-    """Return a table of keys for each part of the config."""
-    return "\n\n".join(part(Config, "", "The run"))
-
-
-def part(kind: Any, prefix: str, title: str) -> Iterator[str]:
-    """Yield the heading, the words and the table of a part of the config, then those of the parts below it."""
-    comments = dict(re.findall(r"^    (\w+): .*  # (?!type:)(.*)$", inspect.getsource(kind), re.MULTILINE))
-    rows, below = ["| key | default | |", "| --- | --- | --- |"], []
-    for field in dataclasses.fields(kind):
-        key = f"{prefix}{field.name}"
-        if dataclasses.is_dataclass(field.type):
-            below.append((field.type, key))
-        else:
-            rows.append(f"| `{key}` | {default_of(field)} | {comments.get(field.name, '')} |")
-    yield f"## {title}"
-    yield inspect.getdoc(kind) or ""
-    yield "\n".join(rows)
-    for inner, key in below:
-        yield from part(inner, f"{key}.", key)
-
-
-def type_of(field: "dataclasses.Field[Any]") -> str:
-    """Name the type of a key."""
-    text = field.type.__name__ if isinstance(field.type, type) and not hasattr(field.type, "__args__") else field.type
-    return str(text).replace("gsbench.config.", "").replace("typing.", "").replace(" | ", " or ")
-
-
-def default_of(field: "dataclasses.Field[Any]") -> str:
-    """Show the default of a key as YAML has it, or its type where the default does not tell it."""
-    factory = field.default_factory
-    value = field.default if factory is dataclasses.MISSING else factory()
-    if value == MISSING:
-        return type_of(field)
-    if value is None:
-        return f"`null`, {type_of(field).removesuffix(' or None')}"
-    words = {True: "true", False: "false", "": "''"}
-    return f"`{words[value] if isinstance(value, bool | str) and value in words else value}`"
-
-
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     "README.md": readme_blocks.BLOCKS,
     "docs/models.md": {"models": lambda _: models()},
-    "docs/config.md": {"config": lambda _: config()},
+    "docs/config.md": {"config": lambda _: config_tables.tables()},
     "docs/results.md": results_blocks.BLOCKS | suite_blocks.BLOCKS | length_blocks.BLOCKS,
 }
 
@@ -135,7 +94,10 @@ def filled(page: str, published: Path = PUBLISHED) -> str:
 def wrapped(block: str) -> str:
     """Break the sentences of a block into lines; tables and images stay as they are."""
     parts = block.split("\n\n")
-    return "\n\n".join(part if part[0] in "|!#" else textwrap.fill(part, WIDTH, **WHOLE) for part in parts)
+    is_whole = [part[0] in "|!#" or "\n--- |" in part for part in parts]
+    return "\n\n".join(
+        part if whole else textwrap.fill(part, WIDTH, **WHOLE) for part, whole in zip(parts, is_whole, strict=True)
+    )
 
 
 def main() -> int:

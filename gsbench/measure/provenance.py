@@ -1,8 +1,6 @@
 """Collect the provenance of a run: its commit, package versions, machine, settings and time."""
 
 import functools
-import hashlib
-import json
 import platform
 import subprocess
 from collections.abc import Sequence
@@ -11,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from gsbench.config_roles import config_hash
 from gsbench.measure.machine import hardware
 from gsbench.measure.record import Provenance
 from gsbench.version import __version__
@@ -50,12 +49,6 @@ def provenance(
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         hardware=here,
     )
-
-
-def config_hash(config: dict[str, Any]) -> str:
-    """Return the SHA-256 of a config in plain JSON; the order of its keys does not matter."""
-    canonical = json.dumps(config, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:

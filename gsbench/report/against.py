@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean, variance
 
+from gsbench.config_roles import listed, training_differences
 from gsbench.errors import printable
 from gsbench.measure.record import Record
-from gsbench.measure.settings import listed, training_differences
 from gsbench.report.configurations import OF_THE_MACHINE, QUANTITIES
 from gsbench.report.intervals import LEVEL, Estimate, Spread, holm
 

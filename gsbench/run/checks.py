@@ -3,76 +3,33 @@
 import dataclasses
 import importlib.resources
 import itertools
-import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gsbench.config import Config, LearningRate
+from gsbench.config_roles import facts, flat
 from gsbench.errors import InputError, did_you_mean, one_line
 from gsbench.kernels.backends import resolve
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.record import MAX_POINTS, run_path
-from gsbench.measure.speed import LEAST_RENDERS
+from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
 from gsbench.models.gated import as_gated
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
-from gsbench.scenes import RESIZES, Scene, View
+from gsbench.scenes import Scene, View
 from gsbench.scenes.trained import TrainedGaussians, read_trained, share_seen
-from gsbench.train.densify import check_kind
-from gsbench.train.gating import GATES
 from gsbench.train.losses import WINDOW
-from gsbench.train.optim import OPTIMIZERS
 from gsbench.train.penalties import check_penalties
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
-SPLITS = ("test", "val")
 LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
 ENOUGH_SEEN = 0.5  # share of Gaussians to start from that a camera sees; below it a line says so
-ENDLESS = 10**9  # more than any machine can do
-RANGES = {  # the ranges of settings, both ends included
-    "train.iterations": (1, ENDLESS),
-    "train.recipe_iterations": (1, ENDLESS),
-    "train.batch_size": (1, 10_000),
-    "train.ssim_weight": (0, 1),
-    "train.sh_every": (1, ENDLESS),
-    "train.refine_from": (0, ENDLESS),
-    "train.lambda_from": (0, ENDLESS),
-    "train.cooldown_from": (0, ENDLESS),
-    "train.average_from": (0, ENDLESS),
-    "train.densify.start": (0, ENDLESS),
-    "train.densify.stop": (0, ENDLESS),
-    "train.densify.every": (1, ENDLESS),
-    "train.densify.rounds": (1, ENDLESS),
-    "train.densify.reset_every": (1, ENDLESS),
-    "train.densify.grad_threshold": (0, math.inf),
-    "train.densify.clone_below": (0, math.inf),
-    "train.densify.prune_above": (0, math.inf),
-    "train.densify.thin_to": (1e-3, 1),
-    "train.densify.noise": (0, ENDLESS),
-    "train.penalties.opacity.weight": (0, math.inf),
-    "train.penalties.size.weight": (0, math.inf),
-    "train.penalties.strain.weight": (0, math.inf),
-    "train.densify.max_gaussians": (LEAST_GAUSSIANS, ENDLESS),
-    "train.curve_points": (1, MAX_POINTS),
-    "train.lengths": (2, 8),
-    "train.patience": (0.01, 1),
-    "train.checkpoint_minutes": (0, ENDLESS),
-    "model.min_opacity": (0, 0.25),  # a reset lowers opacities to twice as much
-    "data.initial_points": (4, ENDLESS),
-    "data.initial_half_width": (1e-6, 1e6),
-    "scene.downscale": (1, 10_000),
-    "scene.val_every": (2, ENDLESS),
-    "effects.budget_db": (0, 10),
-    "protocol.renders": (LEAST_RENDERS, 1_000_000),
-    "protocol.pictures": (0, 10_000),
-}
 
 
 def check_config(config: Config) -> None:
@@ -87,21 +44,9 @@ def check_config(config: Config) -> None:
 def check_values(config: Config) -> None:
     """Raise InputError if a setting is invalid on every machine, for instance out of its range."""
     check_keys(config, Config, "")
-    _check_choice("data.background", config.data.background, BACKGROUNDS)
-    if config.scene.resize is not None:
-        _check_choice("scene.resize", config.scene.resize, RESIZES)
-    _check_choice("scene.eval_split", config.scene.eval_split, SPLITS)
-    _check_choice("optim", config.optim, OPTIMIZERS)
-    _check_choice("effects.gate", config.effects.gate, GATES)
-    for key, value in _numbers(config, ""):
-        if not math.isfinite(value):
-            raise InputError(f"{key}: expected a finite number, got {value}")
-        low, high = RANGES.get(key, (-math.inf, math.inf))
-        if not low <= value <= high:
-            expected = f"{low} to {high}" if high < ENDLESS else f"at least {low}"
-            raise InputError(f"{key}: expected {expected}, got {value}")
+    for dotted, value in flat(dataclasses.asdict(config)):
+        facts(dotted).check(dotted, value)
     _check_steps(config)
-    check_kind(config.train.densify.kind)
     check_penalties(config.train.penalties)
     _check_coarse(config.train.coarse or [])
     for name, rate in config.model.lr.items():
@@ -168,15 +113,6 @@ def check_keys(value: Any, kind: Any, place: str) -> None:
         check_keys(one, type(one), dotted)
 
 
-def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
-    """Yield all numbers in the settings with their dotted keys."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        yield place, value
-    members = value if isinstance(value, dict) else vars(value) if dataclasses.is_dataclass(value) else {}
-    for name, one in members.items():
-        yield from _numbers(one, f"{place}.{name}".lstrip("."))
-
-
 def _check_steps(config: Config) -> None:
     """Raise InputError if the end of a training is to begin after its last step, or its shortest length has no step."""
     train = config.train
@@ -219,11 +155,6 @@ def check_folder(folder: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise InputError(f"results: expected a folder that can be written, got {folder}: {error.strerror}") from None
-
-
-def _check_choice(key: str, value: str, known: Iterable[str]) -> None:
-    if value not in known:
-        raise InputError(f"{key} '{value}' is not known. {did_you_mean(value, known)}")
 
 
 def check_device(name: str) -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 import torch
 
 from gsbench import kernels
+from gsbench.config_roles import listed, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError
 from gsbench.measure import perceptual
 from gsbench.measure import record as records
 from gsbench.measure.machine import hardware, named
 from gsbench.measure.record import Record
-from gsbench.measure.settings import listed, measuring_differences, training_differences, training_hash
 from gsbench.run.checks import evaluated_views, lpips_weights
 from gsbench.run.identity import Run
 from gsbench.scenes import Scene

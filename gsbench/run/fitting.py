@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from gsbench.config import Config, DataConfig
+from gsbench.config_roles import training_hash
 from gsbench.errors import InputError
-from gsbench.measure.settings import training_hash
 from gsbench.models import GaussianModel
 from gsbench.models.start import start_from
 from gsbench.run import progress, stop

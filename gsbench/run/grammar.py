@@ -2,14 +2,13 @@
 
 import re
 import shlex
-from dataclasses import is_dataclass
-from typing import Any, get_type_hints
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Quote, QuotedString
 from hydra.errors import HydraException
 
-from gsbench.config import Config
+from gsbench.config_roles import facts
 from gsbench.errors import InputError
 
 _TEXTS = (str, str | None)  # the types of keys whose values are texts
@@ -21,7 +20,7 @@ def check_override(word: str) -> None:
     The message has the override as it is to be typed in a shell, with quotes around the value.
     """
     key, _, text = word.partition("=")
-    kind, read = _type_of(key), _read(word)
+    kind, read = facts(key.lstrip("+")).kind, _read(word)
     if isinstance(read, HydraException):
         if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:
             raise InputError(f"{word!r:.300}: expected KEY=VALUE, such as model=7dgs or +exp=mini")
@@ -56,14 +55,6 @@ def _read(word: str) -> Any:
         return OverridesParser.create().parse_override(word).value()
     except HydraException as error:
         return error
-
-
-def _type_of(key: str) -> Any:
-    """Return the type of a config key, such as str for data.root; None if gsbench/config.py does not declare it."""
-    kind: Any = Config
-    for name in key.lstrip("+").split("."):
-        kind = get_type_hints(kind).get(name) if is_dataclass(kind) else None
-    return kind
 
 
 def _is_list(text: str) -> bool:

@@ -4,28 +4,24 @@ import hashlib
 import json
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
-from gsbench.config import Config
+from gsbench.config import CONF, Config
+from gsbench.config_roles import Plain, flat, recorded, repeating, training_keys
 from gsbench.errors import InputError
 from gsbench.measure import record as records
-from gsbench.measure.renamed import present_key
-from gsbench.measure.settings import Plain, flat, training_part
 from gsbench.reading import read_file
 from gsbench.run.grammar import quoted_value
-from gsbench.run.overrides import UNNAMED, deciding
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
 OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
-DEFAULTS = {"train": "default", "raster": "default", "protocol": "gsbench"}  # groups of conf/config.yaml
 LONGEST_VARIANT = 80  # characters; longer names could exceed the limits of a path
 
 
@@ -62,7 +58,6 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     for name in (one.name for one in fields(Config)):
         if name not in composed:
             raise _deleted(name)
-    _rename_rates(composed)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     for key, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
         if name == records.PUBLISHED:
@@ -77,10 +72,8 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     folder = records.run_path(
         Path(config.results), config.experiment, config.scene.name, label, config.seed, variant=variant
     )
-    for key in UNNAMED if config.init.ply is not None else (*UNNAMED, "init"):  # older runs have no such key
-        del plain[key]
-    plain = _storable(plain)
-    return Run(config, plain, folder, label, variant, deciding(overrides))
+    plain = _storable(recorded(plain))
+    return Run(config, plain, folder, label, variant, repeating(overrides))
 
 
 def _deleted(key: str) -> InputError:
@@ -91,17 +84,6 @@ def label_of(config: Config) -> str:
     """Return the model's name, with _agr or _noagr if its use of AGR (a network) differs from the published method."""
     as_published = config.agr == config.model.published_with_agr
     return config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
-
-
-def _rename_rates(composed: DictConfig) -> None:
-    """Rename learning rates of a user's model YAML that was written for an older version of gsbench."""
-    rates = composed.model.lr
-    for name in list(rates):
-        present = present_key(f"model.lr.{name}").rpartition(".")[2]
-        if present != name:
-            warnings.warn(f"model.lr.{name} was renamed, read as model.lr.{present}", stacklevel=1)
-            with open_dict(rates):
-                rates[present] = rates.pop(name)
 
 
 def hash_of(ply: str) -> str:
@@ -122,32 +104,30 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     Raises:
         InputError: a setting of the model was deleted, which no name could tell.
     """
-    groups = {
-        group: choice
-        for group, choice in choices.items()
-        if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
-    }
-    words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if DEFAULTS.get(group) != choice]
-    own = [f"{'' if group in DEFAULTS or group in ('model', 'scene') else '+'}{group}={quoted_value(choice)}"
-           for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
-    own += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}"]
-    own += [f"scene.name={quoted_value(plain['scene']['name'])}"]
-    base: Plain = OmegaConf.to_container(hydra.compose("config", own), resolve=True)  # type: ignore[assignment]
-    effects = base["effects"]
-    theirs = {"effects.budget_db": effects["budget_db"]} | dict(flat(training_part(
-        base | {"effects": effects | {"compare": plain["effects"]["compare"]}}  # so that both have model.compared
-    ))) | {"effects.compare": effects["compare"]}  # fmt: skip
-    mine = dict(flat(training_part(plain)))
-    if "effects.gate" in theirs:
-        mine.setdefault("effects.gate", "off")
-    for key in theirs:
-        if key.startswith("model.") and key not in mine:
+    standard = _standard_choices()
+    groups = {group: choice for group, choice in choices.items()
+              if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))}  # fmt: skip
+    words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if standard.get(group) != choice]
+    base = [f"{'' if group in standard else '+'}{group}={quoted_value(choice)}"
+            for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
+    base += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}"]
+    base += [f"scene.name={quoted_value(plain['scene']['name'])}"]
+    before = dict(flat(OmegaConf.to_container(hydra.compose("config", base), resolve=True)))  # type: ignore[arg-type]
+    after = dict(flat(plain))
+    for key in before:
+        if key.startswith("model.") and key not in after:
             raise _deleted(key)
-    changed = {key: value for key, value in mine.items() if key not in theirs or value != theirs[key]}
+    changed = {key: value for key, value in training_keys(plain).items() if key not in before or value != before[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):
         words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")
     return _cut(words)
+
+
+def _standard_choices() -> dict[str, str]:
+    """Return the choice of each config group in conf/config.yaml."""
+    entries: Any = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
+    return {group: choice for entry in entries if isinstance(entry, dict) for group, choice in entry.items()}
 
 
 def _storable(value: Any) -> Any:

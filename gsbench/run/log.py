@@ -6,11 +6,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+from gsbench.config_roles import flat
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Record
-from gsbench.measure.settings import flat
 from gsbench.reading import parse_json, read_file
 from gsbench.run.identity import Run
 from gsbench.run.trackers import Guarded, Subject

@@ -4,10 +4,10 @@ import copy
 from pathlib import Path
 
 from gsbench.config import EffectsConfig
+from gsbench.config_roles import Plain, training_hash
 from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.measure.record import Record
-from gsbench.measure.settings import Plain, training_hash
 from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder
 from gsbench.run.identity import Run

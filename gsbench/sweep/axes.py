@@ -5,7 +5,6 @@ A command that names a launcher is a sweep too: without `--multirun`, Hydra igno
 
 import itertools
 import re
-import warnings
 from collections.abc import Sequence
 
 from hydra import compose, initialize_config_dir
@@ -16,7 +15,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF
 from gsbench.errors import InputError, did_you_mean
-from gsbench.measure.renamed import present_override
 from gsbench.run.grammar import check_override, quoted_value
 
 MULTIRUN = ("-m", "--multirun")
@@ -31,15 +29,14 @@ NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{
 def expand(words: Sequence[str]) -> list[str]:
     """Return the words of a command line with `--multirun` first, and with all scene names instead of scene=all.
 
-    Config keys that were renamed are replaced by their present names. Nothing else is changed in a command line that
-    names one scene, asks for information or has an error; Hydra explains the error.
+    Nothing is changed in a command line that names one scene, asks for information or has an error; Hydra explains it.
 
     Raises:
         InputError: Hydra cannot read an override, the choice of a config group is a number, the experiment has no
             scenes, or scene=all is combined with several experiments.
     """
     multirun = any(word in MULTIRUN for word in words)
-    words = [_with_present_names(word) for word in words if word not in MULTIRUN]
+    words = [word for word in words if word not in MULTIRUN]
     for before, word in itertools.pairwise(["", *words]):
         if not any(one.startswith("-") for one in (before, word)):  # an option, or its value, such as a folder
             check_override(word)
@@ -99,14 +96,6 @@ def _key(word: str) -> str:
 def _first_of(word: str) -> str:
     """Return an override with the first of the values that commas separate."""
     return word if re.search("=['\"[]", word) else word.partition(",")[0]
-
-
-def _with_present_names(word: str) -> str:
-    """Return a word of the command line with the present names of config keys; warn if a key was renamed."""
-    present = present_override(word)
-    if present != word:
-        warnings.warn(f"{word}: a key of it was renamed, read as {present}", stacklevel=1)
-    return present
 
 
 def _check_group(name: str, choices: str) -> None:

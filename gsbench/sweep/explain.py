@@ -9,7 +9,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.errors import did_you_mean
 from gsbench.extras import how_to_install
-from gsbench.measure.renamed import present_key
 from gsbench.run.grammar import typed
 
 LIBRARIES = ("hydra", "omegaconf", "antlr4", "submitit")
@@ -27,9 +26,6 @@ def explain(error: Exception) -> str:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
         keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
-        present = present_key(str(cause.full_key))
-        if present != cause.full_key:
-            return f"config key '{cause.full_key}' was renamed: write {present}"
         if keys and cause.key not in keys:
             return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
         return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from gsbench.config_roles import repeating
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.schema import MOST, parse
 from gsbench.reading import MAX_JSON, parse_json, read_file
-from gsbench.run.overrides import deciding
 
 FOLDER, FILE_NAME, ENDED, JOBS = ".sweep", "plan.json", "ended", ".submitit"
 Identity = tuple[str, ...]
@@ -49,7 +49,7 @@ class Ended:
 
 def identity(overrides: Sequence[str]) -> Identity:
     """Return those overrides of a run that affect its results; they identify the run."""
-    return tuple(deciding(overrides))
+    return tuple(repeating(overrides))
 
 
 def write(plan: Plan, folder: Path) -> Path:

@@ -17,10 +17,9 @@ from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, register_schema
+from gsbench.config_roles import launches
 from gsbench.errors import InputError, printable
-from gsbench.measure.renamed import present_override
 from gsbench.run.grammar import quoted_value
-from gsbench.run.overrides import launches
 from gsbench.sweep import container, plan
 from gsbench.sweep.axes import SCENES_DEPEND_ON, scenes_of
 from gsbench.sweep.callbacks import plan_of
@@ -96,7 +95,7 @@ def _relaunch(
                          f"{getattr(error, 'strerror', error)}") from None  # fmt: skip
     # Scenes that have no file in conf/ become choices of the group `scene`, as when the command was given.
     scenes_of([one for one in first.overrides if one.partition("=")[0].lstrip("+") in SCENES_DEPEND_ON])
-    runs = [[*(present_override(one) for one in requested.overrides if not one.startswith("results=")),
+    runs = [[*(one for one in requested.overrides if not one.startswith("results=")),
              f"results={quoted_value(results)}", *more] for requested in group]  # fmt: skip
     with initialize_config_dir(str(CONF), job_name="gsbench", version_base="1.3"):
         config = compose(CONFIG_NAME, [*first.plan.hydra, *_common(runs)], return_hydra_config=True)

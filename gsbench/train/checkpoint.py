@@ -14,7 +14,6 @@ from torch import Tensor
 from gsbench.errors import InputError, TooLargeError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import CHECKPOINT
-from gsbench.measure.renamed import with_present_keys
 
 MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = CHECKPOINT
@@ -42,7 +41,7 @@ RENAMED_IN_MODEL = {
 class Checkpoint:
     """Hold the state of a training, and what is needed to render its model without the data set."""
 
-    training: str  # hash of the settings that affect the training: gsbench.measure.settings.training_hash
+    training: str  # hash of the settings that affect the training: gsbench.config_roles.training_hash
     data: str  # hash of the data set: Scene.fingerprint
     state: dict[str, Any]  # Trainer.state_dict
     config: dict[str, Any] = field(default_factory=dict)  # the whole resolved config as plain containers
@@ -142,7 +141,7 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
         expected = str if name in ("training", "data") else dict
         if not isinstance(value, expected):
             raise _fault(path, f"'{name}' as {type(value).__name__}")
-    return replace(found, state=with_present_names(found.state), config=with_present_keys(found.config))
+    return replace(found, state=with_present_names(found.state))
 
 
 def with_present_names(state: dict[str, Any]) -> dict[str, Any]:

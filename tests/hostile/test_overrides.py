@@ -22,9 +22,9 @@ from omegaconf.errors import OmegaConfBaseException
 from tiny_run import overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
+from gsbench.config_roles import flat
 from gsbench.errors import InputError
 from gsbench.measure import record
-from gsbench.measure.settings import flat
 from gsbench.run import claim
 from gsbench.run.run import run
 from gsbench.sweep.axes import expand

@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from tiny_run import gsbench, main_here, overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
+from gsbench.config_roles import flat
 from gsbench.errors import InputError
-from gsbench.measure.settings import flat
 from gsbench.sweep import callbacks, plan, status
 from gsbench.sweep.__main__ import main as sweep_main
 from gsbench.sweep.plan import Plan, identity

@@ -1,0 +1,106 @@
+"""Tell from a run's config what its training is, what is only measured otherwise, and compare two configs.
+
+What depends on a key stands in its field (`gsbench.config_key.Role`). Configs are in plain JSON, as they are recorded.
+"""
+
+import functools
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from gsbench.config import Config
+from gsbench.config_key import Key, described
+
+Plain = dict[str, Any]  # a resolved config in plain JSON
+
+_MOST_NAMED = 5  # the most differences that a message contains
+
+
+@functools.cache
+def facts(dotted: str) -> Key:
+    """Return the facts of a dotted config key; a key that no dataclass declares counts as its group."""
+    return described(Config, dotted)
+
+
+def flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the leaves of a nested config as (dotted key, value)."""
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def training_keys(plain: Plain) -> Plain:
+    """Return the keys of a config on which its training depends, as a flat dict."""
+    whole = dict(flat(plain))
+
+    def is_set(key: str) -> bool:
+        return whole.get(key, facts(key).absent) not in (None, facts(key).absent)
+
+    return {key: value for key, value in whole.items()
+            if facts(key).role == "training" and ((needed := facts(key).needs) is None or is_set(needed))}  # fmt: skip
+
+
+def training_hash(plain: Plain) -> str:
+    """Return the SHA-256 of all settings that change the training; a checkpoint with an equal hash can be resumed."""
+    return config_hash(_decided(training_keys(plain)))
+
+
+def config_hash(plain: Plain) -> str:
+    """Return the SHA-256 of a config; the order of its keys does not matter."""
+    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def training_differences(before: Plain, after: Plain) -> list[str]:
+    """Describe the settings that change the training and differ; [] if both configs have the same training."""
+    return _differences(training_keys(before), training_keys(after))
+
+
+def measuring_differences(before: Plain, after: Plain) -> list[str]:
+    """Describe the settings that change only what is measured, and differ between two configs."""
+    return _differences(*(
+        {key: value for key, value in flat(plain) if facts(key).role == "measuring"} for plain in (before, after)
+    ))  # fmt: skip
+
+
+def listed(differences: list[str]) -> str:
+    """Join descriptions of differences to one line, which contains only the first few and the number of others."""
+    more = len(differences) - _MOST_NAMED
+    return "; ".join(differences[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+
+
+def recorded(plain: Plain) -> Plain:
+    """Return a config without the keys that only say how a run is launched."""
+    return {key: value for key, value in plain.items() if facts(key).role != "launching"}
+
+
+def repeating(overrides: Sequence[str]) -> list[str]:
+    """Return the sorted overrides of a command line that are needed to repeat a run; equal runs have equal lists."""
+    return sorted(override for override in overrides if facts(_key(override)).role != "launching")
+
+
+def launches(override: str) -> bool:
+    """Return whether an override only sets how a run is launched, for instance on Slurm."""
+    return _key(override).partition(".")[0] == "launch"
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")
+
+
+def _decided(keys: Plain) -> Plain:
+    """Return the keys of a flat config whose value is not that of runs from before there was the key."""
+    return {key: value for key, value in keys.items() if value is not None and value != facts(key).absent}
+
+
+def _differences(before: Plain, after: Plain) -> list[str]:
+    before, after = _decided(before), _decided(after)
+    return [f"{key} {_shown(after, key)} instead of {_shown(before, key)}"
+            for key in sorted(before.keys() | after.keys())
+            if config_hash({"": before.get(key, [])}) != config_hash({"": after.get(key, [])})]  # fmt: skip
+
+
+def _shown(config: Plain, key: str) -> str:
+    return f"{config[key]!s:.80}" if key in config else "not set"

@@ -1,0 +1,178 @@
+"""The facts of config keys: refusals, hashes and comparisons that follow from them, and the files of conf/."""
+
+import copy
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import yaml
+from tiny_run import ROOT
+
+from gsbench.config import CONF, Config
+from gsbench.config_key import Key, declared, described, extended, joins, key
+from gsbench.config_roles import facts, flat, measuring_differences, training_differences, training_hash
+from gsbench.errors import InputError
+from gsbench.measure.record import MAX_POINTS
+from gsbench.measure.speed import LEAST_RENDERS
+from gsbench.run.checks import BACKGROUNDS, LEAST_GAUSSIANS, check_config
+from gsbench.scenes import RESIZES
+from gsbench.stability.training_cases import compose
+from gsbench.train.densify import KINDS
+from gsbench.train.gating import GATES
+from gsbench.train.optim import OPTIMIZERS
+
+KEYS = declared(Config)
+OF_HYDRA = ("defaults", "hydra")  # keys of YAML files that are not keys of a config
+OPEN = ("model.options.", "model.candidates.", "model.compared.", "launch.sbatch.")  # groups that may have any key
+GROUPS = {name.partition(".")[0] for name in KEYS}
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return compose("7dgs", 10)
+
+
+def wrong(facts: Key) -> Iterator[Any]:
+    """Values that a key refuses."""
+    if facts.choices:
+        yield "nothing"
+    if facts.low > -math.inf:
+        yield from (facts.low - 1, 2 * facts.high + 1, math.nan)
+
+
+@pytest.mark.parametrize("dotted", [name for name in KEYS if [*wrong(KEYS[name])] and "NAME" not in name])
+def test_values_out_of_a_range_or_no_choice_are_refused(dotted: str, config: Config) -> None:
+    """Catches a key that is not looked at: its run would fail in the middle, or train as if nothing were said."""
+    for value in wrong(KEYS[dotted]):
+        broken = copy.deepcopy(config)
+        *groups, name = dotted.split(".")
+        part: Any = broken
+        for group in groups:
+            part = getattr(part, group)
+        setattr(part, name, value)
+        with pytest.raises(InputError, match=rf"^{dotted}( 'nothing' is not known|: expected)"):
+            check_config(broken)
+    check_config(config)
+
+
+def test_rates_of_any_name_have_a_range(config: Config) -> None:
+    """Catches a negative learning rate."""
+    broken = copy.deepcopy(config)
+    broken.model.lr["means"].start = -1
+    with pytest.raises(InputError, match=r"^model\.lr\.means\.start: expected at least 0, got -1"):
+        check_config(broken)
+
+
+@pytest.mark.parametrize("key", ["train.cooldown_from", "train.average_from"])
+def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
+    """Catches an end of a training that begins after its last step, of the recipe's 30,000."""
+    broken = copy.deepcopy(config)
+    setattr(broken.train, key.removeprefix("train."), 30_000)
+    with pytest.raises(InputError, match=f"^{key}: expected a step below train.recipe_iterations=30000"):
+        check_config(broken)
+
+
+def test_facts_are_those_of_the_code() -> None:
+    """Catches a choice that the code does not have, and one that is refused though it has it."""
+    choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "optim": OPTIMIZERS, "effects.gate": GATES,
+               "train.densify.kind": KINDS, "model.gate": GATES}  # fmt: skip
+    for name, known in choices.items():
+        assert set(KEYS[name].choices) == set(known), name
+    assert KEYS["train.curve_points"].high == MAX_POINTS
+    assert KEYS["protocol.renders"].low == LEAST_RENDERS
+    assert KEYS["train.densify.max_gaussians"].low == KEYS["data.initial_points"].low == LEAST_GAUSSIANS
+
+
+PLAIN: dict[str, Any] = {"experiment": "a", "train": {"iterations": 9, "checkpoint_minutes": 2, "noise": None},
+                         "model": {"lr": {"means": {"start": 1}}, "compared": {"a": 1}},
+                         "protocol": {"renders": 30, "best_on_test": False},
+                         "effects": {"gate": "off", "budget_db": 0.05}, "launch": {"cpus": 4}}  # fmt: skip
+
+
+def changed(dotted: str, value: Any) -> dict[str, Any]:
+    """PLAIN with another value."""
+    plain = copy.deepcopy(PLAIN)
+    *groups, name = dotted.split(".")
+    part = plain
+    for group in groups:
+        part = part[group]
+    part[name] = value
+    return plain
+
+
+@pytest.mark.parametrize(
+    ("dotted", "value", "trains", "measures"),
+    [
+        ("train.iterations", 8, True, False),
+        ("train.a_key_of_a_later_version", 8, True, False),
+        ("model.lr.means.start", 2, True, False),
+        ("protocol.best_on_test", True, True, False),
+        ("protocol.renders", 60, False, True),
+        ("experiment", "b", False, True),
+        ("train.checkpoint_minutes", 3, False, False),
+        ("launch.cpus", 8, False, False),
+        ("effects.gate", "end", True, False),
+        ("effects.budget_db", 1, False, False),  # the gate is off
+        ("model.compared.a", 2, False, False),  # nothing is compared
+        ("effects.compare", False, False, False),  # as before there was the key
+        ("train.patience", None, False, False),
+    ],
+)
+def test_what_depends_on_a_key(dotted: str, value: Any, trains: bool, measures: bool) -> None:
+    """Catches a finished run that is trained again for nothing, and one that is kept though its numbers are others."""
+    other = changed(dotted, value)
+    assert (training_hash(other) != training_hash(PLAIN)) == trains == bool(training_differences(PLAIN, other))
+    assert bool(measuring_differences(PLAIN, other)) == measures
+
+
+def test_differences_are_named() -> None:
+    """Catches a difference with the two values exchanged."""
+    assert training_differences(PLAIN, changed("train.iterations", 8)) == ["train.iterations 8 instead of 9"]
+    assert measuring_differences(changed("experiment", None), PLAIN) == ["experiment a instead of not set"]
+
+
+def test_files_of_conf_have_known_keys_and_allowed_values() -> None:
+    """Catches a key of a YAML that is refused only when someone chooses it."""
+    for path in CONF.rglob("*.yaml"):
+        text, group = path.read_text(), path.relative_to(CONF).parts[0]
+        content = {name: value for name, value in (yaml.safe_load(text) or {}).items() if name not in OF_HYDRA}
+        is_of_group = group in GROUPS and "@package _global_" not in text
+        for dotted, value in flat({group: content} if is_of_group else content):
+            assert facts(dotted).kind is not None or dotted.startswith(OPEN), f"{path}: {dotted}"
+            if not (isinstance(value, str) and "${" in value):
+                facts(dotted).check(f"{path}: {dotted}", value)
+
+
+def test_a_dataclass_of_another_module_joins_a_group() -> None:
+    """Catches a hook whose keys are not in the schema, or in front of those that names of runs begin with."""
+
+    @joins("test")
+    @dataclass
+    class Hook:
+        flat_for: int | None = key(None, "most measurements without a better loss", low=1)
+
+    @extended("test")
+    @dataclass
+    class Group:
+        steps: int = key(1, "of a run")
+
+    assert [*declared(Group)] == ["steps", "flat_for"]
+    assert isinstance(Group(), Hook)
+    assert described(Group, "flat_for").low == 1
+    assert Group.__module__ == __name__
+
+
+def test_the_schema_needs_no_library() -> None:
+    """Catches a hook that imports torch, which takes seconds, or gsbench.config, which then lacks its keys."""
+    program = ("import sys, {}; from gsbench import config, config_key; print(*config_key.declared(config.Config));"
+               "assert not {{'torch', 'hydra', 'omegaconf'}} & sys.modules.keys()")  # fmt: skip
+    hooks = [f"gsbench.train.hooks.{path.stem}" for path in (ROOT / "gsbench/train/hooks").glob("[!_]*.py")]
+    for first in ("gsbench.config", *hooks):
+        command = [sys.executable, "-c", program.format(first)]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert ran.stdout.split() == [*KEYS], f"{first}: {ran.stderr}"
+        assert ran.returncode == 0, f"{first}: {ran.stderr}"
