@@ -105,9 +105,9 @@ def declared(config: type) -> dict[str, Key]:
 
 def _leaves(facts: Key, prefix: str) -> Iterator[tuple[str, Key]]:
     inner = _members(facts)
-    yield from ((f"{prefix}{name}", one) for name, one in inner.items() if not _members(one))
-    for name, one in inner.items():
-        yield from _leaves(one, f"{prefix}{name}.")
+    yield from ((f"{prefix}{name}", key) for name, key in inner.items() if not _members(key))
+    for name, key in inner.items():
+        yield from _leaves(key, f"{prefix}{name}.")
 
 
 def _root(config: type) -> Key:

@@ -20,7 +20,7 @@ from tiny_run import run_here
 
 from gsbench.config import CONF, register_schema
 from gsbench.measure.record import Record
-from gsbench.measure.settings import training_hash
+from gsbench.config_roles import training_hash
 from gsbench.report import against_table, frontier, paper_tables
 from gsbench.report.against import compare
 from gsbench.report.comparisons import comparisons
