@@ -292,7 +292,7 @@ def write(record: Record, path: Path) -> None:
         plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: expected a record of plain JSON values: {error}") from None
-    _validated(plain, path)
+    parsed(plain, path)
     write_atomically(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
 
 
@@ -302,10 +302,10 @@ def read(path: Path) -> Record:
     Raises:
         InputError: the record is not valid; the message names the file and the field.
     """
-    return _validated(parse_json(read_file(path, str(path), MAX_FILE), str(path)), path)
+    return parsed(parse_json(read_file(path, str(path), MAX_FILE), str(path)), path)
 
 
-def _validated(plain: Any, path: Path) -> Record:
+def parsed(plain: Any, path: Path | str) -> Record:
     """Convert plain JSON to a record.
 
     Raises:
@@ -323,13 +323,13 @@ def _validated(plain: Any, path: Path) -> Record:
     return record
 
 
-def find(root: Path) -> list[Path]:
-    """Return the sorted paths of all record.json files under `root`, without subfolders called "published"."""
+def find(root: Path, name: str = FILE_NAME) -> list[Path]:
+    """Return the sorted paths of all files of a name under `root`, without subfolders called "published"."""
     found = []
     for folder, folders, names in os.walk(root):
-        if FILE_NAME in names or FILE_NAME in folders:  # a broken link counts too, so that it is reported
-            found.append(Path(folder, FILE_NAME))
-        folders[:] = [name for name in folders if name != PUBLISHED]
+        if name in names or name in folders:  # a broken link counts too, so that it is reported
+            found.append(Path(folder, name))
+        folders[:] = [one for one in folders if one != PUBLISHED]
     return sorted(found)
 
 

@@ -1,7 +1,7 @@
 """Read runs into tables: `runs` (a row a run), `views` (a row a view of a run) and `curves` (a row a test on val).
 
-The tables RUNS, VIEWS and CURVES below declare every column, with its unit and meaning. A number that is missing is
-NaN. Everything that compares, averages or shows results starts from these tables.
+`gsbench.report.columns` declares every column, with its unit and meaning. A number that is missing is NaN. Everything
+that compares, averages or shows results starts from these tables.
 """
 
 import math
@@ -15,83 +15,14 @@ import pandas as pd
 from gsbench.errors import InputError, printable
 from gsbench.measure import record as files
 from gsbench.measure.record import Record
+from gsbench.report import study
+from gsbench.report.columns import CURVES, RUNS, VIEWS
 
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
 GATES = ("off", "end", "both")  # values of effects.gate
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of a table: its name with its unit, its place in record.json, its type and its meaning."""
-
-    name: str
-    place: str  # "" if the column is computed from others
-    kind: type
-    meaning: str
-    unit: float = 1.0  # the number in a record is divided by it
-
-
-RUNS = (
-    Column("experiment", "experiment", str, "the runs that are compared with each other: conf/exp"),
-    Column("dataset", "dataset", str, "the data set"),
-    Column("scene", "scene", str, "the scene"),
-    Column("model", "model", str, "the model, with _agr or _noagr if this differs from its publication"),
-    Column("variant", "variant", str, 'settings that differ from the experiment\'s, such as "iterations=10"'),
-    Column("seed", "seed", int, "the seed of the run"),
-    Column("status", "status", str, "ok, failed or diverged"),
-    Column("reason", "reason", object, "why the status is not ok"),
-    Column("psnr_db", "metrics.psnr", float, "mean over the evaluated views, all pixels and channels"),
-    Column("psnr_train_db", "metrics.psnr_train", float, "the same on as many training views"),
-    Column("psnr_val_db", "", float, "on val at the end of the run: `psnr_val`"),
-    Column("psnr_channel_mean_db", "metrics.psnr_channel_mean", float, "the mean of the three channels' PSNR"),
-    Column("psnr_best_on_val_db", "metrics.psnr_best_on_val", float, "at the iteration that was best on val"),
-    Column("psnr_best_on_test_db", "metrics.psnr_best_on_test", float, "the best on test in training, which LEAKS"),
-    Column("psnr_moving_db", "metrics.psnr_moving", float, "over the pixels that move"),
-    Column("psnr_object_db", "metrics.psnr_object", float, "over the pixels of objects"),
-    Column("psnr_float32_db", "metrics.psnr_float32", float, "the most by which float32 changes the PSNR of a view"),
-    Column("psnr_background_only_db", "metrics.psnr_background_only", float, "of the background alone"),
-    Column("ssim", "metrics.ssim", float, "scikit-image, Gaussian window"),
-    Column("lpips_alex", "metrics.lpips_alex", float, "LPIPS with AlexNet"),
-    Column("lpips_vgg", "metrics.lpips_vgg", float, "LPIPS with VGG"),
-    Column("train_s", "cost.train_s", float, "seconds of all training steps, without evaluation"),
-    Column("train_min", "", float, "the same in minutes"),
-    Column("train_cpu_s", "cost.train_cpu_s", float, "CPU-seconds of all threads in these seconds"),
-    Column("load", "cost.load", float, "mean load average of the machine in training, with this run"),
-    Column("frame_ms", "cost.render_ms.p50", float, "median milliseconds of a frame, with slicing and AGR"),
-    Column("frame_p10_ms", "cost.render_ms.p10", float, "the 10th percentile"),
-    Column("frame_p90_ms", "cost.render_ms.p90", float, "the 90th percentile"),
-    Column("fps", "cost.fps", float, "frames per second: 1000 / frame_ms"),
-    Column("gaussians", "cost.num_gaussians", float, "number of Gaussians"),
-    Column("model_mb", "cost.bytes", float, "MB of the parameters", 1e6),
-    Column("peak_mb", "cost.peak_memory", float, "MB of memory at the peak of training", 1e6),
-    Column("iterations", "", float, "iterations of the training that was kept: `iterations`"),
-    Column("averaged", "averaged", int, "last iterations over which parameters were averaged; 0: none"),
-    Column("effect_time", "effects.time", bool, "Gaussians depend on time"),
-    Column("effect_direction", "effects.direction", bool, "Gaussians depend on the view direction"),
-    Column("effect_refinement", "effects.refinement", bool, "Gaussians depend on AGR, a neural network"),
-    Column("on_demand", "", bool, "effects were removed from the model or from Gaussians"),
-    Column("gate", "", str, 'when that was, such as "gate=end"; "" where it is the model\'s default'),
-    Column("config", "provenance.config", object, "all settings, a nested dict"),
-    Column("missing", "missing", object, "why metrics are missing, a dict"),
-    Column("versions", "", str, 'Python and packages, such as "numpy 2.1, python 3.11"'),
-    Column("machine", "", str, "processor, memory and threads; times are comparable only within one"),
-    Column("device", "provenance.device", str, "the processor or GPU of the training"),
-    Column("threads", "provenance.threads", int, "threads of torch and of the kernels"),
-    Column("git_commit", "provenance.git_commit", object, 'the commit, with "-dirty" if tracked code was changed'),
-    Column("config_hash", "provenance.config_hash", str, "SHA-256 of all settings"),
-    Column("data_hash", "provenance.data_hash", str, "SHA-256 of the images and cameras"),
-    Column("time", "provenance.time", str, "when the run ended, UTC"),
-)
-PARTS = {  # of a record that differ between runs: a column for each key, such as protocol_eval_split
-    "protocol": "protocol_",  # how the run was evaluated
-    "cost.stage_s": "stage_",  # the seconds of train_s by stage: stage_raster ..
-}
-VIEWS = {  # by column, the score in record.json
-    "psnr_db": "psnr", "psnr_channel_mean_db": "psnr_channel_mean", "ssim": "ssim", "lpips_alex": "lpips_alex",
-    "lpips_vgg": "lpips_vgg", "psnr_moving_db": "psnr_moving", "psnr_object_db": "psnr_object",
-}  # fmt: skip
-CURVES = {"iteration": "iteration", "train_s": "seconds", "psnr_val_db": "psnr_val"}
 NUMBERS = [column.name for column in RUNS if column.kind is float]
 
 
@@ -126,7 +57,7 @@ class Results:
 
 
 def load(root: Path) -> Results:
-    """Read all records under `root`; damaged and duplicate ones are left out, and `faults` says why.
+    """Read all records and studies under `root`; damaged and duplicate ones are left out, and `faults` says why.
 
     Raises:
         InputError: the folder is missing or has no record.
@@ -139,8 +70,15 @@ def load(root: Path) -> Results:
             records.append((path, files.read(path)))
         except InputError as error:
             faults.append(printable(error))
+    for folder in study.find(root):
+        try:
+            of_study, damaged = study.read(folder)
+            records += [(folder / study.RUNS_FILE, record) for record in of_study]
+            faults += damaged
+        except InputError as error:
+            faults.append(printable(error))
     if not records and not faults:
-        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} in it or below")
+        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} or {study.RUNS_FILE} in it or below")
     return tables(records, faults)
 
 
@@ -148,8 +86,7 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
     """Return the tables of records, sorted by RUN; of two records of one run, the first one is kept."""
     once: dict[tuple[Any, ...], tuple[Path, Record]] = {}
     for path, record in records:
-        run = tuple(getattr(record, name) for name in RUN)
-        if run in once:
+        if (run := name(record)) in once:
             faults = [*faults, printable(f"{path}: the same run as {once[run][0]}; keep one of them")]
         else:
             once[run] = path, record
@@ -157,7 +94,7 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
     runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in kept], dtype=object)
     first = [*(column.name for column in RUNS), "path", "record"]
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
-    runs = runs.astype({column.name: column.kind for column in RUNS if column.kind is not str})
+    runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
     views = [view for i, (_, record) in enumerate(kept) for view in _views(i, record)]
     curves = [
         {"run": i} | {name: getattr(point, of) for name, of in CURVES.items()}
@@ -165,6 +102,11 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
         for point in record.curve
     ]
     return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
+
+
+def name(record: Record) -> tuple[Any, ...]:
+    """Return what names a run."""
+    return tuple(getattr(record, part) for part in RUN)
 
 
 def _table(rows: list[dict[str, Any]], texts: list[str], numbers: Mapping[str, str]) -> pd.DataFrame:
@@ -180,9 +122,8 @@ def row(r: Record) -> dict[str, Any]:
     values |= {"iterations": iterations(r), "machine": r.provenance.machine}
     values |= {"on_demand": r.on_demand is not None, "gate": gating(r)}
     values |= {"versions": ", ".join(f"{name} {version}" for name, version in sorted(r.provenance.versions.items()))}
-    for place, prefix in PARTS.items():
-        values |= {f"{prefix}{name}": value for name, value in (_at(r, place) or {}).items()}
-    return values
+    values |= {f"protocol_{name}": value for name, value in r.protocol.items()}
+    return values | {f"stage_{name}": seconds for name, seconds in (r.cost.stage_s if r.cost else {}).items()}
 
 
 def _at(of: Any, place: str) -> Any:

@@ -1,41 +1,37 @@
-"""Copy the records of finished runs to the folder of published records, and rewrite the tables there."""
+"""Add the finished runs of a folder to a published study, which is three tables (gsbench.report.study)."""
 
-import sys
 from pathlib import Path
 
 from gsbench.errors import InputError
-from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
-from gsbench.report import tables
+from gsbench.report import frame, layout, study, tables
 
 
 def publish(folder: Path, to: Path) -> str:
-    """Copy every run record of a folder, such as ``results/mini``, to another one, such as ``results/published/mini``.
+    """Write the runs of a folder, such as ``results/mini``, into a study, such as ``results/published/mini``.
 
-    A record of the same run in the second folder is replaced, and all others stay. The tables of the second folder are
-    rewritten. The function returns a line that describes the result.
+    A run that the study has is replaced, and all others stay. Its result table, ``table.md``, is written anew. The
+    function returns a line that describes the result.
 
     Raises:
-        InputError: a record is damaged or a duplicate, a run did not finish, or its code was not a clean git commit;
-            nothing is copied.
+        InputError: a record of either is damaged or a duplicate, a run did not finish, or its code was not a clean git
+            commit; nothing is written.
     """
-    records, faults = tables.load(folder)
-    for r in records:
-        if r.status != "ok":
-            faults.append(f"{r.path}: {r.status}: {r.reason}")
-        elif r.provenance.git_commit is None or r.provenance.git_commit.endswith("-dirty"):
-            faults.append(f"{r.path}: its commit is {r.provenance.git_commit}, which does not reproduce it")
+    results = frame.load(folder)
+    earlier = frame.load(to) if (to / study.RUNS_FILE).exists() else None
+    faults = [*results.faults, *(earlier.faults if earlier else ())]
+    for record in results.runs.record:
+        if record.status != "ok":
+            faults.append(f"{record.path}: {record.status}: {record.reason}")
+        elif (record.provenance.git_commit or "-dirty").endswith("-dirty"):
+            faults.append(f"{record.path}: its commit is {record.provenance.git_commit}, which does not reproduce it")
     if faults:
         more = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
         raise InputError(
             f"{folder}: expected finished runs of clean commits, got {'; '.join(faults[:3])}{more}", docs="report.md"
         )
-    for path in files.find(folder):
-        write_atomically(to / path.relative_to(folder), path.read_bytes())
-    published, left_out = tables.load(to)
-    for fault in left_out:
-        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    tables.write(published, to, tables.build(published))
-    return (
-        f"Published: {len(records)} records in {to}, which has {len(published)}; {to / 'table.md'}, {to / 'table.csv'}"
-    )
+    runs = {frame.name(record): record for part in (earlier, results) if part for record in part.runs.record}
+    records = [runs[name] for name in sorted(runs)]
+    study.write(records, to)
+    write_atomically(to / "table.md", layout.markdown(tables.build(records)).encode())
+    return f"Published: {len(results.runs)} runs in {to}, which has {len(records)}; {to / study.RUNS_FILE}"

@@ -9,11 +9,10 @@ from typing import Any
 
 import pandas as pd
 
-from gsbench.errors import InputError, printable
-from gsbench.measure import record as files
+from gsbench.errors import printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import METRICS, Record
-from gsbench.report import layout, paper
+from gsbench.report import frame, layout, paper
 from gsbench.report.cells import cell
 from gsbench.report.conditions import conditions
 from gsbench.report.configurations import groups
@@ -62,25 +61,8 @@ def load(root: Path) -> tuple[list[Record], list[str]]:
     Raises:
         InputError: the folder is missing or has no record.
     """
-    if not root.is_dir():
-        raise InputError(f"{root}: expected a folder of results, found none")
-    seen: dict[tuple[str, str, str, str, str, int], Path] = {}
-    records, faults = [], []
-    for path in files.find(root):
-        try:
-            record = files.read(path)
-        except InputError as error:
-            faults.append(printable(error))
-            continue
-        run = (record.experiment, record.dataset, record.scene, record.model, record.variant, record.seed)
-        if run in seen:
-            faults.append(printable(f"{path}: the same run as {seen[run]}; keep one of them"))
-            continue
-        seen[run] = path
-        records.append(record)
-    if not records and not faults:
-        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} in it or below")
-    return records, faults
+    results = frame.load(root)
+    return list(results.runs.record), list(results.faults)
 
 
 def tidy(records: list[Record]) -> pd.DataFrame:

@@ -15,6 +15,7 @@ import torch
 from gsbench.errors import InputError
 from gsbench.measure import atomic, record
 from gsbench.process import memory
+from gsbench.report import study
 from gsbench.sweep.estimate import span
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
@@ -129,9 +130,8 @@ def in_views(plain: dict[str, Any], count: int) -> None:
 def test_a_record_with_endless_entries_is_refused(harm: Callable[[dict[str, Any], int], None], tmp_path: Path) -> None:
     """Catches a record whose lists hold a report for a minute and take a gigabyte."""
     path = tmp_path / "record.json"
-    source = next((Path(__file__).parents[2] / "results" / "published").rglob("record.json"))
-    plain = json.loads(source.read_text())
-    path.write_text(json.dumps(plain))
+    record.write(study.read(Path(__file__).parents[2] / "results" / "published" / "effects")[0][0], path)
+    plain = json.loads(path.read_text())
     record.read(path)
     harm(plain, 20_000)
     path.write_text(json.dumps(plain))

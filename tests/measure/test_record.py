@@ -373,7 +373,8 @@ def test_git_ignores_what_this_machine_measured_and_nothing_that_is_published():
     if not (ROOT / ".git").exists():
         pytest.skip("gsbench is not in a git checkout here")
     own = [f"results/{name}" for name in ("table1.md", "mini/table.md", "mini/suzanne/7dgs/seed0/record.json")]
-    ours = [f"results/published/{name}" for name in ("new/table.md", "new/suzanne/7dgs/seed9/record.json")]
+    own.append("results/published/new/table.csv")
+    ours = [f"results/published/{name}" for name in ("new/table.md", "new/runs.csv", "new/views.csv.gz")]
     done = subprocess.run(["git", "check-ignore", *own, *ours], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == own
 

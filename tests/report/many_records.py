@@ -49,7 +49,7 @@ def one(model: str, scene: str, seed: int, length: int, views: int, lengths: tup
     rank = list(EFFECTS).index(model)
     effects = EFFECTS[model]
     reached = 20 + 3 * effects.time + 0.5 * effects.direction + effects.refinement + 1.5 * np.log2(length / 250)
-    reached += 0.1 * random.normal()
+    reached = float(reached + 0.1 * random.normal())
     psnr = [float(p) for p in reached + 0.5 * random.normal(size=views)]
     seconds = length / 100 * (1 + 0.2 * rank) * (1 + 0.02 * random.random())
     base = make("7dgs", scene, seed, float(np.mean(psnr)))

@@ -8,10 +8,8 @@ from statistics import fmean
 
 import numpy as np
 import pytest
-from make_golden import make
 from many_records import frontier, on_demand
 
-from gsbench.errors import InputError
 from gsbench.measure import record as files
 from gsbench.measure.machine import Hardware
 from gsbench.measure.record import Record
@@ -19,7 +17,6 @@ from gsbench.report.__main__ import main
 from gsbench.report.against import AGREES, DIFFERS, LIMITS, UNTOLD, Comparison, compare
 from gsbench.report.against_lines import LONGEST, compared, lines, trained
 from gsbench.report.page.messages import duration
-from gsbench.report.publish import publish
 
 
 def runs(seeds=3, **more: object) -> list[Record]:
@@ -322,23 +319,3 @@ def test_text_from_a_record_cannot_break_the_comparison(tmp_path, capsys):
     folder = write([dataclasses.replace(r, dataset="x\x1b\ny") for r in bad], tmp_path / "mine")
     main([str(folder), "--against", str(folder)])
     assert "\x1b" not in capsys.readouterr().out
-
-
-def test_published_is_what_was_measured_and_nothing_doubtful(tmp_path):
-    """Catches a failed or dirty run among published records, and a table there that does not hold all of them."""
-    to = tmp_path / "published/mini"
-    assert "10 records" in publish(write(runs(seeds=1), tmp_path / "mini"), to)
-    more = write([r for r in runs(seeds=2) if r.seed], tmp_path / "more")
-    assert "10 records in" in publish(more, to)
-    assert len(files.find(to)) == 20
-    assert len((to / "table.csv").read_text().splitlines()) == 21
-    (path,) = [p for p in files.find(more) if "suzanne/7dgs/" in str(p)]
-    for bad in (
-        told(make(seed=1), git_commit="0123-dirty"),
-        told(make(seed=1), git_commit=None),
-        make(seed=1, status="failed", reason="x", metrics=None, missing={}, cost=None),
-    ):
-        files.write(bad, path)
-        with pytest.raises(InputError, match="expected finished runs of clean commits"):
-            publish(more, to)
-    assert len(files.find(to)) == 20

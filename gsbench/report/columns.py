@@ -1,0 +1,80 @@
+"""The columns of the tables of runs, each with its unit and meaning, and its place in record.json.
+
+`gsbench.report.frame` reads records into these tables, and `gsbench.report.study` writes them to files.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its name with its unit, its place in record.json, its type and its meaning."""
+
+    name: str
+    place: str  # "" if the column is computed from others
+    kind: type
+    meaning: str
+    unit: float = 1.0  # the number in a record is divided by it
+
+
+RUNS = (
+    Column("experiment", "experiment", str, "the runs that are compared with each other: conf/exp"),
+    Column("dataset", "dataset", str, "the data set"),
+    Column("scene", "scene", str, "the scene"),
+    Column("model", "model", str, "the model, with _agr or _noagr if this differs from its publication"),
+    Column("variant", "variant", str, 'settings that differ from the experiment\'s, such as "iterations=10"'),
+    Column("seed", "seed", int, "the seed of the run"),
+    Column("status", "status", str, "ok, failed or diverged"),
+    Column("reason", "reason", object, "why the status is not ok"),
+    Column("psnr_db", "metrics.psnr", float, "mean over the evaluated views, all pixels and channels"),
+    Column("psnr_train_db", "metrics.psnr_train", float, "the same on as many training views"),
+    Column("psnr_val_db", "", float, "on val at the end of the run: `psnr_val`"),
+    Column("psnr_channel_mean_db", "metrics.psnr_channel_mean", float, "the mean of the three channels' PSNR"),
+    Column("psnr_best_on_val_db", "metrics.psnr_best_on_val", float, "at the iteration that was best on val"),
+    Column("psnr_best_on_test_db", "metrics.psnr_best_on_test", float, "the best on test in training, which LEAKS"),
+    Column("psnr_moving_db", "metrics.psnr_moving", float, "over the pixels that move"),
+    Column("psnr_object_db", "metrics.psnr_object", float, "over the pixels of objects"),
+    Column("psnr_float32_db", "metrics.psnr_float32", float, "the most by which float32 changes the PSNR of a view"),
+    Column("psnr_background_only_db", "metrics.psnr_background_only", float, "of the background alone"),
+    Column("ssim", "metrics.ssim", float, "scikit-image, Gaussian window"),
+    Column("lpips_alex", "metrics.lpips_alex", float, "LPIPS with AlexNet"),
+    Column("lpips_vgg", "metrics.lpips_vgg", float, "LPIPS with VGG"),
+    Column("train_s", "cost.train_s", float, "seconds of all training steps, without evaluation"),
+    Column("train_min", "", float, "the same in minutes"),
+    Column("train_cpu_s", "cost.train_cpu_s", float, "CPU-seconds of all threads in these seconds"),
+    Column("load", "cost.load", float, "mean load average of the machine in training, with this run"),
+    Column("frame_ms", "cost.render_ms.p50", float, "median milliseconds of a frame, with slicing and AGR"),
+    Column("frame_p10_ms", "cost.render_ms.p10", float, "the 10th percentile"),
+    Column("frame_p90_ms", "cost.render_ms.p90", float, "the 90th percentile"),
+    Column("fps", "cost.fps", float, "frames per second: 1000 / frame_ms"),
+    Column("gaussians", "cost.num_gaussians", float, "number of Gaussians"),
+    Column("model_mb", "cost.bytes", float, "MB of the parameters", 1e6),
+    Column("peak_mb", "cost.peak_memory", float, "MB of memory at the peak of training", 1e6),
+    Column("iterations", "", float, "iterations of the training that was kept: `iterations`"),
+    Column("averaged", "averaged", int, "last iterations over which parameters were averaged; 0: none"),
+    Column("effect_time", "effects.time", bool, "Gaussians depend on time"),
+    Column("effect_direction", "effects.direction", bool, "Gaussians depend on the view direction"),
+    Column("effect_refinement", "effects.refinement", bool, "Gaussians depend on AGR, a neural network"),
+    Column("on_demand", "", bool, "effects were removed from the model or from Gaussians"),
+    Column("gate", "", str, 'when that was, such as "gate=end"; "" where it is the model\'s default'),
+    Column("config", "provenance.config", dict, "all settings, a nested dict"),
+    Column("missing", "missing", dict, "why metrics are missing, a dict"),
+    Column("versions", "", str, 'Python and packages, such as "numpy 2.1, python 3.11"'),
+    Column("machine", "", str, "processor, memory and threads; times are comparable only within one"),
+    Column("device", "provenance.device", str, "the processor or GPU of the training"),
+    Column("threads", "provenance.threads", int, "threads of torch and of the kernels"),
+    Column("git_commit", "provenance.git_commit", object, 'the commit, with "-dirty" if tracked code was changed'),
+    Column("config_hash", "provenance.config_hash", str, "SHA-256 of all settings"),
+    Column("data_hash", "provenance.data_hash", str, "SHA-256 of the images and cameras"),
+    Column("time", "provenance.time", str, "when the run ended, UTC"),
+)
+PARTS = (  # of a record that differ between runs have a column for each key, such as protocol_eval_split
+    ("protocol.", "protocol_"),  # how the run was evaluated
+    ("cost.stage_s.", "stage_"),  # the seconds of train_s by stage: stage_raster ..
+    ("provenance.config.", "config."),  # all settings; only in runs.csv
+)
+VIEWS = {  # by column, the score in record.json
+    "psnr_db": "psnr", "psnr_channel_mean_db": "psnr_channel_mean", "ssim": "ssim", "lpips_alex": "lpips_alex",
+    "lpips_vgg": "lpips_vgg", "psnr_moving_db": "psnr_moving", "psnr_object_db": "psnr_object",
+}  # fmt: skip
+CURVES = {"iteration": "iteration", "train_s": "seconds", "psnr_val_db": "psnr_val"}
