@@ -329,7 +329,7 @@ def find(root: Path, name: str = FILE_NAME) -> list[Path]:
     for folder, folders, names in os.walk(root):
         if name in names or name in folders:  # a broken link counts too, so that it is reported
             found.append(Path(folder, name))
-        folders[:] = [one for one in folders if one != PUBLISHED]
+        folders[:] = [inner for inner in folders if inner != PUBLISHED]
     return sorted(found)
 
 
