@@ -7,6 +7,7 @@ import pytest
 import torch
 from models.small import MODELS, VARIANTS, lively
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
@@ -44,10 +45,7 @@ def drawn(data: bytes, seen: Camera) -> torch.Tensor:
     assert rows.dtype.names == tuple(COLUMNS)
     take = {name: np.stack([rows[name + end] for end in ends], 1).astype(np.float64) for name, ends in
             (("f_dc_", "012"), ("scale_", "012"), ("rot_", "0123"), ("", "xyz"))}  # fmt: skip
-    w, x, y, z = (take["rot_"] / np.linalg.norm(take["rot_"], axis=1, keepdims=True)).T
-    R = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                  [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                  [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]).transpose(2, 0, 1)  # fmt: skip
+    R = Rotation.from_quat(np.roll(take["rot_"], -1, axis=1)).as_matrix()
     directions = take[""] - seen.center.double().numpy()
     a, b, c = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     xx, yy, zz = a * a, b * b, c * c
@@ -70,10 +68,10 @@ def drawn(data: bytes, seen: Camera) -> torch.Tensor:
 def test_the_ply_is_the_image(variant: str) -> None:
     """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
     model, seen = trained(variant), camera(0.3, -4.0, 1.0)
-    given = trained_of(model, Query.of(seen, 0.4))
+    gaussians = trained_of(model, Query.of(seen, 0.4))
     image = render(model, seen, 0.4, BACKGROUND)
     assert (image - BACKGROUND).abs().max() > 0.1
-    assert (drawn(ply_of(given), seen) - image).abs().max() < 2e-3
+    assert (drawn(ply_of(gaussians), seen) - image).abs().max() < 2e-3
 
 
 @pytest.mark.parametrize("variant", ["3dgs", "3dgs_agr", "4dgs", "4dgs_agr", "4dgs_constant_colors"])
@@ -102,11 +100,7 @@ def test_factors_are_decomposed() -> None:
     factors[:5, :, 0] = 0
     log_scales, quats = decompose(factors)
     assert log_scales.isfinite().all()
-    w, v = quats[:, :1].double(), quats[:, 1:].double()
-    cross = torch.zeros(200, 3, 3, dtype=torch.float64)
-    for i, j, k, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        cross[:, i, j], cross[:, j, i] = sign * v[:, k], -sign * v[:, k]
-    R = torch.eye(3) + 2 * w[:, :, None] * cross + 2 * cross @ cross  # Rodrigues' formula of a unit quaternion
+    R = torch.from_numpy(Rotation.from_quat(quats.roll(-1, dims=1)).as_matrix())
     S = R * log_scales.exp()[:, None, :]
     torch.testing.assert_close(S @ S.mT, factors @ factors.mT, atol=1e-5, rtol=1e-5)
 
