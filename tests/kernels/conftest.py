@@ -7,10 +7,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
+from torch import Tensor
 
 from gsbench import kernels
 from gsbench.kernels import cuda, library
@@ -18,18 +21,43 @@ from gsbench.kernels import cuda, library
 ROOT = Path(__file__).resolve().parents[2]
 
 
+INSTRUCTION_SETS = kernels.native().instruction_sets() if kernels.available() else []
+
+
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
     """Tests of the CPU's kernels are skipped where those were not built."""
     return None if kernels.available() or "cuda" in collection_path.name else True
 
 
-@pytest.fixture(params=kernels.native().instruction_sets() if kernels.available() else [])
+@pytest.fixture(params=INSTRUCTION_SETS)
 def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
     """Runs the test once with each instruction set that this machine has."""
-    best = kernels.native().instruction_sets()[-1]
     kernels.use_instruction_set(request.param)
     yield request.param
-    kernels.use_instruction_set(best)
+    kernels.use_instruction_set(INSTRUCTION_SETS[-1])
+
+
+@dataclass(frozen=True)
+class Place:
+    """Kernels to test: those of an instruction set of the CPU, or those of CUDA."""
+
+    name: str
+    device: str  # of their tensors
+
+    def move(self, x: Tensor) -> Tensor:
+        """Round a tensor to float32 on the device, as a leaf."""
+        return x.detach().to(self.device, torch.float32).requires_grad_(x.requires_grad)
+
+
+@pytest.fixture(params=[*INSTRUCTION_SETS, "cuda"])
+def place(request: pytest.FixtureRequest) -> Iterator[Place]:
+    """Runs the test with each instruction set, and with the kernels of CUDA: on a GPU, or on the CPU by the shim."""
+    if request.param == "cuda":
+        yield Place("cuda", request.getfixturevalue("cuda_device"))
+    else:
+        kernels.use_instruction_set(request.param)
+        yield Place(request.param, "cpu")
+        kernels.use_instruction_set(INSTRUCTION_SETS[-1])
 
 
 @pytest.fixture(scope="session")

@@ -37,5 +37,5 @@ LD_PRELOAD="$(c++ -print-file-name=libasan.so) $(c++ -print-file-name=libstdc++.
 LD_PRELOAD="$(c++ -print-file-name=libtsan.so) $(c++ -print-file-name=libstdc++.so)" \
     TSAN_OPTIONS=halt_on_error=1:ignore_noninstrumented_modules=1 OMP_NUM_THREADS=1 GSBENCH_SANITIZE=thread \
     GSBENCH_SHIM_BUILD=$build/shim_of_threads \
-    setarch "$(uname -m)" -R "$python" -m pytest -o "$limit" tests/kernels/test_cuda.py tests/kernels/test_cuda_models.py \
-    tests/kernels/test_cuda_graph.py -p no:cacheprovider
+    setarch "$(uname -m)" -R "$python" -m pytest -o "$limit" tests/kernels -k cuda -p no:cacheprovider \
+    --ignore tests/kernels/test_cuda_compiles.py

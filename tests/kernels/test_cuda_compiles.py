@@ -21,8 +21,8 @@ def test_compiles_without_a_warning(source: Path, tmp_path: Path) -> None:
     command = ["nvcc", "-std=c++20", "-arch=sm_90", "--ftz=true", "--cubin", "-Xptxas", "-v", "-Werror", "all-warnings",
                "-Xcompiler", "-Wno-unknown-pragmas", str(source), "-o", str(tmp_path / "out.cubin")]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True)
-    said = done.stdout + done.stderr
-    assert done.returncode == 0, said[-4000:]
-    kept = [int(number) for number in re.findall(r"(\d+) bytes (?:stack frame|spill)", said)]
+    printed = done.stdout + done.stderr
+    assert done.returncode == 0, printed[-4000:]
+    kept = [int(number) for number in re.findall(r"(\d+) bytes (?:stack frame|spill)", printed)]
     assert kept
-    assert max(kept) <= LOCAL_MEMORY.get(source.name, 0), said
+    assert max(kept) <= LOCAL_MEMORY.get(source.name, 0), printed

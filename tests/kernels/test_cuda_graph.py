@@ -71,20 +71,20 @@ def test_replays_are_what_is_launched(name: str, agr: bool, device: str) -> None
     """Catches a camera, a time or a parameter that is read when a picture is recorded, and not when it is replayed."""
     fitted, replayed, launched = both(device, name, agr)
     for distance, time in ((4.0, 0.4), (4.5, 0.1), (3.9, 0.9)):
-        seen = camera(device, distance)
-        torch.testing.assert_close(replayed(seen, time), launched(seen, time), rtol=0, atol=1e-4)
+        at = camera(device, distance)
+        torch.testing.assert_close(replayed(at, time), launched(at, time), rtol=0, atol=1e-4)
     with torch.no_grad():
         fitted.splats["means"].mul_(0.8)
         fitted.splats["opacities"].add_(0.5)
-    torch.testing.assert_close(replayed(seen, 0.9), launched(seen, 0.9), rtol=0, atol=1e-4)
+    torch.testing.assert_close(replayed(at, 0.9), launched(at, 0.9), rtol=0, atol=1e-4)
 
 
 def test_replays_of_beta_profiles(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a replay that draws Gaussians where the slice has exponents, or ones of the wrong camera."""
     fitted, replayed, launched = both(device, "3dgs")
-    gaussians, seen = launched(camera(device), 0.4), fitted.slice
+    gaussians, at = launched(camera(device), 0.4), fitted.slice
     exponents = torch.linspace(0.1, 6.0, 300, device=device)
-    monkeypatch.setattr(fitted, "slice", lambda query: seen(query)._replace(shapes=exponents))
+    monkeypatch.setattr(fitted, "slice", lambda query: at(query)._replace(shapes=exponents))
     for distance in (4.0, 4.5):
         view = camera(device, distance)
         torch.testing.assert_close(replayed(view, 0.4), launched(view, 0.4), rtol=0, atol=1e-4)
@@ -114,15 +114,15 @@ def test_a_bad_value_is_named(device: str) -> None:
 
 @pytest.mark.parametrize("room", [0, 1, 40])
 @pytest.mark.parametrize("N", [0, 300])
-def test_too_little_room_is_told(N: int, room: int, device: str) -> None:
+def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
     """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
-    seen, fitted = camera(device), large("4dgs", device)
+    at, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
-        means, factors, opacities, colors, _ = fitted.slice(Query.at(seen.center, 0.4))
+        means, factors, opacities, colors, _ = fitted.slice(Query.at(at.center, 0.4))
         image, needed = draw_within(
-            means[:N], factors[:N], opacities[:N], colors[None, :N], seen.viewmat[None], seen.K[None],
+            means[:N], factors[:N], opacities[:N], colors[None, :N], at.viewmat[None], at.K[None],
             torch.tensor(BACKGROUND, device=device),
-            Viewport(seen.width, seen.height, NEAR, FAR, EPS2D, antialias=False), room,
+            Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False), room,
         )  # fmt: skip
     assert needed.tolist()[-1] == 0
     assert image.isfinite().all()

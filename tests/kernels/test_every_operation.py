@@ -99,10 +99,12 @@ def shape_in(sizes: dict[str, int], declared: str, unknown: int | None = None) -
 def values(key: str, shape: list[int], dtype: torch.dtype, count: int) -> Tensor:
     """The numbers of an input: its own, or any."""
     if key in VALUES:
-        own = VALUES[key]
+        known = VALUES[key]
         for dim, size in enumerate(shape):  # repeated where more are asked for
-            own = own.index_select(dim, torch.arange(size) % own.shape[dim])
-        return own if count or dtype is torch.float32 else own.zero_()  # no number of a Gaussian where there are none
+            known = known.index_select(dim, torch.arange(size) % known.shape[dim])
+        return (
+            known if count or dtype is torch.float32 else known.zero_()
+        )  # no number of a Gaussian where there are none
     return torch.rand(shape, generator=torch.Generator().manual_seed(len(key))).to(dtype)
 
 
@@ -112,11 +114,11 @@ OPERATIONS = pytest.mark.parametrize("operation", declared(), ids=lambda operati
 def run(operation: Operation, at: Call) -> tuple[list[Tensor], dict[str, Tensor | None]]:
     """The outputs of a call, and the gradients of a weighted sum of them by all that has one, from autograd."""
     tensors = [torch.empty(0) if x is None else x.clone() for x in at.tensors.values()]
-    for x, own in zip(tensors, operation.differentiable(tensors), strict=True):
-        x.requires_grad_(own and x.dtype is torch.float32)
-    there = {name: x for (name, given), x in zip(at.tensors.items(), tensors, strict=True) if given is not None}
+    for x, has_gradient in zip(tensors, operation.differentiable(tensors), strict=True):
+        x.requires_grad_(has_gradient and x.dtype is torch.float32)
+    there = {name: x for name, x in zip(at.tensors, tensors, strict=True) if at.tensors[name] is not None}
     outputs = operation(*at.with_(**there))
-    carried = [x for x, own in zip(outputs, operation.carries_gradient(outputs), strict=True) if own]
+    carried = [x for x, carries in zip(outputs, operation.carries_gradient(outputs), strict=True) if carries]
     g = torch.Generator().manual_seed(1)
     sum((x * torch.rand(x.shape, generator=g)).sum() for x in carried).backward()
     return outputs, {name: x.grad for name, x in there.items() if x.requires_grad}
@@ -144,14 +146,14 @@ def test_v3_and_v4_have_the_same_bits(operation: Operation) -> None:
     if "v4" not in levels or "v3" not in levels:
         pytest.skip("needs a processor with AVX-512, and the kernels of v3 and v4: make test LEVELS=all")
     many = 3 * 16 + 5  # some whole vectors, and a rest
-    at, found = call(operation, N if "ids" in operation.inputs else many), {}  # `ids` are of N Gaussians
+    at, results = call(operation, N if "ids" in operation.inputs else many), []  # `ids` are of N Gaussians
     try:
         for level in ("v3", "v4"):
             kernels.use_instruction_set(level)
-            found[level] = run(operation, at)
+            results.append(run(operation, at))
     finally:
         kernels.use_instruction_set(levels[-1])
-    (outputs, gradients), (other_outputs, other_gradients) = found.values()
+    (outputs, gradients), (other_outputs, other_gradients) = results
     assert all(torch.equal(x, y) for x, y in zip(outputs, other_outputs, strict=True))
     assert [name for name, x in gradients.items() if not torch.equal(x, other_gradients[name])] == []
 
@@ -210,10 +212,10 @@ def test_what_is_added_is_added(operation: Operation) -> None:
     at = call(operation)
     tensors, numbers = list(at.tensors.values()), list(at.numbers.values())
     outputs, slots = operation.run(tensors, numbers)
-    given, wanted = [torch.ones_like(x) for x in outputs], [True] * len(tensors)
-    alone = operation.backward(tensors, slots, outputs, given, wanted)
+    by_outputs, wanted = [torch.ones_like(x) for x in outputs], [True] * len(tensors)
+    alone = operation.backward(tensors, slots, outputs, by_outputs, wanted)
     sums = {i: torch.full_like(tensors[i], 3.0) for i in operation.adds}
-    both = operation.backward(tensors, slots, outputs, given, wanted, sums)
+    both = operation.backward(tensors, slots, outputs, by_outputs, wanted, sums)
     for i in operation.adds:
         assert both[i] is sums[i]
         assert alone[i].any()

@@ -28,11 +28,11 @@ def calls() -> dict[str, Callable[[], object]]:
     b = torch.full((N,), 4.0).requires_grad_()
     image, target = torch.rand(200, 200, 3).requires_grad_(), torch.rand(200, 200, 3)
 
-    def slice_both_ways(made: GaussianModel) -> None:
-        sum(x.sum() for x in tensors_of(made.slice(query))).backward()
+    def slice_both_ways(of: GaussianModel) -> None:
+        sum(x.sum() for x in tensors_of(of.slice(query))).backward()
 
     return {
-        **{f"slice and colours of {name}": partial(slice_both_ways, made) for name, made in sliced.items()},
+        **{f"slice and colours of {name}": partial(slice_both_ways, of) for name, of in sliced.items()},
         "raster": lambda: rasterize(*splats, viewmats, Ks, 200, 200).image.sum().backward(),
         "raster of Beta profiles": lambda: rasterize(*splats, viewmats, Ks, 200, 200, shapes=b).image.sum().backward(),
         "loss": lambda: l1_ssim(image, target, 0.2).backward(),

@@ -7,8 +7,6 @@ import torch
 from raster.cases import case
 from torch import Tensor
 
-from gsbench.errors import InputError
-from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
 from gsbench.kernels.slices import slice_static
@@ -26,19 +24,22 @@ LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", ["means", "factors", "opacities", "colors", "background", "shapes"])
 def test_gradient_of_a_leaf_of_any_layout(name: str, layout: str) -> None:
-    """Catches a gradient that is added up in the memory that the rows of a leaf share, or written in another order."""
+    """Catches memory read as it does not lie, a gradient that is added up in the memory that the rows of a leaf share,
+    or one that is written in another order."""
     arguments = case("tall", torch.float32) | {"background": torch.tensor([0.1, 0.5, 0.9])}
     if name == "shapes":
         arguments["shapes"] = torch.linspace(0.5, 4.0, len(arguments["means"]))
     leaf = LAYOUTS[layout](arguments[name])
-    gradients = {}
+    images, gradients = [], []
     for backend, x in (("cpu", leaf.detach()), ("reference", leaf.detach().double().contiguous())):
-        given = {k: v.to(x.dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
-        given |= {name: x.requires_grad_(), "backend": backend}
-        rasterize(**given).image.square().sum().backward()
+        others = {k: v.to(x.dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
+        image = rasterize(**others | {name: x.requires_grad_(), "backend": backend}).image
+        image.square().sum().backward()
         assert x.grad is not None
-        gradients[backend] = x.grad.double()
-    torch.testing.assert_close(gradients["cpu"], gradients["reference"], rtol=1e-3, atol=1e-3)
+        images.append(image.double())
+        gradients.append(x.grad.double())
+    torch.testing.assert_close(*images, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-3)
 
 
 def test_a_negated_view_is_negated() -> None:
@@ -66,11 +67,3 @@ def test_transposed_weights_of_agr() -> None:
     for got, expected in zip(run([LAYOUTS["transposed"](x) for x in plain]), run(plain), strict=True):
         for x, y in zip(got, expected, strict=True):
             torch.testing.assert_close(x, y)
-
-
-def test_waves_without_times_are_refused() -> None:
-    """Catches empty tensors in the place of times, which passed for times that are left out."""
-    given = torch.rand(N, 1, 3), torch.rand(N, 1, 3), torch.rand(N, 3), torch.rand(N), torch.rand(3), 0
-    for times, time in ((None, None), (torch.zeros(0), torch.zeros(0)), (torch.zeros(0), torch.tensor(0.5))):
-        with pytest.raises(InputError, match="times"):
-            show_colors(*given, times, time, 2)

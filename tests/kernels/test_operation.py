@@ -6,7 +6,6 @@ from test_every_operation import declared
 
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels.colors import show_colors
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import MOST_KNOWN, Operation
 from gsbench.kernels.slices import _static, slice_static
@@ -23,23 +22,16 @@ def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
         assert library.takes(operation.name, f"out.{name}"), name
     if operation.name == "l1_ssim":
         return  # its gradient comes with its value
-    for name, own in zip(operation.inputs, operation.differentiable([]) if operation.inputs else (), strict=True):
-        assert library.takes(f"{operation.name}_backward", f"grad.{name}") == own, name
+    has_gradient = operation.differentiable([]) if operation.inputs else ()
+    for name, expected in zip(operation.inputs, has_gradient, strict=True):
+        assert library.takes(f"{operation.name}_backward", f"grad.{name}") == expected, name
 
 
 def test_every_kernel_is_declared() -> None:
     """Catches a kernel that no operation calls any more."""
     called = {operation.name for operation in declared()}
-    without_gradient = {
-        "adam",
-        "adam_all",
-        "flag_values",
-        "flag_arrays",
-        "count_tiles",
-        "fill_tiles",
-        "exact_splats",
-        "exact_image",
-    }
+    without_gradient = {"adam", "adam_all", "flag_values", "flag_arrays", "count_tiles", "fill_tiles", "exact_splats",
+                        "exact_image"}  # fmt: skip
     assert {name.removesuffix("_backward") for name in kernels.native().SIGNATURES} == called | without_gradient
 
 
@@ -51,20 +43,12 @@ def test_a_message_says_what_was_expected_and_what_came() -> None:
         slice_static(torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4))
 
 
-def test_coefficients_are_whole_harmonics_of_every_wave() -> None:
-    """Catches coefficients that are no multiple of the waves: the kernel would read one wave's as another's."""
-    N = 4
-    given = torch.zeros(N, 1, 3), torch.zeros(N, 6, 3), torch.zeros(N, 3), torch.ones(N), torch.zeros(3)
-    with pytest.raises(InputError, match="waves=2 and 7 coefficients"):
-        show_colors(*given, 0, torch.zeros(N, 1), torch.tensor(0.0), 2)
-
-
 def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
     Gaussians that are kept for ever."""
     matched: list[int] = []
-    own = _static._match
-    monkeypatch.setattr(_static, "_match", lambda tensors, numbers: (matched.append(1), own(tensors, numbers))[1])
+    match = _static._match
+    monkeypatch.setattr(_static, "_match", lambda tensors, numbers: (matched.append(1), match(tensors, numbers))[1])
     for _ in range(3):
         for N in (1003, 1005):
             factors, opacities = slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
@@ -74,15 +58,6 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     for N in range(2 * MOST_KNOWN):
         slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
     assert len(_static._known) <= MOST_KNOWN
-
-
-def test_columns_are_put_in_rows() -> None:
-    """Catches a kernel that is given the address of a transposed tensor."""
-    g = torch.Generator().manual_seed(0)
-    scales, quats, opacities = (torch.randn(n, 4, generator=g) for n in (3, 4, 1))
-    columns = slice_static(scales.mT, quats.mT, opacities[0])
-    rows = slice_static(scales.mT.contiguous(), quats.mT.contiguous(), opacities[0])
-    assert all(torch.equal(a, b) for a, b in zip(columns, rows, strict=True))
 
 
 def test_the_extension_counts_and_types_its_values() -> None:

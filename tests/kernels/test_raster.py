@@ -1,233 +1,257 @@
-"""The native rasterizer against a brute-force picture, the reference's gradients in float64, and its own promises."""
+"""The rasterizer's kernels against a brute-force picture, the reference's gradients in float64, and their promises."""
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
+from conftest import Place
 from raster.cases import assert_beta_vector, camera, case, gaussians, names
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
-from gsbench.stability.brute import render
+from gsbench.stability.brute import Picture, render
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
+Arguments = dict[str, Any]
 
 
-def single(name: str) -> dict[str, Any]:
-    arguments = case(name, torch.float32)
-    arguments.setdefault("background", torch.full((arguments["colors"].shape[-1],), 0.3))
-    return arguments
+def with_background(name: str, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Arguments:
+    """The arguments of a case, with a background where it has none."""
+    arguments = case(name, dtype, device)
+    channels = arguments["colors"].shape[-1]
+    return {"background": torch.full((channels,), 0.3, dtype=dtype, device=device)} | arguments
 
 
-def differentiate(arguments: dict[str, Any], backend: str, undecided: Tensor) -> tuple[RasterOutput, dict[str, Tensor]]:
-    """A picture, and the gradients of a random sum over the pixels that rounding cannot decide otherwise."""
+def cast(arguments: Arguments, dtype: torch.dtype, device: str = "cpu") -> Arguments:
+    return {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
+
+
+@cache
+def brute_force(name: str) -> Picture:
+    """The picture of a case in float64, from its numbers in float32."""
+    return render(**cast(with_background(name), torch.float64))
+
+
+def decided(name: str) -> Tensor:
+    """Pixels where no rounding can flip a decision of the picture's rules, [C, H, W]."""
+    return brute_force(name).slack > 1e-3
+
+
+def differentiate(arguments: Arguments, backend: str, where: Tensor) -> tuple[RasterOutput, dict[str, Tensor]]:
+    """A picture, and the gradients of a random sum over some of its pixels, in float64 on the CPU."""
     inputs = {k: v.clone().requires_grad_(k in DIFFERENTIABLE) if isinstance(v, Tensor) else v
               for k, v in arguments.items()}  # fmt: skip
     output = rasterize(**inputs, backend=backend)
     output.info.means2d.retain_grad()
     g = torch.Generator().manual_seed(1)
-    weight = torch.randn(output.image.shape, generator=g).to(output.image) * ~undecided[..., None]
-    weight_alpha = torch.randn(output.alpha.shape, generator=g).to(output.image) * ~undecided[..., None]
-    ((output.image * weight).sum() + (output.alpha * weight_alpha).sum()).backward()
-    gradients = {k: inputs[k].grad for k in DIFFERENTIABLE if k in inputs}
-    gradients["means2d"] = output.info.means2d.grad
-    return output, {k: torch.zeros(()) if v is None else v for k, v in gradients.items()}
+    weights = [torch.randn(x.shape, generator=g) * where[..., None] for x in (output.image, output.alpha)]
+    sum((x * w.to(x)).sum() for x, w in zip((output.image, output.alpha), weights, strict=True)).backward()
+    leaves = {k: inputs[k] for k in DIFFERENTIABLE if k in inputs} | {"means2d": output.info.means2d}
+    return output, {k: torch.zeros_like(x).cpu().double() if x.grad is None else x.grad.cpu().double()
+                    for k, x in leaves.items()}  # fmt: skip
 
 
-def undecided_pixels(arguments: dict[str, Any]) -> Tensor:
-    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    return render(**exact).slack <= 1e-3
+@cache
+def by_reference(name: str) -> tuple[RasterOutput, dict[str, Tensor]]:
+    """Picture and gradients of a case by the reference in float64."""
+    return differentiate(cast(with_background(name), torch.float64), "reference", decided(name))
 
 
-@pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("name", names())
-def test_picture(name: str) -> None:
-    """Catches any rule of the picture that differs, a bound that loses a pixel, and a wrong rounding in one ISA."""
-    arguments = single(name)
-    picture = render(**{k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()})
-    output = rasterize(**arguments, backend="cpu")
-    decided = picture.slack > 1e-3
-    np.testing.assert_allclose(output.image[decided], picture.image[decided], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(output.alpha[decided], picture.alpha[decided], rtol=0, atol=1e-4)
+def assert_gradients_close(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    """Compare by size, by direction, and by which numbers are zero."""
+    for key, want in expected.items():
+        got, size = actual[key], want.norm()
+        assert (got - want).norm() <= 1e-3 * size + 1e-6, key
+        if size > 1e-6:
+            assert torch.cosine_similarity(got.flatten(), want.flatten(), 0) > 0.9999, key
+        noise = 1e-6 * (want.abs().max() if want.numel() else 0) + 1e-9
+        assert not ((got == 0) & (want.abs() > noise)).any(), f"{key}: a gradient is missing"
+        assert not ((want == 0) & (got.abs() > noise)).any(), f"{key}: a gradient should be zero"
 
 
-@pytest.mark.usefixtures("instruction_set")
-@pytest.mark.parametrize("name", names())
-def test_gradients(name: str) -> None:
-    """Catches a wrong gradient of any input: by size, by direction, and by which entries are zero."""
-    arguments = single(name)
-    undecided = undecided_pixels(arguments)
-    exact = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
-    _, expected = differentiate(exact, "reference", undecided)
-    _, actual = differentiate(arguments, "cpu", undecided)
-    for key, truth in expected.items():
-        got = actual[key].double()
-        scale = truth.norm()
-        assert (got - truth).norm() <= 1e-3 * scale + 1e-6, key
-        if scale > 1e-6:
-            assert torch.nn.functional.cosine_similarity(got.flatten(), truth.flatten(), 0) > 0.9999, key
-        noise = 1e-6 * (truth.abs().max() if truth.numel() else 0) + 1e-9
-        assert not ((got == 0) & (truth.abs() > noise)).any(), f"{key}: a gradient is missing"
-        assert not ((truth == 0) & (got.abs() > noise)).any(), f"{key}: a gradient should be zero"
+def backward_kernels(place: Place) -> Iterator[AbstractContextManager[None]]:
+    """Each of the backward kernels of a place: those of CUDA go by pixel or by splat."""
+    yield nullcontext()
+    if place.name == "cuda":
+        yield raster.backward_by_splat()
 
 
 @pytest.mark.parametrize("name", names())
-def test_info(name: str) -> None:
-    """Catches radii, means or depths that differ from the reference's: density control lives on them."""
-    arguments = single(name)
-    expected, actual = (rasterize(**arguments, backend=backend).info for backend in ("reference", "cpu"))
-    assert actual.radii.dtype == torch.int32
-    assert (actual.radii - expected.radii).abs().le(1 + 1e-5 * expected.radii).all()
-    assert ((actual.radii > 0) == (expected.radii > 0)).float().mean() > 0.95 or not len(arguments["means"])
-    drawn = actual.radii > 0
-    torch.testing.assert_close(actual.means2d[drawn], expected.means2d[drawn], rtol=1e-5, atol=1e-3)
-    torch.testing.assert_close(actual.depths, expected.depths, rtol=1e-5, atol=1e-5)
+def test_picture(name: str, place: Place) -> None:
+    """Catches any rule of the picture that differs, a bound or tile that loses a Gaussian, and radii, means or depths
+    that density control would take for others."""
+    output = rasterize(**with_background(name, device=place.device), backend=place.device)
+    for got, want in ((output.image, brute_force(name).image), (output.alpha, brute_force(name).alpha)):
+        known = torch.as_tensor(want)[decided(name)]
+        torch.testing.assert_close(got.cpu().double()[decided(name)], known, rtol=0, atol=1e-4)
+    info, expected = output.info, by_reference(name)[0].info
+    assert info.radii.dtype == torch.int32
+    radii = info.radii.cpu()
+    assert (radii - expected.radii).abs().le(1 + 1e-5 * expected.radii).all()
+    assert ((radii > 0) == (expected.radii > 0)).float().mean() > 0.95 or not radii.numel()
+    drawn = (radii > 0) & (expected.radii > 0)
+    means2d, depths = info.means2d.detach().cpu().double(), info.depths.cpu().double()
+    torch.testing.assert_close(means2d[drawn], expected.means2d.detach()[drawn], rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(depths, expected.depths.detach(), rtol=1e-5, atol=1e-5)
+    assert (info.pairs == 0) == (expected.pairs == 0)
+
+
+@pytest.mark.parametrize("name", names())
+def test_gradients(name: str, place: Place) -> None:
+    """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
+    for kernel in backward_kernels(place):
+        with kernel:
+            _, actual = differentiate(with_background(name, device=place.device), place.device, decided(name))
+        assert_gradients_close(actual, by_reference(name)[1])
+
+
+def test_many_tiles_and_rounds(place: Place) -> None:
+    """Catches what shows only with more than 32 splats a tile and several tiles: staging rounds, offsets, sort keys."""
+    g = torch.Generator().manual_seed(3)
+    N, width, height = (3_000, 230, 170) if place.device == "cuda" else (300, 50, 40)
+    exact = gaussians(g, N, size=0.1) | camera(width, height) | {"background": torch.tensor([0.1, 0.5, 0.9])}
+    exact["opacities"] = exact["opacities"] * 0.3  # deep: many splats a pixel
+    exact, single = cast(exact, torch.float64), cast(exact, torch.float32, place.device)
+    want, got = rasterize(**exact, backend="reference"), rasterize(**single, backend=place.device)
+    error = (got.image.cpu().double() - want.image).abs().amax(-1)
+    # A decision that rounding flips changes a pixel by up to 1/255: a handful of the millions there are.
+    assert error.quantile(0.999) < 1e-4
+    assert error.max() < 1 / 255
+    _, expected = differentiate(exact, "reference", error < 1e-4)
+    for kernel in backward_kernels(place):
+        with kernel:
+            assert_gradients_close(differentiate(single, place.device, error < 1e-4)[1], expected)
 
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack", "beta_of_three_cameras"])
 def test_same_bits_for_any_number_of_threads(name: str) -> None:
     """Catches sums whose order depends on who comes first."""
-    arguments = single(name)
+    arguments = with_background(name)
     if name == "random":  # several tiles and several tasks of every loop
         g = torch.Generator().manual_seed(0)
-        scene = gaussians(g, 3000, size=0.05) | camera(150, 100) | {"background": torch.ones(3)}
-        arguments = {k: v.float() if isinstance(v, Tensor) else v for k, v in scene.items()}
-    none = torch.zeros(len(arguments["viewmats"]), arguments["height"], arguments["width"], dtype=torch.bool)
+        arguments = cast(gaussians(g, 3000, size=0.05) | camera(150, 100) | {"background": torch.ones(3)},
+                         torch.float32)  # fmt: skip
     results = []
     for number in (1, 2, 5):
         torch.set_num_threads(number)
-        output, gradients = differentiate(arguments, "cpu", none)
+        output, gradients = differentiate(arguments, "cpu", torch.ones(()).bool())
         results.append([output.image, output.alpha, *gradients.values()])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-def test_layouts_do_not_matter() -> None:
-    """Catches memory read in the wrong order: transposed factors, expanded colours, strided means."""
-    arguments = single("three_cameras")
-    N = len(arguments["means"])
-    arguments["colors"] = arguments["colors"][0]
-    expected = rasterize(**arguments, backend="cpu").image
-    strided = arguments | {
-        "factors": arguments["factors"].mT.contiguous().mT,
-        "means": torch.cat([arguments["means"], torch.ones(N, 2)], 1)[:, :3],
-        "colors": arguments["colors"].expand(3, N, 3),
-        "viewmats": arguments["viewmats"].mT.contiguous().mT,
-    }
-    assert torch.equal(rasterize(**strided, backend="cpu").image, expected)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
 def test_shared_colors_collect_the_gradient_of_every_camera() -> None:
     """Catches a gradient of shared colours that keeps only one camera's part."""
-    arguments = single("three_cameras") | {"colors": torch.rand(30, 3)}
-    none = undecided_pixels(arguments) & False
-    _, shared = differentiate(arguments, "cpu", none)
-    _, separate = differentiate(arguments | {"colors": arguments["colors"].repeat(3, 1, 1)}, "cpu", none)
-    torch.testing.assert_close(shared["colors"], separate["colors"].sum(0))
+    arguments = with_background("three_cameras") | {"colors": torch.rand(30, 3)}
+    shared, separate = (
+        differentiate(arguments | {"colors": colors}, "cpu", torch.ones(()).bool())[1]["colors"]
+        for colors in (arguments["colors"], arguments["colors"].repeat(3, 1, 1))
+    )
+    torch.testing.assert_close(shared, separate.sum(0), rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("place", [0, 15, (1 << 17) - 1, 1 << 17, -1])
-def test_one_bad_value_of_many_is_flagged(bad: float, place: int) -> None:
+@pytest.mark.parametrize("position", [0, 15, (1 << 17) - 1, 1 << 17, -1])
+def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
     """Catches vectors or parts of a large array that are not looked at: its first, where parts meet, its last."""
     N = 100_003
     arrays = [torch.full((N, 3), 0.5), torch.full((N, 3, 3), 0.5), torch.full((N,), 0.5), torch.full((N, 3), 0.5)]
     rest = torch.eye(4)[None], torch.eye(3)[None], torch.zeros(3)
     assert int(raster.flag_values(*arrays, *rest)) == 0
-    arrays[1].view(-1)[place] = bad
+    arrays[1].view(-1)[position] = bad
     assert int(raster.flag_values(*arrays, *rest)) == 1 << 1
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, torch.nan, torch.inf])
-def test_exponents_of_beta_profiles_are_positive(bad: float) -> None:
-    """Catches an exponent that the kernel lets in and the reference refuses."""
-    arguments = single("beta")
-    arguments["shapes"][-1] = bad
-    with pytest.raises(InputError, match=r"^shapes: expected (exponents above 0|finite values), got"):
-        rasterize(**arguments, backend="cpu")
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [("means", torch.nan, "means: expected finite"), ("factors", torch.inf, "factors: expected finite"),
+     ("opacities", 1.5, "opacities: expected values in"), ("colors", -torch.inf, "colors: expected finite"),
+     ("viewmats", torch.nan, "viewmats: expected finite"), ("Ks", 0.0, "Ks: expected positive"),
+     ("background", torch.nan, "background: expected finite"), ("shapes", 0.0, "shapes: expected exponents above 0"),
+     ("shapes", -1.0, "shapes: expected exponents above 0"), ("shapes", torch.inf, "shapes: expected finite"),
+     ("shapes", torch.nan, "shapes: expected finite")],
+)  # fmt: skip
+def test_bad_values_are_named(name: str, value: float, message: str, place: Place) -> None:
+    """Catches a value that shows late, as a picture of NaN: on a GPU the check does not wait for the device."""
+    arguments = with_background("beta_of_three_cameras", device=place.device)
+    arguments[name].view(-1)[0] = value
+    with pytest.raises(InputError, match=f"^{message}"):
+        rasterize(**arguments, backend=place.device)
 
 
-@pytest.mark.usefixtures("instruction_set")
-def test_beta_vector() -> None:
+def test_beta_vector(place: Place) -> None:
     """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
-    assert_beta_vector("cpu", torch.float32, 2e-4)
+    assert_beta_vector(place.device, torch.float32, 2e-4)
 
 
 @pytest.mark.usefixtures("instruction_set")
 def test_a_large_exponent_is_a_gaussian() -> None:
     """Catches digits of 1 - r^2 that are lost near 1, which an exponent of 10^5 multiplies: alphas were off by 1e-3."""
-    arguments = single("random") | {"eps2d": 0.0}
-    large = {"factors": arguments["factors"] * (2e5**0.5), "shapes": torch.full((60,), 1e5)}
-    gaussian, beta = (rasterize(**a, backend="cpu").image for a in (arguments, arguments | large))
-    decided = ~undecided_pixels(arguments) & ~undecided_pixels(arguments | large)
-    assert decided.double().mean() > 0.8
-    torch.testing.assert_close(beta[decided], gaussian[decided], rtol=0, atol=1e-4)
+    arguments = with_background("random") | {"eps2d": 0.0}
+    large = arguments | {"factors": arguments["factors"] * (2e5**0.5), "shapes": torch.full((60,), 1e5)}
+    gaussian, beta = (rasterize(**a, backend="cpu").image for a in (arguments, large))
+    where = torch.stack([render(**cast(a, torch.float64)).slack > 1e-3 for a in (arguments, large)]).all(0)
+    assert where.double().mean() > 0.8
+    torch.testing.assert_close(beta[where], gaussian[where], rtol=0, atol=1e-4)
 
 
 @pytest.mark.usefixtures("instruction_set")
 def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
     """Catches a gradient of an exponent below 1 that is infinite or missing at the rim: pixels are put on it."""
     distances = torch.tensor([0.9, 1 - 1e-4, 1 - 6e-7, 1 + 1e-5]).sqrt()  # r at which each image has its one pixel
+    Ks = torch.tensor([[1.0, 0, 0], [0, 1, 0.5], [0, 0, 1]]).repeat(4, 1, 1)
+    Ks[:, 0, 2] = 0.5 + distances
     gradients = []
-    for backend, dtype in (("cpu", torch.float32), ("reference", torch.float32)):
-        factor = torch.diag(torch.tensor([1.0, 1, 0], dtype=dtype))[None].requires_grad_()
-        shapes = torch.tensor([0.2], dtype=dtype, requires_grad=True)
-        Ks = torch.tensor([[1.0, 0, 0], [0, 1, 0.5], [0, 0, 1]], dtype=dtype).repeat(4, 1, 1)
-        Ks[:, 0, 2] = 0.5 + distances
-        out = rasterize(torch.tensor([[0.0, 0, 1]], dtype=dtype), factor, torch.ones(1, dtype=dtype),
-                        torch.ones(1, 1, dtype=dtype), torch.eye(4, dtype=dtype).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0,
-                        shapes=shapes, backend=backend)  # fmt: skip
+    for backend in ("cpu", "reference"):
+        factor = torch.diag(torch.tensor([1.0, 1, 0]))[None].requires_grad_()
+        shapes = torch.tensor([0.2], requires_grad=True)
+        out = rasterize(torch.tensor([[0.0, 0, 1]]), factor, torch.ones(1), torch.ones(1, 1),
+                        torch.eye(4).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0, shapes=shapes, backend=backend)  # fmt: skip
         slopes = [torch.autograd.grad(x, (factor, shapes), retain_graph=True) for x in out.alpha.flatten()]
         gradients.append((out.alpha.detach().flatten(), *map(torch.stack, zip(*slopes, strict=True))))
     for got, want in zip(*gradients, strict=True):
         assert want[2].abs().max() > 0
         assert not want[3].any()
-        for one, other in zip(got, want, strict=True):  # the slope at r^2 = 1 - 1e-4 is known to 1e-3: r^2 is rounded
-            assert (one - other).norm() <= 5e-3 * other.norm()
+        for x, y in zip(got, want, strict=True):  # the slope at r^2 = 1 - 1e-4 is known to 1e-3: r^2 is rounded
+            assert (x - y).norm() <= 5e-3 * y.norm()
 
 
-def test_what_it_cannot_do_is_said() -> None:
-    """Catches a crash or a silent wrong result where the backend has limits the reference has not."""
-    arguments = single("random")
-    double = {k: v.double() if isinstance(v, Tensor) else v for k, v in arguments.items()}
+def test_what_it_cannot_do_is_refused() -> None:
+    """Catches a crash or a silent wrong result where the kernels have limits the reference has not: types, a gradient
+    by intrinsics, and 100,000 Gaussians that each cover a 4k picture, or 2,000 cameras of it."""
+    arguments = with_background("random")
     with pytest.raises(InputError, match="float32"):
-        rasterize(**double, backend="cpu")
+        rasterize(**cast(arguments, torch.float64), backend="cpu")
     with pytest.raises(InputError, match="no gradient by Ks"):
         rasterize(**arguments | {"Ks": arguments["Ks"].requires_grad_()}, backend="cpu")
-
-
-def test_a_request_beyond_memory_fails_by_message() -> None:
-    """Catches the process being killed: 100,000 Gaussians that each cover a 4k picture, before 2,000 cameras."""
-    g = torch.Generator().manual_seed(0)
-    scene = gaussians(g, 100_000, size=20.0) | camera(3840, 2160)
-    arguments = {k: v.float() if isinstance(v, Tensor) else v for k, v in scene.items()}
+    covering = gaussians(torch.Generator().manual_seed(0), 100_000, size=20.0) | camera(3840, 2160)
     with pytest.raises(InputError, match=r"GiB|pairs"):
-        rasterize(**arguments, backend="cpu")
-    few = single("random") | {"width": 3840, "height": 2160}
-    many = few | {"viewmats": few["viewmats"].repeat(2000, 1, 1), "Ks": few["Ks"].repeat(2000, 1, 1)}
+        rasterize(**cast(covering, torch.float32), backend="cpu")
+    cameras = {key: arguments[key].detach().repeat(2000, 1, 1) for key in ("viewmats", "Ks")}
     with pytest.raises(InputError, match="GiB"):
-        rasterize(**many, backend="cpu")
+        rasterize(**arguments | cameras | {"width": 3840, "height": 2160}, backend="cpu")
 
 
 @pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "beta_of_three_cameras"])
 def test_operations_keep_torch_s_rules(name: str) -> None:
     """Catches an operation that aliases, mutates or misdeclares its outputs, so that torch.compile would be wrong."""
-    a = single(name)
+    a = with_background(name)
     inputs = [a[k].requires_grad_() for k in ("means", "factors", "opacities", "viewmats")]
     viewport = raster.Viewport(a["width"], a["height"], 0.01, 1e10, 0.3, False)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    ops = torch.ops.gsbench
     shapes = a.get("shapes")
-    given = torch.empty(0) if shapes is None else shapes.requires_grad_()
-    torch.library.opcheck(ops.project, ([*inputs, a["Ks"], given], *viewport), test_utils=checks)
+    exponents = torch.empty(0) if shapes is None else shapes.requires_grad_()
+    torch.library.opcheck(torch.ops.gsbench.project, ([*inputs, a["Ks"], exponents], *viewport), test_utils=checks)
     splats = raster.Splats(*(x.detach() for x in raster.project(*inputs, a["Ks"], viewport, shapes)[:4]))
     bins, _ = raster.bin_tiles(splats, viewport, torch.zeros(1, dtype=torch.int64))
     colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
     blended = [splats.means2d.requires_grad_(), splats.roots.requires_grad_(), splats.half_sizes, colors]
     torch.library.opcheck(
-        ops.blend, ([*blended, a["background"], *bins, given], a["width"], a["height"]), test_utils=checks
-    )
+        torch.ops.gsbench.blend, ([*blended, a["background"], *bins, exponents], a["width"], a["height"]),
+        test_utils=checks,
+    )  # fmt: skip

@@ -33,23 +33,23 @@ def test_a_repetition_has_the_results_of_the_present_values() -> None:
         halves = torch.linalg.qr(x.view(4, 2)[:2])
         return [summed, *halves, x.new_full((2,), 3.0) + x[[1, 3]], torch.cat([x, summed]).sum()]
 
-    given = numbers(8)
+    inputs = numbers(8)
     with Recording() as recording:
-        found = work(given)
+        results = work(inputs)
     assert recording.is_repeatable
     for seed in (1, 2):
-        given.copy_(numbers(8, seed=seed))
+        inputs.copy_(numbers(8, seed=seed))
         repeated(recording)
-        assert all(torch.equal(x, y) for x, y in zip(found, work(given), strict=True))
+        assert all(torch.equal(x, y) for x, y in zip(results, work(inputs), strict=True))
 
 
 def test_kernels_and_gradients_are_repeated() -> None:
     """Catches a kernel that is not recorded, a backward pass of the tape, and autograd's where torch is in between."""
     scales, quats, opacities = numbers(50, 3), numbers(50, 4), numbers(50)
-    given = [scales, quats, opacities]
+    inputs = [scales, quats, opacities]
 
     def work(sums: dict[int, Tensor]) -> list[Tensor]:
-        sources = [x.requires_grad_() for x in given]
+        sources = [x.requires_grad_() for x in inputs]
         with Tape() as tape:
             factors, dimmed = slice_static(scales * 0.5, quats, opacities)
             loss = (factors.square().sum((1, 2)) * dimmed).sum()
@@ -57,14 +57,14 @@ def test_kernels_and_gradients_are_repeated() -> None:
         return [loss.detach(), *[sums[id(x)] for x in sources]]
 
     with Recording() as recording:
-        found = work({})
+        results = work({})
     assert recording.is_repeatable
     with torch.no_grad():
-        for i, x in enumerate(given):
+        for i, x in enumerate(inputs):
             x.copy_(numbers(*x.shape, seed=5 + i))
     repeated(recording)
-    assert all(torch.equal(x, y) for x, y in zip(found, work({}), strict=True))
-    assert all(x.any() for x in found)
+    assert all(torch.equal(x, y) for x, y in zip(results, work({}), strict=True))
+    assert all(x.any() for x in results)
 
 
 def test_a_number_that_was_read_is_read_again() -> None:
@@ -92,13 +92,13 @@ def test_what_cannot_be_repeated_says_so(work: object) -> None:
 
 def test_threads_record_one_after_the_other() -> None:
     """Catches a recording with another thread's calls, and torch's note of a recording that stays after its end."""
-    made: list[list[tuple[Recording, Tensor]]] = [[], []]
-    given = [torch.ones(3), torch.ones(3)]
+    recorded: list[list[tuple[Recording, Tensor]]] = [[], []]
+    inputs = [torch.ones(3), torch.ones(3)]
 
     def work(thread: int) -> None:
         for _ in range(50):
             with Recording() as recording:
-                made[thread].append((recording, given[thread] * 2))
+                recorded[thread].append((recording, inputs[thread] * 2))
 
     threads = [threading.Thread(target=work, args=(i,)) for i in range(2)]
     for thread in threads:
@@ -107,11 +107,11 @@ def test_threads_record_one_after_the_other() -> None:
         thread.join()
     assert current() is None
     assert not is_in_torch_dispatch_mode()
-    given[0].fill_(2.0)
-    for recording, _ in [*made[0], *made[1]]:
+    inputs[0].fill_(2.0)
+    for recording, _ in [*recorded[0], *recorded[1]]:
         repeated(recording)
-    assert all((result == 4).all() for _, result in made[0])
-    assert all((result == 2).all() for _, result in made[1])
+    assert all((result == 4).all() for _, result in recorded[0])
+    assert all((result == 2).all() for _, result in recorded[1])
 
 
 def test_recording_does_not_import_torch_s_compiler() -> None:

@@ -1,13 +1,17 @@
 """A tape's gradients against autograd's: the same bits, where operations are chained and where torch is in between."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from conftest import Place
+from test_refinement import intervals_around
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.scene import camera, model
-from gsbench.kernels.backends import CPU
+from gsbench.kernels.backends import AUTO, CPU, REFERENCE, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.slices import slice_static
@@ -26,43 +30,44 @@ BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
 def views(count: int, size: int = 40) -> list[View]:
     """The benchmark's camera at a few distances and times, before random images."""
     viewmats, Ks = camera(size)
-    g, made = torch.Generator().manual_seed(0), []
+    g, batch = torch.Generator().manual_seed(0), []
     for i in range(count):
         viewmat = viewmats[0].clone()
         viewmat[2, 3] += 0.3 * i
-        made.append(View(str(i), Camera(viewmat, Ks[0], size, size - 3), 0.1 + 0.2 * i,
-                         torch.rand(size - 3, size, 3, generator=g)))  # fmt: skip
-    return made
+        image = torch.rand(size - 3, size, 3, generator=g)
+        batch.append(View(str(i), Camera(viewmat, Ks[0], size, size - 3), 0.1 + 0.2 * i, image))
+    return batch
 
 
 def fitted(name: str, N: int = 300, *, agr: bool = False, classed: bool = False) -> GaussianModel:
     """A model all of whose parts learn, and whose Gaussians cover each other; or not all of them in every row."""
-    made = model(name, N, agr=agr, sigma=0.2, backend=CPU)
+    fitting = model(name, N, agr=agr, sigma=0.2, backend=CPU)
     with torch.no_grad():
-        for parameter in made.refinement.parameters() if made.refinement is not None else ():
+        for parameter in fitting.refinement.parameters() if fitting.refinement is not None else ():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
-    made.set_active(replace(made.active, tunes_lambda=True))
+    fitting.set_active(replace(fitting.active, tunes_lambda=True))
     if classed:
         orders = torch.randint(0, 12, (N,), generator=torch.Generator().manual_seed(2), dtype=torch.int32)
-        made.effect_sets = EffectSets(N // 3, N // 2 + 1, orders)
-    return made
+        fitting.effect_sets = EffectSets(N // 3, N // 2 + 1, orders)
+    return fitting
 
 
-def gradients(made: GaussianModel) -> dict[str, Tensor]:
-    found = {name: p.grad for name, p in made.named_parameters() if p.grad is not None}
-    made.zero_grad(set_to_none=True)
-    return found
+def gradients(of: GaussianModel) -> dict[str, Tensor]:
+    """Take the gradients from the parameters."""
+    taken = {name: p.grad for name, p in of.named_parameters() if p.grad is not None}
+    of.zero_grad(set_to_none=True)
+    return taken
 
 
 def test_a_tape_runs_backwards_for_several_vectors() -> None:
     """Catches a second vector whose product has the first one's in it, or is empty: the probe asks for two."""
     view = views(1)[0]
-    seen = fitted("7dgs").slice(Query.of(view.camera, view.time))
-    at = [x.detach().requires_grad_() for x in tensors_of(seen)]
+    gaussians = fitted("7dgs").slice(Query.of(view.camera, view.time))
+    at = [x.detach().requires_grad_() for x in tensors_of(gaussians)]
     with Tape() as tape:
-        images = rasterize_slice(type(seen)(*at), view.camera, BACKGROUND, CPU).image
+        images = rasterize_slice(type(gaussians)(*at), view.camera, BACKGROUND, CPU).image
     vectors = [torch.randn(images.shape, generator=torch.Generator().manual_seed(i)) for i in range(2)]
-    alone = rasterize_slice(type(seen)(*at), view.camera, BACKGROUND, CPU).image
+    alone = rasterize_slice(type(gaussians)(*at), view.camera, BACKGROUND, CPU).image
     for vector in vectors:
         sums: dict[int, Tensor] = {}
         tape.backward(images, vector, at, sums)
@@ -78,41 +83,61 @@ def test_a_tape_runs_backwards_for_several_vectors() -> None:
 )  # fmt: skip
 def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) -> None:
     """Catches an operation left out of the chain, a gradient given twice, or to another tensor."""
-    made, batch = fitted(name, agr=agr, classed=classed), views(3)
+    fitting, batch = fitted(name, agr=agr, classed=classed), views(3)
     expected: dict[str, Tensor] = {}
     for view in batch:
-        seen = made.slice(Query.of(view.camera, view.time))
-        output = rasterize_slice(seen, view.camera, BACKGROUND, CPU)
+        gaussians = fitting.slice(Query.of(view.camera, view.time))
+        output = rasterize_slice(gaussians, view.camera, BACKGROUND, CPU)
         output.info.means2d.retain_grad()
         (l1_ssim(output.image[0], view.image, 0.2) / 3).backward()
-        for key, gradient in gradients(made).items():
+        for key, gradient in gradients(fitting).items():
             expected[key] = gradient if key not in expected else expected[key] + gradient
     torch.set_num_threads(1)
-    seen_by_step = Step(made, BACKGROUND, 0.2, False, StageClock())(batch)
-    actual = gradients(made)
+    of_views = Step(fitting, BACKGROUND, 0.2, False, StageClock())(batch)
+    actual = gradients(fitting)
     assert actual.keys() == expected.keys()
     for key, gradient in expected.items():
         assert torch.equal(actual[key], gradient), key
         assert gradient.any(), key
     assert output.info.means2d.grad is not None
-    assert torch.equal(seen_by_step[-1].g_means2d, output.info.means2d.grad)
+    assert torch.equal(of_views[-1].g_means2d, output.info.means2d.grad)
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("name", "agr", "classed"), [("7dgs", True, False), ("4dgs", False, False),
+                                                      ("7dgs", True, True), ("4dgs", True, True)])  # fmt: skip
+def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, classed: bool, place: Place) -> None:
+    """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
+    blending, projection, colours and slices to the parameters, or in the sum over views."""
+    torch.set_num_threads(1)  # the shim runs in one
+
+    def step(backend: Backend, device: str) -> dict[str, Tensor]:
+        fitting = fitted(name, agr=agr, classed=classed).to(device)
+        if classed:
+            fitting.effect_sets = fitting.effect_sets._replace(orders=fitting.effect_sets.orders.to(device))
+        fitting.backend = backend
+        Step(fitting, BACKGROUND.to(device), 0.2, False, StageClock(device))([view.to(device) for view in views(2)])
+        return gradients(fitting)
+
+    got, want = step(AUTO, place.device), step(REFERENCE, "cpu")
+    assert got.keys() == want.keys()
+    for key, expected in want.items():
+        assert expected.any(), key
+        assert (got[key].cpu() - expected).norm() <= 1e-3 * expected.norm(), key
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")
 @pytest.mark.parametrize(("name", "N", "classed"), [("4dgs", 300, False), ("7dgs", 300, False), ("7dgs", 2500, True)])
 def test_the_same_bits_for_any_number_of_threads(name: str, N: int, classed: bool) -> None:
     """Catches views whose gradients are added in the order that threads come by."""
-    made, batch = fitted(name, N, agr=True, classed=classed), views(5)
-    found = []
+    fitting, batch = fitted(name, N, agr=True, classed=classed), views(5)
+    results = []
     for count in (1, 2, 3, 8):
         torch.set_num_threads(count)
-        seen = Step(made, BACKGROUND, 0.2, False, StageClock())(batch)
-        found.append((gradients(made), torch.stack([one.loss for one in seen]), [one.g_means2d for one in seen]))
+        of_views = Step(fitting, BACKGROUND, 0.2, False, StageClock())(batch)
+        results.append([*gradients(fitting).values(), *(x for view in of_views for x in (view.loss, view.g_means2d))])
         assert torch.get_num_threads() == count
-    for other in found[1:]:
-        assert all(torch.equal(x, other[0][key]) for key, x in found[0][0].items())
-        assert torch.equal(other[1], found[0][1])
-        assert all(torch.equal(a, b) for a, b in zip(other[2], found[0][2], strict=True))
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
 @pytest.mark.usefixtures("threads")
@@ -209,3 +234,32 @@ def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     with Tape() as tape:
         slice_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
     assert not tape._notes
+
+
+class Calls(TorchDispatchMode):
+    """Collects the operations of the kernels that are called, with their arguments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.arguments: dict[str, tuple[Any, tuple[Any, ...]]] = {}
+
+    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if operator.namespace == "gsbench":
+            self.arguments[operator.name()] = operator, args
+        return operator(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ["4dgs", "7dgs"])
+@pytest.mark.parametrize("classed", [False, True])
+def test_torch_is_given_the_right_shapes(name: str, classed: bool) -> None:
+    """Catches an operation with prefixes, intervals or orders whose fake has other shapes than it has."""
+    time, fitting = torch.tensor(0.4), fitted(name, 30, agr=True, classed=classed)
+    if fitting.effect_sets is not None:
+        intervals = intervals_around(time, fitting.effect_sets.refined)[1]
+        fitting.effect_sets = fitting.effect_sets._replace(intervals=intervals)
+    with Calls() as calls:
+        fitting.slice(Query(torch.tensor([0.3, -0.2, -3.0]), time))
+    slicing = "slice_triangular" if name == "7dgs" else "slice_rotated"
+    assert {f"gsbench::{operation}" for operation in ("refine", slicing, "show_colors")} <= calls.arguments.keys()
+    for operator, arguments in calls.arguments.values():
+        torch.library.opcheck(operator, arguments, test_utils=("test_schema", "test_faketensor"))
