@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
+import pandas as pd
+
 AVERAGE = "avg"
 MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # the models of Table 1, and whether they have AGR
 
@@ -77,6 +79,15 @@ def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
     Example: ``paper_row("D-NeRF", "trex", "7dgs")``.
     """
     return table1().get((dataset, scene.lower(), model))  # Technicolor's folders are named Birthday, ..
+
+
+def average(dataset: str, scenes: list[str], model: str) -> pd.Series | None:
+    """Return the paper's numbers of a model, averaged over scenes; None if it lacks one of them."""
+    rows = [paper_row(dataset, scene, model) for scene in scenes]
+    if not rows or None in rows:
+        return None
+    names = {"lpips": "lpips_alex", "psnr": "psnr_db", "num_gaussians": "gaussians"}
+    return pd.DataFrame([vars(row) for row in rows]).astype(float).rename(columns=names).mean(skipna=False)
 
 
 @cache

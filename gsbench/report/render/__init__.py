@@ -1,0 +1,1 @@
+"""Show sections in a form: one module a form, each from the same shown table."""

@@ -1,0 +1,186 @@
+"""Show sections as one HTML file with interactive figures, which needs no other file and no network."""
+
+import base64
+import functools
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from gsbench.errors import printable
+from gsbench.measure.atomic import write_atomically
+from gsbench.report.frame import Results
+from gsbench.report.render import charts, text
+from gsbench.report.render.palette import MARKERS, THEMES, styles
+from gsbench.report.section import Figure, Section
+from gsbench.report.section import text as short
+from gsbench.report.sections import built
+
+FILE_NAME = "report.html"
+MOST_ROWS = 60  # of a table that the page shows; its CSV file has all
+MOST_FAULTS = 20  # damaged records that are listed
+TURNED = 13  # columns from which a table of few rows is shown with its columns as rows
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """The part of the page about one experiment on one data set."""
+
+    key: str
+    title: str
+    summary: str
+    sections: list[Section]
+    series: list[str]  # the models of the figures
+    best: str  # the model that pictures show first
+
+
+def write(results: Results, folder: Path, *, reload: int = 0, more: Sequence[Section] = ()) -> Path:
+    """Write the page of some runs to ``report.html`` in a folder, and return its path.
+
+    Args:
+        results: the tables of the runs, with at least one run.
+        folder: the folder of the page.
+        reload: seconds after which an open page reloads itself; 0 for never.
+        more: sections that are not of one experiment, such as a comparison with another folder.
+    """
+    path = folder / FILE_NAME
+    write_atomically(path, page(folder.resolve().name, results, reload=reload, more=more).encode())
+    return path
+
+
+def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Section] = ()) -> str:
+    """Return the page as text; no script but its own can run in it, and none may evaluate text."""
+    chapters = [_chapter(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
+    look = styles(name for chapter in chapters for name in chapter.series)
+    keyed = [(f"{chapter.key}-{of.key}", of) for chapter in chapters for of in chapter.sections]
+    keyed += [(f"more-{of.key}", of) for of in more]
+    specs = {f"{key}-{i}": charts.spec(figure, look) for key, of in keyed for i, figure in enumerate(of.figures)}
+    views = {key: list(map(asdict, of.images)) for key, of in keyed if of.key == "gallery"}
+    scripts = [library(), _asset("page.js")]
+    return _template().render(
+        title=short(title)[:80] or "results",
+        chapters=chapters,
+        more=more,
+        look=look,
+        markers=MARKERS,
+        specs=specs,
+        views=views,
+        faults=[short(fault) for fault in results.faults],
+        most_faults=MOST_FAULTS,
+        reload=reload,
+        hashes=" ".join(map(_hash, scripts)),
+        scripts=[Markup(script) for script in scripts],
+        css=Markup(_asset("page.css")),
+        light=_variables(0),
+        dark=_variables(1),
+    )
+
+
+def figures(results: Results, folder: Path) -> list[Path]:
+    """Write all figures of the page as PDF and SVG files to a folder, and return their paths."""
+    chapters = [_chapter("", chapter) for chapter in results.chapters()]
+    look = styles(name for chapter in chapters for name in chapter.series)
+    return [
+        path
+        for chapter in chapters
+        for of in chapter.sections
+        for figure in of.figures
+        for path in charts.write(figure, look, folder / f"{chapter.title} {of.key} {figure.caption}")
+    ]
+
+
+def _chapter(key: str, chapter: Results) -> Chapter:
+    runs = chapter.runs
+    counts = {
+        "run": len(runs),
+        "model": runs.model.nunique(),
+        "scene": runs.scene.nunique(),
+        "seed": runs.seed.nunique(),
+    }
+    words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
+    title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])[:60]}"
+    mean = runs.groupby("model").psnr_db.mean()
+    return Chapter(
+        key, title, " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]]), built(chapter),
+        sorted(runs.series.unique()), "" if mean.isna().all() else str(mean.idxmax()),
+    )  # fmt: skip
+
+
+def table(of: Section) -> dict[str, Any]:
+    """Return what the template shows as a table: rows of (text, class); turned if it is wide and short.
+
+    A column without any text is left out.
+    """
+    shown = of.shown().iloc[:MOST_ROWS]
+    names = [name for name, title in zip(of.shown_columns, shown, strict=True) if shown[title].ne("").any()]
+    shown = shown[[of.column(name).title for name in names]]
+    kinds = ["number" if of.is_number(name) else "" for name in names]
+    columns = [
+        [
+            (title, kind),
+            *(
+                (cell, f"{kind} best" if rank == 1 else kind)
+                for cell, rank in zip(shown[title], of.rank(name), strict=False)
+            ),
+        ]
+        for name, title, kind in zip(names, shown, kinds, strict=True)
+    ]
+    turned = len(names) > TURNED > len(shown)
+    rows = columns if turned else list(zip(*columns, strict=True))
+    return {"rows": rows, "turned": turned, "count": len(of.table), "more": len(of.table) - len(shown)}
+
+
+def _keys(figure: Figure) -> dict[str, list[str]]:
+    """Return what a reader can choose in a figure: its scenes and its models."""
+    of = figure.table
+    return {name: list(dict.fromkeys(of[name])) if name in of else [] for name in ("scene", "series")}
+
+
+def _swatches(of: Section) -> list[tuple[str, str]]:
+    """Return the legend of the stacked bars of a section: each part with the variable of its colour."""
+    options = [figure.options for figure in of.figures if figure.draw == "bars"]
+    return [
+        (part, hue)
+        for option in options
+        for part, hue in zip(option["parts"], charts.part_colours(option["parts"], option["colours"]), strict=True)
+    ]
+
+
+@functools.cache
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("gsbench.report", "render"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    csv = lambda of: base64.b64encode(text.csv(of.table).encode()).decode()  # noqa: E731
+    environment.filters |= {"table": table, "csv": csv, "keys": _keys, "swatches": _swatches, "short": short}
+    return environment.get_template("page.html.j2")
+
+
+@functools.cache
+def library() -> str:
+    """Return Vega, Vega-Lite and Vega-Embed as one script, from the package vl-convert-python."""
+    import vl_convert  # takes a moment
+
+    script: str = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")
+    return script.replace("</script", "<\\/script")
+
+
+def _asset(name: str) -> str:
+    return (resources.files("gsbench.report.render") / name).read_text()
+
+
+def _hash(script: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+def _variables(theme: int) -> Markup:
+    return Markup(";".join(f"--{name}:{pair[theme]}" for name, pair in THEMES.items()))

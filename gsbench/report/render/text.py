@@ -1,0 +1,160 @@
+"""Show sections in a terminal, as Markdown, as LaTeX and as plain values for JSON: one function each."""
+
+import re
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from gsbench.errors import printable
+from gsbench.report.section import EMPTY, Section
+
+ARROWS = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
+STYLES = {0: "{}", 1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"}
+TEX = {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
+    ">": r"\textgreater{}", "|": r"\textbar{}", "±": r"$\pm$", "×": r"$\times$", "−": "$-$", EMPTY: "--",
+    **{c: f"\\{c}" for c in "&%$#_{}"},
+}  # fmt: skip
+
+
+def terminal(sections: Sequence[Section], width: int = 120) -> str:
+    """Return sections as plain text of at most `width` characters a line, with a star at the best numbers.
+
+    Columns that do not fit are left out, and a line names them.
+    """
+    lines = []
+    for section in sections:
+        table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text)
+        numeric = dict(zip(table, map(section.is_number, section.shown_columns), strict=True))
+        widths = {name: min(60, max(map(len, [name, *table[name]]), default=0)) for name in table}
+        fitting = [n for n in range(1, len(widths) + 1) if sum(list(widths.values())[:n]) + 2 * n <= width]
+        names = list(table)[: max(fitting, default=1)]
+        rows = [names, *table[names].to_numpy().tolist()]
+        lines += [section.title.upper(), ""]
+        for row in rows if names else []:
+            cells = [
+                text[:60].rjust(widths[n]) if numeric[n] else text[:60].ljust(widths[n])
+                for n, text in zip(names, row, strict=True)
+            ]
+            lines.append("  ".join(cells).rstrip()[:width])
+        left_out = ", ".join(list(table)[len(names) :])
+        words = [
+            section.text,
+            *(f"- {note}" for note in section.notes),
+            f"- for lack of width: {left_out}" if left_out else "",
+        ]
+        lines += [
+            "",
+            *(line for text in words for line in textwrap.wrap(printable(text), width, subsequent_indent="  ")),
+            "",
+        ]
+    return "\n".join(lines)
+
+
+def markdown(sections: Sequence[Section]) -> str:
+    """Return sections as Markdown with a heading each; the best numbers are bold."""
+    parts = []
+    for section in sections:
+        notes = "\n".join(f"- {escaped(note)}" for note in section.notes)
+        parts += [f"## {escaped(section.title)}", table(section), escaped(section.text), notes]
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def table(section: Section) -> str:
+    """Return the table of a section as Markdown, as the blocks of README and docs have it."""
+    shown = section.shown(lambda text, rank: f"**{text}**" if rank == 1 else text)
+    marks = ["---:" if section.is_number(name) else "---" for name in section.shown_columns]
+    rows = [list(shown), marks, *shown.to_numpy().tolist()]
+    return "\n".join(f"| {' | '.join(map(escaped, row))} |" for row in rows) if len(shown) else ""
+
+
+def escaped(text: str) -> str:
+    """Escape the characters of Markdown and HTML that would end a cell or change how a text is shown."""
+    text = re.sub(r"&(?=[#\w])", "&amp;", printable(text)).replace("<", "&lt;")
+    return re.sub(r"([\\|\[\]])", r"\\\1", text)
+
+
+def latex(sections: Sequence[Section]) -> str:
+    r"""Return sections as LaTeX for a paper, one ``table*`` each; the document needs ``\usepackage{booktabs}``.
+
+    The best numbers are bold, the second best underlined. Notes stand above each table as comments.
+    """
+    return "\n".join(line for i, section in enumerate(sections, 1) for line in [*_latex(section, i), ""])
+
+
+def _latex(section: Section, number: int) -> list[str]:
+    names = section.shown_columns
+    shown = section.shown()
+    titles = [tex(section.column(name).title) + ARROWS[section.column(name).better] for name in names]
+    ranks = zip(*(section.rank(name) for name in names), strict=True)
+    rows = [
+        " & ".join(_cell(text, rank) for text, rank in zip(texts, places, strict=True))
+        for texts, places in zip(shown.to_numpy().tolist(), ranks, strict=True)
+    ]
+    return [
+        *(f"% {printable(note)}" for note in section.notes),
+        r"\begin{table*}",
+        r"\centering\small",
+        rf"\caption{{{tex(f'{section.title}. {section.text}')}}}",
+        rf"\label{{tab:gsbench-{number}}}",
+        rf"\begin{{tabular}}{{{''.join('r' if section.is_number(name) else 'l' for name in names)}}}",
+        r"\toprule",
+        f"{' & '.join(titles)} \\\\",
+        r"\midrule",
+        *(f"{row} \\\\" for row in rows),
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table*}",
+    ]
+
+
+def _cell(text: str, rank: int) -> str:
+    """Return a cell; only the mean is bold or underlined, not its interval."""
+    mean, sign, half = text.partition(" ± ")
+    return STYLES[rank].format(tex(mean)) + (rf" {{\scriptsize $\pm$ {tex(half)}}}" if sign else "")
+
+
+def tex(text: str) -> str:
+    """Escape the special characters of LaTeX, so that a text is shown unchanged and runs no command."""
+    return "".join(TEX.get(c, c) for c in printable(text))
+
+
+def plain(sections: Sequence[Section]) -> list[dict[str, Any]]:
+    """Return sections as plain values, the numbers not rounded; a number that is missing is None."""
+    return [
+        {"key": of.key, "title": of.title, "text": of.text, "notes": list(of.notes), "rows": rows(of.table)}
+        for of in sections
+    ]
+
+
+def rows(of: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table as plain values; infinity, which is a target never reached, is None too."""
+    values = of.astype(object).where(of.notna() & ~of.isin([float("inf"), -float("inf")]), None)
+    return [{str(name): _plain(value) for name, value in row.items()} for row in values.to_dict("records")]
+
+
+def _plain(value: Any) -> Any:
+    return (
+        value.item()
+        if hasattr(value, "item")
+        else value
+        if isinstance(value, bool | int | float | None)
+        else str(value)
+    )
+
+
+def csv(of: pd.DataFrame) -> str:
+    """Return a table as CSV, the numbers not rounded.
+
+    A text is on one line; if it begins like a formula, which a spreadsheet would compute, a ' is put before it.
+    """
+    return of.map(_safe).rename(columns=_safe).to_csv(index=False)
+
+
+def _safe(value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float) or hasattr(value, "item"):
+        return value
+    line = printable(value)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line

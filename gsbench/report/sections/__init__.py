@@ -1,0 +1,42 @@
+"""Make the sections of a report on one experiment: every module of this folder registers its own with `@section`.
+
+All differences that sections show as significant or not are tested together, with one correction for each quantity.
+"""
+
+import importlib
+import pkgutil
+
+import pandas as pd
+
+from gsbench.report import stats
+from gsbench.report.frame import Results
+from gsbench.report.section import SECTIONS, Section
+
+ORDER = ["budgets", "frontier", "experiment", "pairs", "effects", "quality", "curves", "lengths", "on_demand", "stages",
+         "gallery", "protocol", "runs"]  # others come before the last two  # fmt: skip
+
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+
+def tested(chapter: Results) -> pd.DataFrame:
+    """Test all differences that sections ask for, with one correction (Holm) for each quantity of an experiment.
+
+    Returns:
+        A row for each difference: its "section", "quantity", "name", "weights", and the columns of stats.differences.
+    """
+    rows = [(key, *row) for key, registered in SECTIONS.items() for row in registered.asks(chapter)]
+    asked = pd.DataFrame(rows, columns=["section", "quantity", "name", "weights"])
+    parts = [asked.iloc[:0].join(stats.differences({}, []))]
+    for quantity, of in asked.groupby("quantity", sort=False):
+        of = of.reset_index(drop=True)
+        parts.append(of.join(stats.differences(stats.grids(chapter, str(quantity)), list(of.weights))))
+    return pd.concat(parts[1:] or parts, ignore_index=True)
+
+
+def built(chapter: Results) -> list[Section]:
+    """Make all sections of one experiment, in their order."""
+    tests = tested(chapter)
+    ordered = sorted(SECTIONS, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER) - 2.5)
+    sections = [SECTIONS[key].build(chapter, tests[tests.section == key]) for key in ordered]
+    return [section for section in sections if section is not None]

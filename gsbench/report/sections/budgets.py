@@ -1,0 +1,154 @@
+"""PSNR against seconds, milliseconds and MB: the best model within each budget, and the frontier of each model."""
+
+import pandas as pd
+
+from gsbench.report import paper, stats
+from gsbench.report.frame import Results, covered
+from gsbench.report.paper_protocol import has_images_of_paper
+from gsbench.report.section import Asked, Column, Figure, Section, section
+
+COSTS = {"train_s": "training s", "frame_ms": "ms a frame", "model_mb": "MB"}
+BUDGETS = {"10 s of training": ("train_s", 10.0), "1 min of training": ("train_s", 60.0),
+           "10 min of training": ("train_s", 600.0), "60 frames a second": ("frame_ms", 1000 / 60)}  # fmt: skip
+MOST_SINGLE = 300  # single runs that a figure draws
+BUSY = 0.5  # load by other work from which a run counts as measured beside it
+
+
+def points(chapter: Results, scenes: list[str]) -> pd.DataFrame:
+    """Return a row for each configuration that finished `scenes`: PSNR with its interval, PSNR on val, and costs."""
+    runs = chapter.finished.runs
+    by = ["series", "model", "variant"]
+    table = stats.means(runs[runs.scene.isin(scenes)], by, ["psnr_db", "psnr_val_db", *COSTS])
+    return table[(table.scenes == len(scenes)) & table.psnr_db.notna()].reset_index(drop=True)
+
+
+def basis(chapter: Results) -> list[str]:
+    """Return the scenes of averages: those that all models finished with the main settings, else the one of most."""
+    ok = chapter.finished.runs
+    counts = ok.drop_duplicates(["scene", "model", "variant"]).scene.value_counts().sort_index()
+    return covered(ok[ok.main], "model") or ([counts.idxmax()] if len(counts) else [])
+
+
+def contests(chapter: Results) -> dict[str, pd.DataFrame]:
+    """Return for each budget the best configuration of each model within it, the best first, chosen on val.
+
+    Where a run has no PSNR on val, all are chosen on the evaluated views.
+    """
+    table = points(chapter, basis(chapter))
+    by = "psnr_db" if table.psnr_val_db.isna().any() else "psnr_val_db"
+    ordered = table.sort_values(by, ascending=False, kind="stable")
+    return {name: ordered[ordered[cost] <= most].drop_duplicates("series") for name, (cost, most) in BUDGETS.items()}
+
+
+def asked(chapter: Results) -> Asked:
+    """Return for each budget the differences of the best model and each other model within it."""
+    pairs = []
+    for budget, table in contests(chapter).items():
+        keys = list(table[["model", "variant"]].itertuples(index=False, name=None))
+        pairs += [("psnr_db", budget, {keys[0]: 1.0, other: -1.0}) for other in keys[1:]]
+    return pairs
+
+
+@section(asked)
+def budgets(chapter: Results, tests: pd.DataFrame) -> Section:
+    """Make the table of the best model within each budget."""
+    rows = []
+    for budget, table in contests(chapter).items():
+        of = tests[tests.name == budget]
+        counts = {"better than": of.significant & (of["mean"] > 0), "undecided": ~of.significant & of.p_holm.notna(),
+                  "worse than": of.significant & (of["mean"] < 0), "untested": of.p_holm.isna()}  # fmt: skip
+        rows.append(table.head(1).assign(**{name: int(of_kind.sum()) for name, of_kind in counts.items()}))
+        rows[-1] = rows[-1].assign(budget=budget) if len(table) else pd.DataFrame({"budget": [budget]})
+    order = [
+        "budget",
+        "model",
+        "variant",
+        "psnr_db",
+        "psnr_db ±",
+        *COSTS,
+        "better than",
+        "undecided",
+        "worse than",
+        "untested",
+    ]
+    text = (
+        "The model with the highest PSNR on val of those within the budget, and its PSNR on the evaluated views, which "
+        "choose too where val is missing or evaluated. The last columns count the other models within the budget that "
+        "it differs from significantly, after Holm's correction for all comparisons of this report, or not."
+    )
+    scenes, beside = basis(chapter), is_beside_others(chapter.finished.runs).sum()
+    notes = [f"Mean over {', '.join(scenes)}."] if scenes else ["No run has finished."]
+    if beside:
+        notes.append(
+            f"{beside} of {len(chapter.finished.runs)} runs were measured beside other work, which makes times longer."
+        )
+    columns = {name: Column(name, 0) for name in order[-4:]}
+    return Section("budgets", "Which model to use", text, pd.concat(rows, ignore_index=True).reindex(columns=order),
+                   columns, notes=tuple(notes))  # fmt: skip
+
+
+def is_beside_others(runs: pd.DataFrame) -> pd.Series:
+    """Tell of each run whether the machine had other work in its training: its load without the run's own is high."""
+    of_run = (runs.train_cpu_s / runs.train_s.where(runs.train_s > 0)).fillna(runs.threads)
+    return runs.load - of_run > BUSY
+
+
+@section()
+def frontier(chapter: Results, tests: pd.DataFrame) -> Section | None:
+    """Make the table and the figures of all configurations, over the mean of scenes and on each scene."""
+    names, scenes = sorted(chapter.finished.runs.scene.unique()), basis(chapter)
+    parts = [_frontier(chapter, scenes)] + [_frontier(chapter, [name]) for name in names if [name] != scenes]
+    table = pd.concat(parts, ignore_index=True)
+    if table.empty:
+        return None
+    drawn = pd.concat([table.assign(kind="mean"), *_single_runs(chapter), *_of_paper(chapter)], ignore_index=True)
+    figures = tuple(
+        Figure(f"PSNR against {title}", "frontier", drawn, {"x": cost, "title": title})
+        for cost, title in COSTS.items()
+        if drawn[cost].notna().any()
+    )
+    order = ["scene", "model", "variant", "seeds", "psnr_db", "psnr_db ±", "psnr_val_db", *COSTS, "dominated"]
+    text = (
+        "A point is the mean over seeds; its interval is over seeds, on these scenes and views. The line of a model "
+        "joins its filled points, which no cheaper configuration of the model reaches. Small points are single runs, "
+        "× is the paper's number (other hardware, best on test). Dominated: another mean has at least the PSNR in at "
+        "most the seconds, which may be chance; “Is it a difference?” tests pairs."
+    )
+    return Section("frontier", "What accuracy costs", text, table[order], figures=figures)
+
+
+def _frontier(chapter: Results, scenes: list[str]) -> pd.DataFrame:
+    """Return the points of some scenes, which of them are dominated, and which are on the frontier of their model."""
+    table = points(chapter, scenes)
+    name = scenes[0] if len(scenes) == 1 else f"mean of {len(scenes)} scenes"
+    best = {
+        f"best {cost}": pd.concat(
+            [stats.is_on_frontier(of, cost) for _, of in table.groupby("series")] or [pd.Series()]
+        )
+        for cost in COSTS
+    }
+    return table.assign(scene=name, dominated=stats.is_dominated(table, "train_s"), **best)
+
+
+def _single_runs(chapter: Results) -> list[pd.DataFrame]:
+    """Return the single runs as points, if there are several of a configuration and not too many for a figure."""
+    runs = chapter.finished.runs
+    several = runs.groupby(["scene", "series"]).variant.agg(["size", "nunique"])
+    is_drawn = len(runs) <= MOST_SINGLE * runs.scene.nunique() and (several["size"] > several["nunique"]).any()
+    names = ["scene", "series", "model", "variant", "psnr_db", *COSTS]
+    return [runs[names].assign(kind="run", seeds="seed " + runs.seed.astype(str))] if is_drawn else []
+
+
+def _of_paper(chapter: Results) -> list[pd.DataFrame]:
+    """Return the paper's numbers of models and scenes that were run on its images, with all effects of a Gaussian."""
+    runs = chapter.finished.runs
+    first = runs[~runs.groupby(["scene", "series"]).on_demand.transform("any")].drop_duplicates(["scene", "model"])
+    rows = []
+    for run in first.to_dict("records"):
+        numbers = paper.average(run["dataset"], [run["scene"]], run["model"])
+        if numbers is not None and has_images_of_paper(run["record"]):
+            cost = {"train_s": numbers.train_min * 60, "frame_ms": 1000 / numbers.fps}
+            rows.append(
+                {name: run[name] for name in ("scene", "series", "model")} | {"psnr_db": numbers.psnr_db} | cost
+            )
+    return [pd.DataFrame(rows).assign(kind="paper")] if rows else []

@@ -1,0 +1,200 @@
+"""PSNR on the validation views while models train: mean curves, the time to reach a quality, and training events."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from gsbench.config import TrainConfig
+from gsbench.errors import InputError
+from gsbench.measure.record import Record
+from gsbench.measure.schema import parse
+from gsbench.report import paper
+from gsbench.report.frame import Results
+from gsbench.report.paper_protocol import has_images_of_paper
+from gsbench.report.section import Column, Figure, Section, section
+from gsbench.schedule import Schedule
+
+STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
+FEWEST_TARGETS = 3  # for one scene
+WIDEST = 100.0  # dB from the lowest result, above which there is no target: more is no difference between models
+CONFIGURATION = ["scene", "series", "model", "variant"]
+EVENTS = {"A": "AGR starts", "R": "opacities are reset", "D": "densification ends", "L": "λ starts to be learned"}
+MOST_RESETS = 4  # opacity resets that are marked
+
+
+def mean_curves(chapter: Results) -> pd.DataFrame:
+    """Return the mean curve over seeds of each configuration on each scene, at the iterations that all seeds measured.
+
+    A configuration whose seeds kept different lengths (`train.lengths`) has no mean curve.
+    """
+    runs = chapter.finished.runs
+    lengths = runs.groupby(CONFIGURATION).iterations.transform(lambda values: values.nunique(dropna=False))
+    runs = runs[runs.train_s.notna() & (lengths == 1)]
+    points = chapter.curves.dropna(subset="psnr_val_db").drop_duplicates(["run", "iteration"], keep="last")
+    points = points.merge(runs[CONFIGURATION], left_on="run", right_index=True, validate="many_to_one")
+    means = points.groupby([*CONFIGURATION, "iteration"])[["train_s", "psnr_val_db"]].agg(["mean", "size"])
+    seeds = runs.groupby(CONFIGURATION).size().reindex(means.index.droplevel("iteration")).to_numpy()
+    means = means[means["train_s", "size"] == seeds].xs("mean", axis=1, level=1)
+    return means.reset_index().astype({"iteration": int})
+
+
+def targets(chapter: Results) -> pd.DataFrame:
+    """Return the PSNR targets of every scene and the training seconds that each model needs to reach them.
+
+    A model's seconds are the least after which the mean curve of one of its configurations has the target; infinite: it
+    never has. Nothing is interpolated between measurements.
+    """
+    runs = chapter.finished.runs
+    ends = runs.groupby(CONFIGURATION)[["train_s", "psnr_val_db"]].mean().dropna().reset_index()
+    reached = pd.concat([ends, mean_curves(chapter).merge(ends[CONFIGURATION])], ignore_index=True)
+    rows = []
+    for scene, of in ends.groupby("scene"):
+        psnr = reached[reached.scene == scene]
+        for rule, target in _rules(runs[runs.scene == scene], of.psnr_val_db):
+            needed = psnr.train_s.where(psnr.psnr_val_db >= target, math.inf).groupby(psnr.series).min()
+            rows.append({"scene": scene, "target": rule, "dB": target} | needed.to_dict())
+    return pd.DataFrame(rows, columns=["scene", "target", "dB", *sorted(ends.series.unique())])
+
+
+def _rules(runs: pd.DataFrame, ends: pd.Series) -> Iterator[tuple[str, float]]:
+    """Yield a scene's targets: round values between the lowest and the highest result, and the paper's 7dgs value.
+
+    The paper's value is a target only for runs on the paper's images.
+    """
+    for target in round_numbers(ends.min(), ends.max()):
+        yield f"{target:g} dB", target
+    numbers = paper.average(runs.dataset.iloc[0], [runs.scene.iloc[0]], "7dgs")
+    if numbers is not None and all(map(has_images_of_paper, runs.record)):
+        yield "paper's 7dgs", float(numbers.psnr_db)
+
+
+def round_numbers(low: float, high: float) -> list[float]:
+    """Return the values above `low` and up to `high` that are multiples of 2, 1, 0.5, 0.2 or 0.1 dB.
+
+    The step is the largest that gives three values, else 0.1 dB. Round values favour no model.
+    """
+    high, values = min(high, low + WIDEST), []
+    for step in STEPS:
+        values = [round(i * step, 1) for i in range(math.floor(low / step) + 1, math.floor(high / step) + 1)]
+        if len(values) >= FEWEST_TARGETS:
+            break
+    return values
+
+
+@section()
+def quality(chapter: Results, tests: pd.DataFrame) -> Section | None:
+    """Make the table of the seconds to reach targets, and the figure of performance profiles."""
+    table = targets(chapter)
+    if table.empty:
+        return None
+    models = [name for name in table if name not in ("scene", "target", "dB")]
+    table = table.rename(columns={name: f"{name}, s" for name in models})
+    text = (
+        "Targets are round values of PSNR on val between the lowest and the highest run of a scene; on the paper's "
+        "images, the paper's PSNR of 7DGS (best on test) is one too. Seconds are those after which the mean curve on "
+        "val of a model's runs, of any length, first has the target; the runs go on after that. The figure has the "
+        "performance profiles of Dolan and Moré (2002)."
+    )
+    drawn = profiles(table[[f"{name}, s" for name in models]].set_axis(models, axis=1))
+    caption = f"% of {drawn.attrs['targets']} targets reached within a factor of the fastest model's seconds"
+    figures = (Figure(caption, "profile", drawn),) if len(drawn) else ()
+    columns = {f"{name}, s": Column(f"{name}, s", 1) for name in models} | {"dB": Column("dB", 2)}
+    return Section("quality", "Time to quality", text, table, columns, figures)
+
+
+def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
+    """Return for each model the share of targets that it reaches within a factor of the fastest model's seconds.
+
+    Only targets that some model reaches count; a model without a run on a scene does not reach its targets.
+    """
+    solved = seconds[np.isfinite(seconds.min(axis=1))].fillna(math.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = solved.div(solved.min(axis=1), axis=0)
+    ratios = ratios.mask(solved.eq(solved.min(axis=1), axis=0), 1.0)
+    finite = ratios.to_numpy()[np.isfinite(ratios.to_numpy())]
+    end = max(2.0, 1.15 * max(finite, default=1.0))
+    rows = []
+    for name, column in ratios.items():
+        reached = np.sort(column[np.isfinite(column)].to_numpy())
+        at = [1.0, *reached, end]
+        share = [100 * float((reached <= factor).sum()) / len(solved) for factor in at]
+        rows += [{"series": name, "factor": x, "share": y} for x, y in zip(at, share, strict=True)]
+    table = pd.DataFrame(rows, columns=["series", "factor", "share"])
+    table.attrs["targets"] = len(solved)
+    return table if len(solved) else table.iloc[:0]
+
+
+@section()
+def curves(chapter: Results, tests: pd.DataFrame) -> Section | None:
+    """Make the table and the figure of PSNR on val during training, with the settings that most runs share."""
+    main = chapter.of(chapter.runs.main)
+    table = mean_curves(main)
+    if table.empty:
+        return None
+    runs = main.finished.runs.drop_duplicates(CONFIGURATION).set_index(CONFIGURATION)
+    marks = [
+        dict(zip(CONFIGURATION, key, strict=True))
+        | {"letter": letters, "event": ", ".join(EVENTS[letter] for letter in letters), "iteration": step}
+        | {name: _at(curve, step, name) for name in ("train_s", "psnr_val_db")}
+        for key, curve in table.groupby(CONFIGURATION)
+        for step, letters in events(runs.loc[key].record)
+    ]
+    text = (
+        "Mean over seeds, of the runs whose settings most runs share. Do not read shorter trainings off these curves: "
+        f"schedules depend on length. {'; '.join(f'{letter}: {event}' for letter, event in EVENTS.items())}."
+    )
+    drawn = pd.concat([table, pd.DataFrame(marks)], ignore_index=True)
+    figure = Figure("PSNR on val while training", "curves", drawn)
+    return Section("curves", "While training", text, table.drop(columns="series"), figures=(figure,))
+
+
+def _at(curve: pd.DataFrame, step: int, name: str) -> float:
+    """Return a column of a curve at a step, interpolated between the measured points around it."""
+    start = 0.0 if name == "train_s" else curve[name].iloc[0]
+    return float(np.interp(step, [0, *curve.iteration], [start, *curve[name]]))
+
+
+def events(record: Record) -> list[tuple[int, str]]:
+    """Return the steps of training events, such as an opacity reset, with the letters of EVENTS.
+
+    The list is empty if the settings in the record cannot be read.
+    """
+    try:
+        steps = _steps(record)
+    except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
+        return []  # a record of another version of gsbench, with other config keys
+    letters: dict[int, str] = {}
+    for step, letter in sorted(steps):
+        letters[step] = letters.get(step, "") + letter
+    return sorted(letters.items())
+
+
+def _steps(record: Record) -> list[tuple[int, str]]:
+    train = parse(TrainConfig, record.provenance.config["train"], "config")
+    if record.length_choice:
+        train = replace(train, iterations=record.length_choice.kept)
+    schedule = Schedule(train, sh_degree=0, agr=record.effects.refinement)
+    steps = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
+    if record.effects.refinement:
+        steps.append((schedule.scaled(train.refine_from), "A"))
+    if _rates(record).get("lambda", {}).get("start", 0) > 0:
+        steps.append((schedule.scaled(train.lambda_from), "L"))
+    return [(step, letter) for step, letter in steps if step <= train.iterations]
+
+
+def _rates(record: Record) -> dict[str, Any]:
+    """Return the learning rates of a run's model, with model=auto those of the model that it chose."""
+    model = record.provenance.config["model"]
+    if model.get("candidates"):
+        comparison = record.on_demand.comparison if record.on_demand else None
+        choices = {
+            choice.get("name"): choice for key in ("compared", "candidates") for choice in model.get(key, {}).values()
+        }
+        by_screen = model["candidates"]["moving" if record.effects.time else "static"]
+        model = choices.get(comparison.chosen, by_screen) if comparison else by_screen
+    rates: dict[str, Any] = model["lr"]
+    return rates

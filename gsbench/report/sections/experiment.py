@@ -1,0 +1,95 @@
+"""The result table of an experiment: each model on each scene, averages, runs that failed, and the paper's rows."""
+
+from collections.abc import Iterator, Sequence
+
+import pandas as pd
+
+from gsbench.errors import printable
+from gsbench.report import paper, stats
+from gsbench.report.frame import Results, covered
+from gsbench.report.section import COLUMNS, Section, number, section
+
+SHOWN = ("psnr_db", "psnr_moving_db", "psnr_object_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians",
+         "lpips_vgg", "psnr_best_on_test_db")  # fmt: skip
+IF_MEASURED = ("psnr_moving_db", "psnr_object_db", "lpips_vgg", "psnr_best_on_test_db")
+TEXT = (
+    "Mean over seeds ± half the width of the 95 % interval over seeds. Bold: the best mean of a scene and every mean "
+    "that does not differ from it: the interval of their paired difference contains zero, or they look equal. "
+    "“paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a V100, and whose "
+    "LPIPS does not name its network. “paper, other data”: the scene here is a stand-in of the same name, so the two "
+    "rows cannot be compared."
+)
+
+
+@section()
+def experiment(chapter: Results, tests: pd.DataFrame) -> Section:
+    """Make the table; averages are over the scenes that every model has finished."""
+    return table(chapter, [])
+
+
+def table(chapter: Results, columns: Sequence[str]) -> Section:
+    """Make the table with the given columns of `runs`, or with those that the runs have if none is given."""
+    runs, ok = chapter.runs, chapter.finished.runs
+    names = list(columns) or [name for name in SHOWN if name not in IF_MEASURED or ok[name].notna().any()]
+    parts = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
+    failed = runs[runs.status != "ok"]
+    labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
+    parts.append(pd.DataFrame({"scene": failed.scene, "label": labels}))
+    scenes = covered(runs)
+    if runs.scene.nunique() > 1 and scenes:
+        where = f"average over {len(scenes)} of {runs.scene.nunique()} scenes"
+        average = _means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where)
+        parts.append(average[[name for name in average if not name.endswith(" ±")]])
+    rows = pd.concat(parts, ignore_index=True)
+    rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
+    order = ["scene", "label", *(c for name in names for c in (name, f"{name} ±", f"{name} rank")), "seeds"]
+    rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
+    title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])}"
+    return Section("experiment", f"Results: {title}", TEXT, rows, notes=tuple(_notes(chapter)))
+
+
+def _means(runs: pd.DataFrame, names: list[str]) -> pd.DataFrame:
+    """Return the means of each row of the table with their ranks."""
+    rows = stats.means(runs, ["label"], names)
+    for name in names:
+        if better := COLUMNS[name].better:
+            digits = COLUMNS[name].digits
+            ranks = stats.ranks(runs, "label", name, better == "higher", 1 if digits is None else digits)
+            rows[f"{name} rank"] = rows.label.map(ranks)
+    return rows
+
+
+def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> Iterator[pd.DataFrame]:
+    """Yield the 7DGS paper's rows, each with the index of the measured row of the same scenes and model above it."""
+    runs = runs[runs.model.isin(list(paper.MODELS)) & (runs.effect_refinement == runs.model.map(paper.MODELS))]
+    first = runs.drop_duplicates(["scene", "label"]).set_index(["scene", "label"])
+    for i, scene, label in zip(rows.index, rows.scene, rows.label, strict=True):
+        scenes = [scene] if scene in set(runs.scene) else averaged
+        if not scenes or not all((name, label) in first.index for name in scenes):
+            continue  # a failed run, or a model of the same name that differs from the paper's in AGR
+        of = first.loc[[(name, label) for name in scenes]]
+        named = of.protocol_paper_dataset.iloc[0] if "protocol_paper_dataset" in of else None
+        numbers = paper.average(str(named), scenes, of.model.iloc[0])
+        if numbers is not None:
+            title = "paper" if (of.dataset == named).all() else "paper, other data"
+            yield pd.DataFrame([numbers.to_dict() | {"scene": scene, "label": title}], index=[i])
+
+
+def _notes(chapter: Results) -> Iterator[str]:
+    """Yield why runs failed and metrics are missing, and how many pixels PSNR of moving pixels and objects is over."""
+    for run in chapter.runs[chapter.runs.status != "ok"].itertuples():
+        yield printable(f"{run.scene}, {run.label} seed {run.seed} {run.status}: {run.reason}")
+    ok = chapter.finished.runs
+    lacks = pd.DataFrame([(metric, why, run.scene) for run in ok.itertuples() for metric, why in run.missing.items()],
+                         columns=["metric", "why", "scene"])  # fmt: skip
+    for (metric, why), rows in lacks.groupby(["metric", "why"]):
+        column = COLUMNS.get(metric) or COLUMNS.get(f"{metric}_db")
+        scenes = "" if set(rows.scene) == set(ok.scene) else f" ({', '.join(sorted(set(rows.scene)))})"
+        yield printable(f"{column.title if column else metric}: {why}{scenes}")
+    for scene, runs in ok.groupby("scene"):
+        regions = {name: region for record in runs.record if record for name, region in record.regions.items()}
+        for name, region in sorted(regions.items()):
+            share = number(100 * region.share, 1)
+            yield printable(
+                f"{scene}: PSNR {name} is over {share} % of the pixels of {region.views} views, from {region.source}"
+            )

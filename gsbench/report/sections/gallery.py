@@ -1,0 +1,182 @@
+"""Images of models beside the ground truth, cut from the files of runs and small enough for a page."""
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from gsbench.errors import printable
+from gsbench.measure.images import GAP, HEADER, Pixels
+from gsbench.measure.record import Record, ViewScore
+from gsbench.report.frame import Results
+from gsbench.report.section import EMPTY, Section, number, section
+
+FILE_NAME = "pictures.png"
+BUDGET = 700_000  # bytes of all images as text, which leaves a page below 2 MB
+IMAGES_BUDGET = 300_000  # bytes of the images of `images`
+IMAGE_SIDE = 960  # pixels
+# Longest side, quality and views of a scene, which are tried until the images fit.
+STEPS = ((400, 92, 3), (400, 85, 3), (320, 80, 3), (256, 75, 3), (256, 75, 1), (160, 70, 1), (96, 60, 1), (48, 50, 1))
+
+Strip = list[tuple[Pixels, Pixels, Pixels]]  # for each view: render, ground truth, error
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image with its caption and its size in pixels; the source is a data URL."""
+
+    caption: str
+    source: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class View:
+    """The images of one view as data URLs: the ground truth, and the render and the error image of each model."""
+
+    scene: str
+    name: str
+    truth: str
+    render: dict[str, str]
+    error: dict[str, str]
+    scores: dict[str, str]  # PSNR of each model in this view, and over its moving pixels and those of objects
+    width: int
+    height: int
+
+    @property
+    def size(self) -> int:
+        """Return the bytes of all images."""
+        return len(self.truth) + sum(map(len, (*self.render.values(), *self.error.values())))
+
+
+@section()
+def gallery(chapter: Results, tests: pd.DataFrame) -> Section | None:
+    """Make the section of images: example views of the first seed of each model, with the settings that most share."""
+    strips: dict[str, dict[str, tuple[Record, Strip]]] = {}
+    runs = chapter.finished.runs
+    for run in runs[runs.main].sort_values(["scene", "seed", "model"], kind="stable").itertuples():
+        models = strips.setdefault(run.scene, {})
+        if run.model not in models and (strip := cut(run.path.parent / FILE_NAME)):
+            models[run.model] = run.record, strip
+    for side, quality, most in STEPS:
+        shown = [v for scene, models in strips.items() if models for v in _views(scene, models, side, quality, most)]
+        if sum(view.size for view in shown) <= BUDGET:
+            break
+    while sum(view.size for view in shown) > BUDGET:
+        shown.pop()
+    if not shown:
+        return None
+    text = (
+        "Compare two images of a view: drag the handle, or use the arrow keys. Errors are averaged over RGB, from "
+        "black (0) to bright yellow (0.2 and more). PSNR is that of the view."
+    )
+    return Section("gallery", "Pictures", text, pd.DataFrame(), images=tuple(shown))
+
+
+def images(files: list[tuple[str, Path | None]]) -> list[Image]:
+    """Encode images with captions, at most IMAGES_BUDGET bytes in total; files that cannot be read are left out.
+
+    If the images do not fit, they are compressed more, then the last ones are left out.
+    """
+    read = [(caption, cv2.imread(str(path), cv2.IMREAD_COLOR)) for caption, path in files if path]
+    pixels = [(caption, np.asarray(data, np.uint8)) for caption, data in read if data is not None]
+    for quality in (90, 75, 60):
+        shown = [Image(printable(c)[:200], _encode(p, IMAGE_SIDE, quality), p.shape[1], p.shape[0]) for c, p in pixels]
+        if sum(len(image.source) for image in shown) <= IMAGES_BUDGET:
+            break
+    while sum(len(image.source) for image in shown) > IMAGES_BUDGET:
+        shown.pop()
+    return shown
+
+
+def cut(path: Path) -> Strip:
+    """Cut an image file into rows of (render, ground truth, error), and undo the enlargement of small images.
+
+    The list is empty if there is no file or if it has another layout.
+    """
+    data = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if data is None:
+        return []
+    image = np.asarray(data, np.uint8)
+    width = (image.shape[1] - 2 * GAP) // 3
+    body = image[HEADER:]
+    height = _row_height(body)
+    if width < 1 or height < 1 or 3 * width + 2 * GAP != image.shape[1]:
+        return []
+    rows = []
+    for top in range(0, len(body) - height + 1, height + GAP):
+        line = body[top : top + height]
+        parts = [line[:, left : left + width] for left in (0, width + GAP, 2 * (width + GAP))]
+        step = _enlargement(parts)
+        render, truth, error = (part[::step, ::step] for part in parts)
+        rows.append((render, truth, error))
+    return rows
+
+
+def _row_height(body: Pixels) -> int:
+    """Return the height of a row of images; a grey band separates it from the row below."""
+    grey = (body == body[:, :1, :1]).all((1, 2))
+    inside = [y for y in range(1, len(body) - GAP) if grey[y : y + GAP].all() and (body[y : y + GAP] == 200).all()]
+    return inside[0] if inside else len(body)
+
+
+def _enlargement(parts: list[Pixels]) -> int:
+    """Return the integer factor by which images were enlarged without interpolation; 1 if they were not."""
+    for factor in range(8, 1, -1):
+        if all(not (p.shape[0] % factor or p.shape[1] % factor) and _has_blocks(p, factor) for p in parts):
+            return factor
+    return 1
+
+
+def _has_blocks(image: Pixels, factor: int) -> bool:
+    small = image[::factor, ::factor]
+    return bool((small.repeat(factor, 0).repeat(factor, 1) == image).all())
+
+
+def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quality: int, most: int) -> list[View]:
+    """Encode the views that the image files of all models contain."""
+    shared = min(len(strip) for _, strip in models.values())
+    first, strip = next(iter(models.values()))
+    shown = []
+    for i in range(min(shared, most)):
+        encode = lambda kind: {m: _encode(s[i][kind], side, quality) for m, (_, s) in sorted(models.items())}  # noqa: B023, E731
+        height, width = strip[i][1].shape[:2]
+        spaced = _spaced(first, shared)
+        name = printable(spaced[i].name)[:60] if i < len(spaced) else f"view {i + 1}"
+        scores = {model: _score(record, len(rows), i) for model, (record, rows) in models.items()}
+        shown.append(
+            View(scene, name, _encode(strip[i][1], side, quality), encode(0), encode(2), scores, width, height)
+        )
+    return shown
+
+
+def _spaced(record: Record, rows: int) -> list[ViewScore]:
+    """Return the views in an image file, which are evenly spaced among the evaluated views."""
+    return record.per_view[:: max(1, len(record.per_view) // max(1, rows))][:rows]
+
+
+def _score(record: Record, rows: int, i: int) -> str:
+    """Return the PSNR of row `i` of an image file as text; a region is left out if no view of the run has it."""
+    views = _spaced(record, rows)
+    if i >= len(views) or views[i].psnr is None:
+        return ""
+    regions = {"moving": views[i].psnr_moving, "object": views[i].psnr_object}
+    texts = [
+        f"{name} {EMPTY if value is None else number(value, 2)}"
+        for name, value in regions.items()
+        if name in record.regions
+    ]
+    return ", ".join([f"PSNR {number(views[i].psnr or 0.0, 2)} dB", *texts])
+
+
+def _encode(image: Pixels, side: int, quality: int) -> str:
+    """Encode an image as WebP in a data URL; its longer side is reduced to at most `side` pixels."""
+    scale = side / max(image.shape[:2])
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"

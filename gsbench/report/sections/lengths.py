@@ -1,0 +1,49 @@
+"""PSNR after trainings of several lengths, and after the length that `train.lengths` would keep on val."""
+
+import pandas as pd
+
+from gsbench.report.frame import Results, without
+from gsbench.report.section import Column, Section, section
+
+FEWEST = 3  # lengths of a table
+
+
+@section()
+def lengths(chapter: Results, tests: pd.DataFrame) -> Section | None:
+    """Make the table of models that differ in nothing but their lengths."""
+    runs = chapter.finished.runs
+    runs = runs[(runs.variant.map(lambda variant: without(variant, "iterations")) == "") & runs.iterations.notna()]
+    table = by_length(runs)
+    if len(table.columns) < FEWEST + 2 or table.empty:
+        return None
+    text = (
+        "Each length is a training of its own. “kept”: the lengths are tried from the shortest until PSNR on val no "
+        "longer rises, and the one before is kept, as `train.lengths` does. Mean over the seeds that have all lengths."
+    )
+    means = table.groupby(["scene", "model"]).mean().reset_index()
+    columns = {name: Column(name, 2) for name in table} | {"tried": Column("iterations tried", 0)}
+    ranked = _ranked(means, [name for name in table if name not in ("kept", "tried")])
+    return Section("lengths", "How long to train", text, ranked, columns)
+
+
+def by_length(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return PSNR of each scene, model and seed after each length, and after the length that val keeps ("kept").
+
+    The column "tried" has the iterations of all trainings that `train.lengths` tries.
+    """
+    runs = runs.drop_duplicates(["scene", "model", "seed", "iterations"])
+    wide = runs.pivot(index=["scene", "model", "seed"], columns="iterations", values=["psnr_db", "psnr_val_db"])
+    if wide.empty:
+        return pd.DataFrame()
+    whole = wide.notna().all(axis=1)
+    psnr, val = wide.loc[whole, "psnr_db"], wide.loc[whole, "psnr_val_db"]
+    rises = (val.diff(axis=1).iloc[:, 1:] > 0).cumprod(axis=1).sum(axis=1).astype(int)
+    kept = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
+    tried = [sum(psnr.columns[: rise + 2]) for rise in rises]
+    return psnr.rename(columns="{:,.0f}".format).rename_axis(columns=None).assign(kept=kept, tried=tried)
+
+
+def _ranked(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
+    """Mark the highest values of each row as they are shown."""
+    shown = table[names].round(2)
+    return table.join(shown.eq(shown.max(axis=1), axis=0).astype(int).add_suffix(" rank"))

@@ -1,0 +1,148 @@
+"""How the runs were measured: every setting with its values, warnings where compared runs differ, and all runs."""
+
+import shlex
+from collections.abc import Iterator
+
+import pandas as pd
+
+from gsbench.errors import printable
+from gsbench.measure.exact_views import sentence
+from gsbench.measure.record import Record
+from gsbench.report.frame import Results, without
+from gsbench.report.section import Section, number, section
+
+WARNING = "WARNING: compared runs differ"
+SILENT = {"resize": "area", "repaired": "none", "val_every": "none"}  # what a record means that lacks it
+OF_ALL = {"machine": "machine", "commit": "git_commit", "versions": "versions"}  # the same for all scenes
+# The scenes on which gsbench's own settings were chosen; what holds on them may not hold on others.
+TUNED = frozenset((
+    "bouncingballs", "cloud", "moving-matte", "static-glossy", "static-matte", "suzanne",  # conf/exp/tuning.yaml
+    "lego", "static-lego", "trex",
+    "scene1_close_proximity", "scene4_occlusion", "scene7_deformation", "scene10_texture",
+))  # fmt: skip
+TEXT = (
+    "PSNR is over all pixels and channels of a view, after the final iteration, averaged over views; SSIM is that of "
+    "scikit-image (Gaussian window, data_range 1). FPS is 1000 / the median milliseconds of a frame, with slicing and "
+    "AGR. Minutes of training are without evaluation. Times of other machines than that of most runs are left out."
+)
+
+
+@section()
+def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
+    """Make the table of settings; a setting that differs between the runs of a scene, and is no variant, is a warning.
+
+    It describes the finished runs whose settings most runs share. If no run finished, it describes the failed ones
+    without a warning, because they may have stopped before their data was known.
+    """
+    ok = chapter.finished.runs
+    runs = ok[ok.main] if len(ok) else chapter.runs
+    named = {name.removeprefix("protocol_"): name for name in sorted(runs) if name.startswith("protocol_")}
+    named.pop("paper_dataset", None)
+    named |= {"iterations": "iterations", "data": "data_hash"} | OF_ALL
+    rows = [row for setting, column in named.items() for row in _setting(runs, setting, column, warn=len(ok) > 0)]
+    rows += [[*fact, ""] for fact in _facts(runs)]
+    table = pd.DataFrame(rows, columns=["setting", "value", "scenes", "runs", "note"])
+    table = table.sort_values("note", ascending=False, kind="stable").reset_index(drop=True)
+    return Section("protocol", "Protocol, machine, seeds", TEXT, table, notes=tuple(_notes(runs)))
+
+
+def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> Iterator[list[object]]:
+    """Yield a row for each value of a setting, with its scenes and its number of runs."""
+    silent = SILENT.get(setting, "none" if runs[column].isna().all() else "not recorded")
+    values = runs[column].map(lambda value: silent if value is None or value != value else _short(setting, value))
+    compared = runs.variant.map(lambda variant: without(variant, setting) == variant)
+    by_scene = values[compared].groupby(runs.scene[compared]).nunique()
+    is_mixed = (by_scene > 1).any() or (setting in OF_ALL and values.nunique() > 1)
+    for value, of in runs.groupby(values):
+        where = "all" if of.scene.nunique() == runs.scene.nunique() else ", ".join(sorted(of.scene.unique()))
+        yield [printable(setting), value, where, len(of), WARNING if is_mixed and warn else ""]
+
+
+def _short(setting: str, value: object) -> str:
+    """Return a value as text: a number of iterations without decimals, and the first digits of a hash."""
+    text = printable(f"{value:g}" if isinstance(value, float) and value < 1e15 else value)
+    if setting == "iterations":
+        text = number(float(text), 0)
+    digits, *dirty = text.partition("-") if setting == "commit" else (text, "")
+    return digits[:12] + "".join(dirty) if setting in ("commit", "data") and " " not in text else text
+
+
+def _facts(runs: pd.DataFrame) -> Iterator[tuple[str, str, str, int]]:
+    """Yield what else the numbers depend on: name, value, scenes and number of runs."""
+    yield "seeds", ", ".join(map(str, sorted(runs.seed.unique()))), "all", len(runs)
+    timed = runs[runs.load.notna() & (runs.machine == runs.timed_on)]
+    if len(timed):
+        yield "load of the machine, with the run itself", _span(timed.load, 1), "all", len(timed)
+    rounded = runs[runs.psnr_float32_db.notna()]
+    if len(rounded):
+        yield (
+            "most that float32 changes PSNR of a view, dB",
+            f"{rounded.psnr_float32_db.max():.1e}",
+            "all",
+            len(rounded),
+        )
+    early = runs[[bool(r.stop and r.stop.kept < r.stop.iteration) for r in runs.record]]
+    if len(early):
+        kept = pd.Series([r.stop.kept for r in early.record])
+        yield "measured at the best iteration on val (train.patience)", _span(kept, 0), _scenes(early), len(early)
+    averaged = runs[runs.averaged > 0]
+    if len(averaged):
+        yield (
+            "iterations of averaged parameters (train.average_from)",
+            _span(averaged.averaged, 0),
+            _scenes(averaged),
+            len(averaged),
+        )
+    chosen = runs[[r.length_choice is not None for r in runs.record]]
+    if len(chosen):
+        kept = pd.Series([r.length_choice.kept for r in chosen.record])
+        yield (
+            "iterations chosen on val; times are those of all lengths (train.lengths)",
+            _span(kept, 0),
+            _scenes(chosen),
+            len(chosen),
+        )
+
+
+def _span(values: pd.Series, digits: int) -> str:
+    """Return the least and the largest number, or one of them if they look alike."""
+    return " to ".join(dict.fromkeys(number(float(value), digits) for value in (values.min(), values.max())))
+
+
+def _scenes(runs: pd.DataFrame) -> str:
+    return ", ".join(sorted(runs.scene.unique()))
+
+
+def _notes(runs: pd.DataFrame) -> Iterator[str]:
+    """Yield what a reader must know of some scenes and commits."""
+    if runs.git_commit.fillna("").str.endswith("-dirty").any():
+        yield "WARNING: files were changed after the commit (-dirty), which does not reproduce these numbers."
+    if runs.seed.nunique() == 1:
+        yield "An interval (±) needs several seeds, such as seed=0,1,2."
+    if "protocol_eval_split" in runs and ((runs.scene == "lego") & (runs.protocol_eval_split == "val")).any():
+        yield "lego is measured on val: the test split of D-NeRF's lego contradicts its motion."
+    if tuned := sorted(TUNED & set(runs.scene)):
+        yield f"gsbench's own settings were tuned on {', '.join(tuned)} (docs/tuning.md)."
+    if exact := sorted({view for r in runs.record for view in r.exact}):
+        yield printable(sentence(exact))
+
+
+@section()
+def runs(chapter: Results, tests: pd.DataFrame) -> Section:
+    """Make the table of every run, with why it failed and the command that repeats it."""
+    of = chapter.runs
+    table = of[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
+    table = table.assign(load=of.load.where(of.machine == of.timed_on),
+                         commit=[_short("commit", value or "not recorded") for value in of.git_commit],
+                         command=of.record.map(command), reason=of.reason)  # fmt: skip
+    text = "A time is empty if the run was on another machine than most."
+    table.insert(0, "run", [record.path.as_posix() for record in of.record])
+    table = table.sort_values("status", key=lambda status: status == "ok", kind="stable")
+    table = table if (of.status != "ok").any() else table.drop(columns="reason")
+    return Section("runs", "Every run", text, table.reset_index(drop=True), folded=True)
+
+
+def command(record: Record) -> str:
+    """Return the command that repeats a run; "" if its record does not hold it."""
+    words = " ".join(shlex.quote(printable(word)) for word in record.overrides)
+    return f"python -m gsbench {words}" if words else ""
