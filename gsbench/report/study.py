@@ -12,10 +12,9 @@ import json
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from gsbench.errors import InputError, printable
 from gsbench.measure import record as files
@@ -45,7 +44,7 @@ def write(records: Iterable[Record], folder: Path) -> None:
     curves: list[Row] = []
     records = list(records)
     for i, record in enumerate(records):
-        plain = msgspec.to_builtins(record)
+        plain = asdict(record)
         scores, points = plain.pop("per_view"), plain.pop("curve")
         runs.append({"run": str(i)} | {name: cell(value) for name, value in _flat(plain)})
         views += [

@@ -9,7 +9,7 @@ from gsbench import kernels, models
 from gsbench.measure import record as records
 from gsbench.measure.images import Pixels, write_png
 from gsbench.measure.provenance import provenance
-from gsbench.measure.record import Effects, OnDemand, Record
+from gsbench.measure.record import Effects, OnDemand, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
@@ -130,7 +130,7 @@ class Attempt:
             except OSError as error:
                 print(f"{self.this.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
 
-    def describe(self, status: str, reason: str | None) -> Record:
+    def describe(self, status: Status, reason: str | None) -> Record:
         """Return a record of the run without measurements: its settings, its machine and its status.
 
         Args:

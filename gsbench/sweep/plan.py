@@ -10,15 +10,16 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gsbench.config_roles import repeating
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.schema import MOST, parse
+from gsbench.measure.schema import parse
 from gsbench.reading import MAX_JSON, parse_json, read_file
 
 FOLDER, FILE_NAME, ENDED, JOBS = ".sweep", "plan.json", "ended", ".submitit"
+MOST_RUNS = 100_000
 Identity = tuple[str, ...]
 
 
@@ -27,8 +28,7 @@ class Plan:
     """The runs that one command requested, and the process that launches them."""
 
     launcher: str  # of Hydra: basic or submitit_slurm
-    # the overrides of each run, in the order of the tasks of a job array
-    runs: list[list[str]] = field(metadata={MOST: 100_000})
+    runs: list[list[str]]  # the overrides of each run, in the order of the tasks of a job array
     hydra: list[str]  # overrides of Hydra's own config
     cwd: str  # the folder of the command; relative paths in overrides start there
     host: str
@@ -65,7 +65,7 @@ def read(path: Path) -> Plan:
     Raises:
         InputError: the file is not valid; the message names the file and the field.
     """
-    return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path))
+    return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path), MOST_RUNS)
 
 
 def find(experiment: Path) -> list[Path]:

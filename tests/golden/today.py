@@ -19,8 +19,8 @@ from omegaconf import OmegaConf
 from tiny_run import run_here
 
 from gsbench.config import CONF, register_schema
-from gsbench.measure.record import Record
 from gsbench.config_roles import training_hash
+from gsbench.measure.record import Record
 from gsbench.report import against_table, frontier, paper_tables
 from gsbench.report.against import compare
 from gsbench.report.comparisons import comparisons

@@ -135,7 +135,7 @@ def test_a_record_with_endless_entries_is_refused(harm: Callable[[dict[str, Any]
     record.read(path)
     harm(plain, 20_000)
     path.write_text(json.dumps(plain))
-    with pytest.raises(InputError, match=r"expected at most [\d,]+ entries, got 20,\d\d\d"):
+    with pytest.raises(InputError, match=r"at most 10,000 entries, got 20,000|(array|object) of length <= \d+"):
         record.read(path)
 
 

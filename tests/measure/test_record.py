@@ -22,7 +22,7 @@ from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance, versions
-from gsbench.measure.record import METRICS, Cost, Effects, Gate, OnDemand, Provenance, Record, ViewScore
+from gsbench.measure.record import METRICS, Cost, Effects, Provenance, Record, ViewScore
 from gsbench.measure.speed import RenderTimes
 from gsbench.sweep import traces
 
@@ -58,11 +58,10 @@ def refused(path: Path, *words: str) -> None:
         assert word in message
 
 
-numbers = st.floats(allow_nan=False, allow_infinity=False)
 measured = st.floats(-1e100, 1e100)
 texts = st.text(st.characters(codec="utf-8"), max_size=20)
 plain = st.recursive(
-    st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | numbers | texts,
+    st.none() | st.booleans() | st.integers(-(2**63) + 1, 2**63 - 1) | measured | texts,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
     max_leaves=8,
 )
@@ -123,9 +122,9 @@ def test_a_curve_of_too_many_points_is_refused(tmp_path):
     many["curve"] = [[i, float(i), 20.0] for i in range(100_000)]
     path.write_text(json.dumps(many))
     started = time.process_time()
-    refused(path, "curve: expected at most 10,000 points, got 100,000")
+    refused(path, "curve: expected array of length <= 10000")
     assert time.process_time() - started < 2
-    with pytest.raises(InputError, match="at most 10,000"):
+    with pytest.raises(InputError, match="curve: expected array"):
         files.write(make(curve=[Point(i, float(i), 20.0) for i in range(10_001)]), path)
 
 
@@ -154,7 +153,7 @@ def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):
         ({"curve": [Point(2, 1.0, None), Point(1, 2.0, None)]}, "curve"),
         ({"version": 2}, "version"),
         ({"seed": "0"}, "seed"),
-        ({"effects": {"time": True}}, "effects.direction"),
+        ({"effects": {"time": True}}, "effects: object missing required field direction"),
     ],
 )
 def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
@@ -170,16 +169,16 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
     [
         (["surprise"], 1, ["surprise", "unknown key"]),
         (["scnee"], "x", ["Did you mean 'scene'"]),
-        (["cost", "render_ms", "p50"], "2", ["cost.render_ms.p50", "a finite number", "'2'"]),
+        (["cost", "render_ms", "p50"], "2", ["cost.render_ms.p50", "expected float, got str"]),
         (["cost", "render_ms", "p50"], True, ["cost.render_ms.p50"]),
-        (["cost", "num_gaussians"], 1.0, ["cost.num_gaussians", "an integer"]),
+        (["cost", "num_gaussians"], 1.0, ["cost.num_gaussians", "expected int, got float"]),
         (["seed"], 2**63, ["seed"]),
-        (["seed"], True, ["seed", "an integer"]),
-        (["effects", "time"], 1, ["effects.time", "true or false"]),
+        (["seed"], True, ["seed", "expected int, got bool"]),
+        (["effects", "time"], 1, ["effects.time", "expected bool, got int"]),
         (["per_view", 0, "ssim"], [], ["per_view[0].ssim"]),
-        (["curve", 1], [1, 2], ["curve[1]", "iteration, seconds, psnr_val"]),
+        (["curve", 1], [1, 2], ["curve[1]", "expected array of length 3, got 2"]),
         (["curve", 1, 0], 0.5, ["curve[1][0]"]),
-        (["provenance", "versions", "python"], None, ["provenance.versions.python"]),
+        (["provenance", "versions", "python"], None, ["provenance.versions", "expected str, got null"]),
         (["model"], "\ud800", ["model", "Unicode"]),
         (["version"], 2, ["version", "expected 1"]),
         (["version"], True, ["version"]),
@@ -293,22 +292,6 @@ def test_any_json_in_any_place_reads_or_is_refused(tmp_path, data, value):
         files.read(path)
     except InputError as error:
         assert str(path) in str(error)  # noqa: PT017  # reading well is fine, too
-
-
-def test_a_gate_of_older_names_is_read_as_before(tmp_path: Path) -> None:
-    """Catches effect sets and orders of colour that were renamed and are no longer found in records of before."""
-    kinds = {"refined": 5, "conditioned": 4, "time": 3, "direction": 2, "static": 1, "removed": 9}
-    gate = Gate(0.01, 0.04, 0.03, kinds, {"degree 3": 15}, 300, 200)
-    path = tmp_path / files.FILE_NAME
-    files.write(make(on_demand=OnDemand(gates=[gate])), path)
-    text = path.read_text()
-    for now, before in (("conditioned", "sliced"), ("static", "still"), ("orders", "levels")):
-        assert text.count(f'"{now}":') == 1
-        text = text.replace(f'"{now}":', f'"{before}":')
-    path.write_text(text)
-    (found,) = files.read(path).on_demand.gates
-    assert found == gate
-    assert list(found.rows) == list(kinds)
 
 
 def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):

@@ -103,7 +103,7 @@ def packed(name: str, text: bytes) -> Callable[[Path], object]:
         (edited("run,", "seed,"), "two columns have one name"),
         (edited("\n0,", "\n0,1,"), "expected a CSV table"),
         (edited(",ok,", ",fine,"), "run 0: status"),
-        (edited("psnr_db", "psnr_dB"), "run 0: 'psnr_dB'"),
+        (edited("psnr_db", "psnr_dB"), "run 0: the file: unknown key 'psnr_dB'"),
         (edited("protocol_background", "protocol"), "run 0"),
     ],
 )
