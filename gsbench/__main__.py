@@ -73,14 +73,14 @@ def run_command() -> None:
     if "--version" in sys.argv[1:]:  # Hydra would print its own
         print(f"gsbench {__version__}")
         return
-    if sys.argv[1:2] != ["doctor"] and {"-h", "--help"} & set(sys.argv[1:]):  # Hydra would compose a config first
-        print(usage.text(sys.argv[1:]), end="")
-        return
     if sys.argv[1:2] == ["doctor"]:
         from gsbench.doctor import main as doctor
 
         sys.exit(doctor(sys.argv[2:]))
     try:
+        if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra would compose a config first
+            print(usage.text(sys.argv[1:]), end="")
+            return
         sys.argv[1:] = expand(sys.argv[1:])
         check_words(sys.argv[1:])
         broken, is_refused = see_through(entry, started)

@@ -26,15 +26,15 @@ class DataConfig:
     """Describe a data set; an experiment (`+exp=`) sets these keys."""
 
     dataset: str = key(REQUIRED, "name in tables", role="measuring")
-    paper_dataset: str | None = key(None, "name in the paper's tables", role="measuring")
-    root: str = key(REQUIRED, "folder of the scenes' folders, or pkg://MODULE", role="place")
+    paper_dataset: str | None = key(None, "name in the paper", role="measuring")
+    root: str = key(REQUIRED, "folder of scenes, or pkg://MODULE", role="place")
     published: str = key("", "where to get the data", role="place")
     scenes: list[str] = key([], "scenes of scene=all", role="place")
-    repair: list[str] | None = key(None, "damaged images replaced by the frame before (Technicolor)")
+    repair: list[str] | None = key(None, "damaged images, replaced by the frame before")
     background: str = key("black", "background of images", choices=("black", "white"))
     initial_lambda: float = key(0.5, "initial lambda_t and lambda_d of 7DGS")
-    initial_points: int = key(100_000, "random points, if the data have none", low=4)
-    initial_half_width: float | None = key(1.3, "of the cube of random points; null: the cameras' common frustum",
+    initial_points: int = key(100_000, "random points, where data have none", low=4)
+    initial_half_width: float | None = key(1.3, "of the cube of random points; null: what all cameras see",
                                            low=1e-6, high=1e6)  # fmt: skip
 
 
@@ -43,20 +43,20 @@ class SceneConfig:
     """Choose one scene of the data set."""
 
     name: str = key(REQUIRED, "folder in data.root")
-    released_as: str | None = key(None, "folder in the published data, if another", role="place")
+    released_as: str | None = key(None, "folder in the published data, if different", role="place")
     downscale: int = key(1, "divisor of the image size", low=1, high=10_000)
-    resize: str | None = key(None, "its filter; null: area; pillow: bicubic on 8 bits, as 3DGS", choices=("pillow",))
+    resize: str | None = key(None, "its filter; null: area; pillow: bicubic, 8 bits, as 3DGS", choices=("pillow",))
     eval_split: str = key("test", "evaluated views; val for D-NeRF lego", choices=("test", "val"))
-    val_every: int | None = key(None, "every n-th training view is of val, where the data have no val", low=2)
-    frames: list[int] | None = key(None, "first and last frame (Technicolor); null: all")
+    val_every: int | None = key(None, "every n-th training view becomes val", low=2)
+    frames: list[int] | None = key(None, "first and last frame; null: all")
 
 
 @dataclass
 class InitConfig:
     """Start the training from the Gaussians of a PLY file: `+init.ply=FILE`."""
 
-    ply: str | None = key(None, "trained 3D Gaussians in the format of 3DGS", role="place")
-    ply_sha256: str | None = key(None, "hash of that file; computed if not set")
+    ply: str | None = key(None, "trained Gaussians of 3DGS", role="place")
+    ply_sha256: str | None = key(None, "its hash; null: computed")
 
 
 @dataclass
@@ -65,54 +65,54 @@ class LearningRate:
 
     start: float = key(REQUIRED, "at the first step", low=0)
     end: float | None = key(None, "at the last step; null: constant", low=0)
-    per_extent: bool = key(False, "multiplied by the radius of the scene's cameras")
-    per_run: bool = key(False, "multiplied by sqrt(recipe_iterations / iterations)")
+    per_extent: bool = key(False, "times the radius of the cameras")
+    per_run: bool = key(False, "times sqrt(recipe_iterations / iterations)")
 
 
 @dataclass
 class ModelConfig:
     """Choose the model and its settings."""
 
-    name: str = key(REQUIRED, "name of the model's class")
-    module: str | None = key(None, "Python module of your own model")
+    name: str = key(REQUIRED, "the model's class")
+    module: str | None = key(None, "Python module of your model")
     published_with_agr: bool = key(False, "whether the published method has AGR")
     agr: bool = key("${.published_with_agr}", "default of the key agr")
     agr_octaves: int = key(4, "octaves of AGR's time encoding", low=0, high=32)
     sh_degree: int = key(3, "SH degree", low=0, high=3)
     min_opacity: float = key(0.005, "Gaussians of lower opacity are pruned", low=0, high=0.25)  # resets: to twice it
     gate: str = key("off", "default of effects.gate", role="place", choices=("off", "end", "both"))
-    candidates: dict[str, Any] = key({}, "choices of model=auto")
-    compared: dict[str, Any] = key({}, "more choices of it with effects.compare=true", needs="effects.compare")
-    lr: dict[str, LearningRate] = key({}, "learning rate of each parameter group")
-    options: dict[str, Any] = key({}, "arguments of the model's class")
+    candidates: dict[str, Any] = key({}, "of model=auto")
+    compared: dict[str, Any] = key({}, "more of them, with effects.compare=true", needs="effects.compare")
+    lr: dict[str, LearningRate] = key({}, "of each parameter group")
+    options: dict[str, Any] = key({}, "arguments of the class")
 
 
 @dataclass
 class DensifyConfig:
-    """Set the adaptive density control of 3DGS (section 5.2). All steps but `every` scale with `train.iterations`."""
+    """Set the density control. All steps but `every` scale with `train.iterations`."""
 
-    kind: str = key("gradient", "of 3DGS, by relocation, or of FastGS",
+    kind: str = key("gradient", "rule: 3DGS, 3DGS-MCMC, FastGS",
                     choices=("gradient", "mcmc", "multiview"), absent="gradient")  # fmt: skip
-    start: int = key(500, "step after which densification starts", low=0)
-    stop: int = key(15_000, "step at which densification ends", low=0)
-    every: int = key(100, "least number of steps between two rounds", low=1)
-    rounds: int | None = key(None, "most rounds of a run; null: 36", low=1)
-    reset_every: int = key(3_000, "steps between two opacity resets", low=1)
-    grad_threshold: float = key(2e-4, "least mean gradient of a 2D mean, in units of half the image", low=0)
+    start: int = key(500, "first step", low=0)
+    stop: int = key(15_000, "last step", low=0)
+    every: int = key(100, "least steps between two rounds", low=1)
+    rounds: int | None = key(None, "most rounds; null: 36", low=1)
+    reset_every: int = key(3_000, "steps between opacity resets", low=1)
+    grad_threshold: float = key(2e-4, "least mean gradient of a 2D mean, per half image", low=0)
     clone_below: float = key(0.01, "clone if the largest scale is below this share of the extent, else split", low=0)
-    prune_above: float = key(0.1, "prune if it is above this share, after an opacity reset", low=0)
-    thin_to: float | None = key(None, "share of Gaussians that stay after `stop`, by blend weight", low=1e-3, high=1)
-    max_gaussians: int | None = key(None, "most Gaussians at full resolution; null: one for 64 training pixels", low=4)
-    noise: float = key(5e5, "of mcmc: factor of the noise on means; 0: none", low=0, absent=5e5)
+    prune_above: float = key(0.1, "prune above this share, after an opacity reset", low=0)
+    thin_to: float | None = key(None, "share of Gaussians kept after `stop`, by blend weight", low=1e-3, high=1)
+    max_gaussians: int | None = key(None, "most Gaussians; null: one for 64 training pixels", low=4)
+    noise: float = key(5e5, "of mcmc: factor of noise on means", low=0, absent=5e5)
 
 
 @dataclass
 class PenaltyConfig:
     """Set one loss term."""
 
-    weight: float = key(0.0, "factor of the term; 0: none", low=0, absent=0)
+    weight: float = key(0.0, "factor of the term", low=0, absent=0)
     start: int = key(0, "first step", low=0, absent=0)
-    stop: int | None = key(None, "step after the last; null: never", low=0)
+    stop: int | None = key(None, "step after the last", low=0)
 
 
 @dataclass
@@ -130,21 +130,21 @@ class TrainConfig:
     """Set the schedule and the loss. Steps are given for `recipe_iterations` iterations, and scaled to `iterations`."""
 
     iterations: int = key(30_000, "steps of this run", low=1)
-    recipe_iterations: int = key(30_000, "length of the run that other steps refer to", low=1)
+    recipe_iterations: int = key(30_000, "length for which steps are set", low=1)
     batch_size: int = key(4, "views in a step", low=1, high=10_000)
     ssim_weight: float = key(0.2, "loss = (1 - w) L1 + w (1 - SSIM)", low=0, high=1)
-    sh_every: int = key(1_000, "steps until the SH degree rises by one", low=1)
+    sh_every: int = key(1_000, "steps until the SH degree rises", low=1)
     refine_from: int = key(3_000, "step from which AGR acts and learns", low=0)
     lambda_from: int = key(15_000, "step from which lambda_t and lambda_d learn", low=0)
     densify: DensifyConfig = group(DensifyConfig)
-    cooldown_from: int | None = key(None, "step from which learning rates fall to a tenth", low=0)
-    average_from: int | None = key(None, "parameters averaged from this step on end the run if better on val", low=0)
-    coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until step 3,000")
+    cooldown_from: int | None = key(None, "step from which rates fall to a tenth", low=0)
+    average_from: int | None = key(None, "first step of an average that replaces the end if better on val", low=0)
+    coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until 3,000")
     penalties: PenaltiesConfig = group(PenaltiesConfig)
-    curve_points: int = key(20, "measurements on val during the run", low=1, high=10_000)  # a page can draw so many
-    lengths: int | None = key(None, "4: also train 1/2, 1/4 and 1/8 of the iterations, and keep the best on val",
+    curve_points: int = key(20, "measurements on val", low=1, high=10_000)  # a page can draw so many
+    lengths: int | None = key(None, "4: also train 1/2, 1/4, 1/8 of it; keep the best on val",
                               low=2, high=8)  # fmt: skip
-    patience: float | None = key(None, "share of the iterations without a better PSNR on val that ends a run",
+    patience: float | None = key(None, "share of iterations without a better val PSNR that ends a run",
                                  low=0.01, high=1)  # fmt: skip
     checkpoint_minutes: float = key(2.0, "time between two checkpoints", unit="minutes", low=0, role="place")
 
@@ -153,7 +153,7 @@ class TrainConfig:
 class RasterConfig:
     """Choose how images are rendered."""
 
-    backend: str = key("auto", "docs/glossary.md", choices=("auto", "reference", "cpu", "cuda"))
+    backend: str = key("auto", "see docs/glossary.md", choices=("auto", "reference", "cpu", "cuda"))
     antialias: bool = key(False, "Mip-Splatting: scale opacities for the 2D filter")
 
 
@@ -162,11 +162,11 @@ class ProtocolConfig:
     """Choose how results are measured."""
 
     name: str = key(REQUIRED, "gsbench, published or dgs2026")
-    quantise: bool = key(False, "measure renders rounded to 8 bits")
-    best_on_test: bool = key(False, "also record the best test PSNR (a leak)", role="training")  # while it trains
-    lpips_alex: str | None = key(None, "file of AlexNet's weights; null: in $TORCH_HOME/hub/checkpoints", role="place")
-    lpips_vgg: str | None = key(None, "file of VGG16's weights", role="place")  # checked by their hash
-    renders: int = key(30, "least number of timed renders", low=30, high=1_000_000)
+    quantise: bool = key(False, "round renders to 8 bits")
+    best_on_test: bool = key(False, "record the best test PSNR (a leak)", role="training")  # while it trains
+    lpips_alex: str | None = key(None, "AlexNet's weights; null: in $TORCH_HOME/hub/checkpoints", role="place")
+    lpips_vgg: str | None = key(None, "VGG16's weights", role="place")  # checked by their hash
+    renders: int = key(30, "least timed renders", low=30, high=1_000_000)
     pictures: int = key(3, "test views in pictures.png", low=0, high=10_000)
 
 
@@ -174,44 +174,44 @@ class ProtocolConfig:
 class EffectsConfig:
     """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
-    gate: str = key("${model.gate}", "end: after the training; both: also during it",
+    gate: str = key("${model.gate}", "end: after training; both: also during it",
                     choices=("off", "end", "both"), absent="off")  # fmt: skip
-    budget_db: float = key(0.05, "PSNR on val that the removal at the end may cost", unit="dB", low=0, high=10,
+    budget_db: float = key(0.05, "val PSNR that removal at the end may cost", unit="dB", low=0, high=10,
                            needs="effects.gate")  # fmt: skip
-    compare: bool = key(False, "choose the model of model=auto by PSNR on val, after 70 % of the steps", absent=False)
+    compare: bool = key(False, "choose for model=auto by val PSNR, after 70 % of the steps", absent=False)
 
 
 @dataclass
 class LaunchConfig:
-    """Launch runs here (`+launch=local`), in parallel processes (`parallel`) or as Slurm jobs (`slurm`)."""
+    """Launch runs one after the other, in processes (`+launch=parallel`) or as Slurm jobs (`+launch=slurm`)."""
 
-    at_once: int = key(-1, "runs at a time; -1: one for each CPU (parallel) or all (slurm)")
+    at_once: int = key(-1, "runs at a time; -1: one per CPU (parallel), all (slurm)")
     partition: str | None = key(None, "this and all keys below: Slurm only")
-    minutes: int = key(240, "time limit of a job; longer runs continue in another", unit="minutes")
+    minutes: int = key(240, "limit of a job; longer runs continue in another", unit="minutes")
     cpus: int = key(4, "CPUs of a job")
     gpus: int | None = key(None, "GPUs of a job; use device=cuda")
-    memory: str = key("8G", "memory of a job, as in sbatch")
-    setup: str = key(":", "shell line before the run: `module load cuda`")
-    requeues: int = key(20, "most jobs in which a run may continue")
-    signal_seconds: int = key(120, "time before the limit at which a job saves", unit="seconds")
-    container: str | None = key(None, "Apptainer image in which jobs run")
-    container_command: str = key("apptainer exec", "what runs a command in it")
-    sbatch: dict[str, Any] = key({}, "other options of sbatch: +launch.sbatch.account=NAME")
+    memory: str = key("8G", "of a job, as in sbatch")
+    setup: str = key(":", "shell line before it: `module load cuda`")
+    requeues: int = key(20, "most jobs that continue a run")
+    signal_seconds: int = key(120, "before the limit, when a job saves", unit="seconds")
+    container: str | None = key(None, "Apptainer image of jobs")
+    container_command: str = key("apptainer exec", "runs a command in it")
+    sbatch: dict[str, Any] = key({}, "more options: +launch.sbatch.account=NAME")
 
 
 @extended("")
 @dataclass
 class Config:
-    """Configure one run, or with `scene=all` a run for each scene of the data set."""
+    """Configure a run, or with `scene=all` a run for each scene."""
 
-    experiment: str = key(REQUIRED, "name of the +exp= file", role="measuring")
-    seed: int = key(0, "seed of every random number", low=0, high=2**63 - 1)
+    experiment: str = key(REQUIRED, "the +exp= file", role="measuring")
+    seed: int = key(0, "of every random number", low=0, high=2**63 - 1)
     device: str = key("cpu", "or cuda, cuda:1")
-    agr: bool = key("${model.agr}", "whether the model has AGR, the neural refinement")
-    optim: str = key("adam", "sparse_adam updates only visible Gaussians", choices=("adam", "sparse_adam"))
+    agr: bool = key("${model.agr}", "the neural refinement")
+    optim: str = key("adam", "sparse_adam: only visible Gaussians", choices=("adam", "sparse_adam"))
     results: str = key("results", "folder of all results", role="launching")
     resume: bool = key(True, "false: start over", role="launching")
-    log: str | None = key(None, "also send the curve to tensorboard, wandb or mlflow", role="launching")
+    log: str | None = key(None, "tracker: tensorboard, wandb or mlflow", role="launching")
     model: ModelConfig = group(ModelConfig)
     scene: SceneConfig = group(SceneConfig)
     data: DataConfig = group(DataConfig)

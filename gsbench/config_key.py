@@ -8,6 +8,7 @@ a run, and what `--against` compares are derived from it. This module imports on
 
 import copy
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -48,7 +49,15 @@ class Key:
             return ", ".join(self.choices)
         if self.low == -math.inf:
             return ""
-        return f"{self.low:g} to {self.high:g}" if self.high < ENDLESS else f"at least {self.low:g}"
+        return f"{self.low:.9g} to {self.high:.9g}" if self.high < ENDLESS else f"at least {self.low:.9g}"
+
+    @property
+    def shown(self) -> str:
+        """Return the default as a YAML file has it; "" if the key has none."""
+        if self.default == REQUIRED:
+            return ""
+        is_word = self.default is None or isinstance(self.default, bool)
+        return json.dumps(self.default) if is_word else str(self.default) or "''"
 
     def check(self, name: str, value: Any) -> None:
         """Raise InputError if a value of the key is not finite, out of range or none of the choices."""

@@ -9,10 +9,13 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.config import CONF
+from gsbench.config import CONF, Config
+from gsbench.config_key import declared
+from gsbench.errors import InputError, did_you_mean
 
 WIDTH = 118  # characters of a line
 _INDENT = 16  # of the sentences, characters
+_KEY_INDENT = 36  # of the meaning of keys, characters
 _SENTENCE_END = re.compile(r"\.\s+(?!\d)|[.:]$")  # not that of "et al. 2023"
 USAGE = """\
 gsbench: what a dimension of a Gaussian is worth, measured.
@@ -22,7 +25,7 @@ gsbench: what a dimension of a Gaussian is worth, measured.
 """
 MORE = """\
 Often used: agr=true|false  seed=0  train.iterations=30000  scene.downscale=2  device=cpu  data.root=PATH
-raster.backend=auto|reference|cpu|cuda. Every key: python -m gsbench +exp=EXPERIMENT --cfg job
+raster.backend=auto|reference|cpu|cuda. Keys of a group, with their ranges: python -m gsbench --help train
 
 Also: python -m gsbench doctor, and python -m gsbench.COMMAND --help of report, view, export, fetch, sweep, effects,
 stability
@@ -37,10 +40,16 @@ DESCRIBED = {  # config groups, and how they are chosen
 
 
 def text(words: Sequence[str]) -> str:
-    """Return the help of `python -m gsbench`, with the user's own choices if the words name a --config-dir."""
+    """Return the help of `python -m gsbench`, with the user's choices if the words name a --config-dir.
+
+    A config key, or the first part of some, is explained instead: `--help train.densify`.
+    """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--config-dir", "-cd", type=Path)
-    user = parser.parse_known_args(words)[0].config_dir
+    options, others = parser.parse_known_args(words)
+    user = options.config_dir
+    if prefixes := [word for word in others if not word.startswith("-") and "=" not in word]:
+        return keys(prefixes)
     folders = [CONF, *([user] if user else [])]
     lines = [USAGE]
     for group, title in DESCRIBED.items():
@@ -53,6 +62,26 @@ def text(words: Sequence[str]) -> str:
     lines += ["Scenes, scene=NAME (all of the experiment; custom: any folder, with scene.name=FOLDER):"]
     lines += [*textwrap.wrap(scenes, WIDTH, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False), ""]
     return "\n".join([*lines, MORE])
+
+
+def keys(prefixes: Sequence[str]) -> str:
+    """Return a line for each config key that begins with one of the prefixes: default, meaning, range.
+
+    Raises:
+        InputError: no key begins so.
+    """
+    known = declared(Config)
+    lines = []
+    for prefix in prefixes:
+        of_prefix = {name: facts for name, facts in known.items() if f"{name}.".startswith(f"{prefix}.")}
+        if not of_prefix:
+            groups = {name.partition(".")[0] for name in known}
+            raise InputError(f"--help {prefix}: expected a config key. {did_you_mean(prefix, groups)}")
+        for name, facts in of_prefix.items():
+            about = "; ".join(filter(None, (facts.help, f"{facts.range} {facts.unit}".strip())))
+            word = f"{name}={facts.shown}"
+            lines += textwrap.wrap(f"{word:{_KEY_INDENT - 1}} {about}", WIDTH, subsequent_indent=" " * _KEY_INDENT)
+    return "\n".join([*lines, ""])
 
 
 def first_sentence(path: Path) -> str:

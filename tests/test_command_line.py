@@ -54,6 +54,16 @@ def test_the_help_lists_models_of_the_user(tmp_path: Path, capsys: pytest.Captur
         assert "  balls         Balls of one size\n" in capsys.readouterr().out
 
 
+def test_the_help_explains_keys(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a key without its range, one that another key's name begins, and a prefix of no key."""
+    assert main_here("train.densify", "--help") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "train.densify.start=500             first step; at least 0" in lines
+    assert all(line.startswith("train.densify.") for line in lines)
+    assert main_here("--help", "train.dens") == 2
+    assert "train.dens: expected a config key. Did you mean 'train'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [

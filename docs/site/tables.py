@@ -94,7 +94,7 @@ def filled(page: str, published: Path = PUBLISHED) -> str:
 def wrapped(block: str) -> str:
     """Break the sentences of a block into lines; tables and images stay as they are."""
     parts = block.split("\n\n")
-    is_whole = [part[0] in "|!#" or "\n--- |" in part for part in parts]
+    is_whole = [part[0] in "|!#" or "\n---|" in part for part in parts]
     return "\n\n".join(
         part if whole else textwrap.fill(part, WIDTH, **WHOLE) for part, whole in zip(parts, is_whole, strict=True)
     )
