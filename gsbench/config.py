@@ -9,6 +9,7 @@ imports torch and this module only in functions or for type checkers, as this mo
 import importlib
 import pkgutil
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +64,8 @@ class InitConfig:
 class LearningRate:
     """Set a learning rate that falls log-linearly from `start` to `end` over the run."""
 
-    start: float = key(REQUIRED, "at the first step", low=0)
-    end: float | None = key(None, "at the last step; null: constant", low=0)
+    start: float = key(REQUIRED, "at the first step", low=0, high=inf)
+    end: float | None = key(None, "at the last step; null: constant", low=0, high=inf)
     per_extent: bool = key(False, "times the radius of the cameras")
     per_run: bool = key(False, "times sqrt(recipe_iterations / iterations)")
 

@@ -59,7 +59,7 @@ def test_the_help_explains_keys(capsys: pytest.CaptureFixture[str]) -> None:
     assert main_here("train.densify", "--help") == 0
     lines = capsys.readouterr().out.splitlines()
     assert "train.densify.start=500             first step; at least 0" in lines
-    assert all(line.startswith("train.densify.") for line in lines)
+    assert all(line.startswith(("train.densify.", "  ")) for line in lines)
     assert main_here("--help", "train.dens") == 2
     assert "train.dens: expected a config key. Did you mean 'train'?" in capsys.readouterr().err
 

@@ -185,7 +185,7 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
         (["seed=9223372036854775808"], "seed: expected 0 <= seed < 2^63"),
         (["train.densify.grad_threshold=nan"], "train.densify.grad_threshold: expected a finite number"),
         (["train.ssim_weight=2"], "train.ssim_weight: expected 0 to 1, got 2"),
-        (["model.lr.means.start=-1"], "model.lr.means: expected start >= 0"),
+        (["model.lr.means.start=-1"], "model.lr.means.start: expected at least 0"),
         (["+foo=1"], "config key 'foo' is not known"),
         (["+train.iteratons=1"], "config key 'train.iteratons' is not known. Did you mean 'iterations'?"),
         (["model=7dgs", "model.options.directional_half=no"], "directional_half: expected bool, got 'no'"),

@@ -192,7 +192,7 @@ def test_a_scene_without_val_is_refused_before_training() -> None:
     scene = replace(moving_square(), val=moving_square().train[:2])
     check_candidates(config, scene)
     for word, said in (
-        ("model.compared.moving_4dgs.lr.means.start=-1", r"candidate 4dgs: model\.lr\.means: expected start >= 0"),
+        ("model.compared.moving_4dgs.lr.means.start=-1", r"candidate 4dgs: model\.lr\.means\.start: expected"),
         ("~model.compared.moving_4dgs.lr.scales", r"candidate 4dgs: model\.lr: .* 'scales' has none"),
     ):
         with pytest.raises(InputError, match=said):
