@@ -92,11 +92,11 @@ notebooks: $(VENV)/installed-docs  ## run the notebooks of examples/ from a fres
 	$(BIN)/python -m pytest -n 0 -m slow tests/test_examples.py
 
 stability: $(VENV)/levels-all  ## hard cases against an oracle; results/stability/, fails where a default breaks its bound
-	$(BIN)/python -m gsbench.stability
+	PYTHONPATH=tests $(BIN)/python -m numerics $(ARGS)
 
 stability-long: $(VENV)/levels-all  ## the same with long trainings, and 10,000 random hard cases from slice to gradient
-	$(BIN)/python -m gsbench.stability --long
-	$(BIN)/python -m pytest tests/stability -m slow
+	PYTHONPATH=tests $(BIN)/python -m numerics --long
+	$(BIN)/python -m pytest tests/numerics tests/raster/test_exact.py -m slow
 
 bench: $(VENV)/levels-all  ## time every stage and kernel against the machine's limits; ARGS="--against COMMIT" too; results/benchmarks/
 	$(BIN)/python -m benchmarks $(ARGS)

@@ -39,7 +39,7 @@ def write(name: str, lock: Lock, what: str) -> None:
 
 def main() -> None:
     """Write all locks but that of torch for the CPU."""
-    pyproject = ["pyproject.toml", "--extra", "dev", "--extra", "stability"]
+    pyproject = ["pyproject.toml", "--extra", "dev"]
     everything = resolve([*pyproject, "--extra", "docs"], [ROOT / "constraints.txt"], BUILD)
     pins = FOLDER / "pins.tmp"
     pins.write_text("\n".join(everything))

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from tiny_run import ROOT
+from tiny_training import compose
 
 from gsbench.config import CONF, Config
 from gsbench.config_key import Key, declared, described, extended, joins, key
@@ -20,7 +21,6 @@ from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.run.checks import BACKGROUNDS, LEAST_GAUSSIANS, check_config
 from gsbench.scenes import RESIZES
-from gsbench.stability.training_cases import compose
 from gsbench.train.densify import KINDS
 from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS

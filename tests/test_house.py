@@ -18,8 +18,9 @@ FLOORS = (
     "models measure",
     "effects",
     "train report fetch",
+    "stability",
     "run",
-    "stability sweep view",
+    "sweep view",
 )
 FLOOR = {folder: i for i, folders in enumerate(FLOORS) for folder in folders.split()}
 LEAST_WORDS = 4
@@ -41,7 +42,6 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/report/page": 72,
     "gsbench/run": 54,
     "gsbench/scenes": 27,
-    "gsbench/stability": 65,
     "gsbench/sweep": 39,
     "gsbench/train": 29,
     "gsbench/train/densify": 5,
@@ -60,7 +60,6 @@ VAGUE_NAMES: dict[str, int] = {
     "tests/run": 66,
     "tests/scenes": 66,
     "tests/slurm": 13,
-    "tests/stability": 26,
     "tests/sweep": 22,
     "tests/train": 31,
     "tests/view": 55,

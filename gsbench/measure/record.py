@@ -45,7 +45,7 @@ METRICS = (
     "psnr_best_on_test",  # dB, the best on test during training: it LEAKS, and is only for comparison with papers
     "psnr_moving",  # dB, over the pixels that move: gsbench.measure.regions
     "psnr_object",  # dB, over the pixels of objects
-    "psnr_float32",  # dB, the most by which float32 changes `psnr` of a view, of three views (gsbench.run.rounding)
+    "psnr_float32",  # dB, the most by which float32 changes `psnr` of a view, of three views (gsbench.stability)
     "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )
 

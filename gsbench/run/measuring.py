@@ -17,8 +17,8 @@ from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.run.checks import lpips_weights
-from gsbench.run.rounding import psnr_float32
 from gsbench.scenes import View
+from gsbench.stability.float32_error import psnr_float32
 from gsbench.train.loop import Trainer
 
 Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H, W, 3] each
@@ -76,12 +76,13 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
     metrics |= regions.metrics()
     missing |= regions.missing()
     metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
-    metrics["psnr_float32"], why = psnr_float32(trainer)
+    renderer = trainer.renderer
+    metrics["psnr_float32"], why = psnr_float32(trainer.model, trainer.views, renderer.background, renderer.antialias)
     if why:
         missing["psnr_float32"] = why
     images = {"pictures.png": strip(shown)} if shown else {}
     if shown and with_effect_sets:
-        first, renderer = views[0], trainer.renderer
+        first = views[0]
         images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )

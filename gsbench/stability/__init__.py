@@ -1,1 +1,1 @@
-"""Compare models and backends with high-precision results on numerically hard inputs, and check error bounds."""
+"""Measure how exact float32 images are: each view of a model is rendered in float64 too, with a bound on the error."""

@@ -1,119 +1,126 @@
-"""Run the numerical stability audit (`python -m gsbench.stability`), or measure how exact a model's images are.
+"""Measure how exact the float32 images of a run's model or of a PLY are (`python -m gsbench.stability RUN|FILE.ply`).
 
-The audit computes numerically hard inputs with every model and backend. The exit code is 1 if the error of a default
-setting exceeds its bound. With a run folder or a PLY, the images of this model in float32 are compared with float64.
+Each image is rendered again in float64. The audit of hard cases is `make stability`, in a checkout.
 """
 
 import argparse
-import importlib.util
+import math
 import os
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsbench.errors import InputError, one_line
-from gsbench.extras import how_to_install
+from gsbench.models import GaussianModel, build
+from gsbench.models.cameras import around
+from gsbench.models.registry import import_models
+from gsbench.models.start import start_from
 from gsbench.process.ending import end_with
+from gsbench.run.checks import evaluated_views
+from gsbench.run.load import load_run, scene_of
+from gsbench.scenes.trained import MAX_DEGREE, read_trained
+from gsbench.schedule import ActiveComponents
+from gsbench.stability.float32_error import Shot, measure
+from gsbench.train.seeding import generator
 
-EXTRA = ("matplotlib", "mpmath")  # the packages of the extra stability
+VIEWS = 10  # of an orbit
+SIZE = 400  # pixels a side of the images of a PLY
+DISTANCE = 3.0  # of an orbit around a PLY, in median distances of its Gaussians from their middle
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A trained model, its views, and where the picture of its errors is written."""
+
+    title: str
+    model: GaussianModel
+    shots: Sequence[Shot]
+    background: Sequence[float]
+    antialias: bool
+    picture: Path
+    note: str  # what a reader must know of the views; "" for the evaluated views of a run
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the tests of numerical errors, or measure a trained model.
-
-    Return the exit code: 0, or 1 if a default setting exceeds its error bound, or 2 if a package is missing or the
-    model cannot be read.
-    """
+    """Print and draw how exact a model's images are; return the exit code: 0, or 2 if the model cannot be read."""
     parser = argparse.ArgumentParser(prog="python -m gsbench.stability", description=__doc__)
-    parser.add_argument("model", nargs="?", type=Path, metavar="RUN_FOLDER|FILE.ply",
-                        help="no audit: the error of float32 in this model's images")  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the errors of RUN_FOLDER|FILE.ply as JSON")
+    parser.add_argument("model", type=Path, metavar="RUN_FOLDER|FILE.ply", help="whose images are measured")
+    parser.add_argument("--json", action="store_true", help="print all numbers as JSON, and draw no picture")
     parser.add_argument("--data-root", metavar="FOLDER", help="of the run's data set, where it has moved")
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
-    parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of the results")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--short", action="store_true", help="the defaults alone, in a minute; writes no page")
-    length.add_argument("--long", action="store_true", help="train for 2,000 steps at 30 times the learning rates")
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE",
-                        help="no audit: the condition numbers in a trained model")  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of a PLY's picture")
     options = parser.parse_args(arguments)
-    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        print(
-            f"gsbench.stability: error: expected {' and '.join(missing)}: {how_to_install('stability')}",
-            file=sys.stderr,
-        )
-        return 2
     os.environ.setdefault("MPLBACKEND", "Agg")
-    if options.checkpoint:
-        return show_spectrum(options.checkpoint, options.out)
-    if options.model:
-        return show_exactness(options)
-    if not options.short:
-        try:
-            options.out.mkdir(parents=True, exist_ok=True)  # before the minutes of the audit
-        except OSError as error:
-            print(f"gsbench.stability: error: --out: {one_line(error)}", file=sys.stderr)
-            return 2
-    from gsbench.stability import audit, page  # imports torch
-
-    found = audit.run(long=options.long, short=options.short)
-    if options.short:
-        for cell in found.broken:
-            print(f"{cell.case}, {cell.subject}, {cell.backend}: {page.show(cell)}; {cell.note}")
-        print(page.verdict(found))
-        return 1 if found.broken else 0
-    page.write(found, options.out)
-    print(page.table(found))
-    print(page.verdict(found))
-    print(f"Written: {options.out / 'page.md'}, table.md, table.csv, audit.json")
-    return 1 if found.broken else 0
-
-
-def show_spectrum(checkpoint: Path, folder: Path) -> int:
-    """Print and plot the condition numbers of the Gaussians in a checkpoint.
-
-    Return the exit code: 0, or 2 if the file is not a checkpoint.
-    """
-    from gsbench.stability import spectrum
-
-    try:
-        found, failures = spectrum.measure(checkpoint), spectrum.failures(checkpoint)
-        picture = spectrum.draw(found, folder, "/".join(checkpoint.parts[-4:-1]))
-    except (InputError, OSError) as error:
-        print(f"gsbench.stability: error: {one_line(error)}", file=sys.stderr)
-        return 2
-    print(spectrum.report(found))
-    for scheme, (share, worst) in failures.items():
-        print(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error {worst:.1e}")
-    print(f"Written: {picture}")
-    return 0
-
-
-def show_exactness(options: argparse.Namespace) -> int:
-    """Print and draw how exact the images of a run's model or of a PLY are.
-
-    Return the exit code: 0, or 2 if the model cannot be read.
-    """
-    from gsbench.models.registry import import_models
-    from gsbench.stability import frame, frame_report, subjects
+    from gsbench.stability import report  # imports matplotlib
 
     try:
         import_models(options.model_module)
-        subject = subjects.load(options.model, options.out, options.data_root)
-        found = frame.measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
-        if not options.json:
-            frame_report.draw(found, subject.picture)
+        subject = load(options.model, options.out, options.data_root)
+        exactness = measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
+        if options.json:
+            print(report.json_of(exactness))
+            return 0
+        report.draw(exactness, subject.picture)
     except (InputError, OSError) as error:
         print(f"gsbench.stability: error: {one_line(error)}", file=sys.stderr)
         return 2
-    if options.json:
-        print(frame_report.json_of(found))
-        return 0
     if subject.note:
         print(f"{subject.note}\n")
-    print(frame_report.text(found))
+    print(report.text(exactness))
     print(f"Written: {subject.picture}")
     return 0
+
+
+def load(path: Path, out: Path, data_root: str | None = None) -> Subject:
+    """Load a model with its views.
+
+    Args:
+        path: the folder of a run, or a PLY of 3DGS. A run is measured in its evaluated views; without its data set, or
+            from a PLY, in views on an orbit, of which there are no photographs.
+        out: the folder in which a PLY's picture is written; a run's picture lies in its own folder.
+        data_root: the folder of the data set, if it is not the one in the run's settings.
+
+    Raises:
+        InputError: the folder has no checkpoint, or the file is not a PLY of trained Gaussians.
+    """
+    return _of_ply(path, out) if path.suffix.lower() == ".ply" else _of_run(path, data_root)
+
+
+def _of_run(folder: Path, data_root: str | None) -> Subject:
+    run, note = load_run(folder), ""
+    try:
+        shots = [Shot.of(view) for view in evaluated_views(scene_of(run, data_root), run.config.scene.eval_split)]
+    except InputError as error:
+        if data_root is not None:
+            raise
+        note = f"No photographs, so {VIEWS} views of an orbit: {error}"
+        shots = orbit_shots(run.model, run.scene.extent, run.scene.width, run.scene.height, run.scene.has_time)
+    title = "/".join(folder.absolute().parts[-3:])
+    return Subject(title, run.model, shots, run.scene.background, run.config.raster.antialias,
+                   folder / "exactness.png", note)  # fmt: skip
+
+
+def _of_ply(path: Path, out: Path) -> Subject:
+    trained = read_trained(path)
+    model = build("3dgs", sh_degree=MAX_DEGREE)
+    start_from(model, trained, 1.0, generator(0))
+    model.set_active(ActiveComponents(MAX_DEGREE, False, False))
+    model.requires_grad_(False)
+    middle = trained.means.median(0).values
+    extent = DISTANCE * float((trained.means - middle).norm(dim=-1).median())
+    note = f"Views: {VIEWS} on an orbit around the median of the means, {extent:.3g} world units away."
+    shots = orbit_shots(model, max(extent, 1e-6), SIZE, SIZE, False)
+    return Subject(path.name, model, shots, (0.0, 0.0, 0.0), False, out / f"{path.stem}.exactness.png", note)
+
+
+def orbit_shots(model: GaussianModel, distance: float, width: int, height: int, has_time: bool) -> list[Shot]:
+    """Return views on a circle around a model, without photographs; times run from 0 to 1."""
+    return [
+        Shot(f"orbit {i}", around(model, distance, width, height, 2 * math.pi * i / VIEWS),
+             i / (VIEWS - 1) if has_time else None, None)
+        for i in range(VIEWS)
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def expand(words: Sequence[str]) -> list[str]:
     keys = {_key(word): word.partition("=")[2] for word in words if "=" in word}
     informs = any(word in INFORM for word in words)
     multirun = multirun or (keys.get("launch", "local") != "local" and not informs)
-    wants_all = keys.get("scene", "all") == "all" and "exp" in keys and keys["exp"] != "stability"
+    wants_all = keys.get("scene", "all") == "all" and "exp" in keys
     if wants_all and not informs:
         if "," in keys["exp"]:
             raise InputError(f"scene=all: expected one experiment, got exp={keys['exp']}: name the scenes, scene=A,B")
@@ -78,8 +78,6 @@ def check_complete(composed: DictConfig) -> None:
         known = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
         raise InputError(f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
                          f"{known}. What each is: python -m gsbench --help")  # fmt: skip
-    if composed.experiment == "stability":  # trains on no scene
-        return
     if OmegaConf.is_missing(composed.scene, "name"):
         raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
     if OmegaConf.is_missing(composed.data, "root"):

@@ -14,7 +14,7 @@ LOUD = 1e3  # absolute value of a colour coefficient
 
 
 def explain(model: GaussianModel) -> str:
-    """Name the first Gaussian with a NaN or infinite gradient, and a test of gsbench.stability with such Gaussians."""
+    """Name the first Gaussian with a NaN or infinite gradient, and a case of the audit with such Gaussians."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
@@ -30,7 +30,7 @@ def explain(model: GaussianModel) -> str:
 
 @torch.no_grad()
 def resembles(model: GaussianModel, index: int) -> str | None:
-    """Return the name of a test in `gsbench.stability` whose Gaussians are as extreme as this one, or None."""
+    """Return the name of a case of `make stability` whose Gaussians are as extreme as this one, or None."""
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long

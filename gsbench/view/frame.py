@@ -17,11 +17,11 @@ from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
 from gsbench.models.query import Query
 from gsbench.models.render import rasterize_slice
-from gsbench.models.twins import doubled, exact_model
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
-from gsbench.view.float32_error import Float32Error, check_exactness, float32_error
+from gsbench.stability.float32_error import Float32Error, float32_error
+from gsbench.stability.float64_render import check_exactness, float64_camera, float64_model
 from gsbench.view.labels import measurements, short_names
 
 SLICE, RASTER = "slice", "raster"  # compute the 3D Gaussians at a time and a viewpoint, and rasterize them
@@ -147,10 +147,10 @@ class FrameRenderer:
         check_exactness(run.model)
         with self._exact_lock:
             with self._lock, torch.inference_mode():
-                self._exact = self._exact or exact_model(run.model)
+                self._exact = self._exact or float64_model(run.model)
                 run.model.active = self._exact.active = self._active(request)
                 single = run.model.slice(Query.at(camera.center if center is None else center, request.time))
-            query = Query.at(doubled(camera).center if center is None else center.double(), request.time)
+            query = Query.at(float64_camera(camera).center if center is None else center.double(), request.time)
             background = self._background(request)
             return float32_error(self._exact, single, query, camera, background, run.config.raster.antialias)
 

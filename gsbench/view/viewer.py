@@ -15,9 +15,9 @@ from gsbench.measure.images import png
 from gsbench.models import cameras
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Camera, Scene
+from gsbench.stability.float32_error import Float32Error
 from gsbench.view import video
 from gsbench.view.controls import SIDE, WIPE, Controls, ShownImage
-from gsbench.view.float32_error import Float32Error
 from gsbench.view.frame import FLOAT32, IMAGE, RASTER, SLICE, Frame, FrameRenderer, beside, renderers_of, wiped
 from gsbench.view.labels import Label, labelled
 from gsbench.view.panel import comparison, cost_table, legend

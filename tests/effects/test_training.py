@@ -10,6 +10,7 @@ import pytest
 import torch
 from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides, write_moving_square
+from tiny_training import compose, moving_square
 
 from gsbench.effects import __main__ as command
 from gsbench.effects.direction import without_direction
@@ -20,7 +21,6 @@ from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train import gating
 from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become
 from gsbench.train.loop import Trainer

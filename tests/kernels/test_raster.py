@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 import torch
 from conftest import Place
+from numerics.brute import Picture, render
 from raster.cases import assert_beta_vector, camera, case, gaussians, names
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
-from gsbench.stability.brute import Picture, render
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 Arguments = dict[str, Any]

@@ -14,6 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tiny_run import SIZE, overrides, run_here, write_moving_square
+from tiny_training import compose, moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure import record as records
@@ -24,7 +25,6 @@ from gsbench.measure.record import Record, ViewScore
 from gsbench.measure.speed import Effort
 from gsbench.run.candidates import Candidate, Result, best, highest
 from gsbench.run.setup import build
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 

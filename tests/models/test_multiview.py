@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small import started
+from tiny_training import compose, moving_square
 
 from gsbench.config import DensifyConfig
 from gsbench.kernels.backends import REFERENCE
@@ -14,7 +15,6 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.setup import build as build_for
 from gsbench.scenes.scene import Points, View
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.densify.base import Scores
 from gsbench.train.densify.multiview import LEAST_IMPORTANCE, MultiviewDensification, drawn_once
 from gsbench.train.densify.scores import VIEWS, ErrorScore

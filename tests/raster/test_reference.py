@@ -8,10 +8,10 @@ import torch
 from cases import assert_beta_vector, camera, case, gaussians, names
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numerics.brute import Picture, render
 from torch import Tensor
 
 from gsbench.raster import RasterOutput, rasterize, reference
-from gsbench.stability.brute import Picture, render
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
 PROPERTY = settings(max_examples=15, deadline=None)

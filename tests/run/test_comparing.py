@@ -8,6 +8,7 @@ import pytest
 import torch
 from interrupted import Killed, assert_same_bits, bits, counted_steps, run_through_kills
 from tiny_run import overrides, run_here, write_moving_square
+from tiny_training import compose, moving_square
 
 from gsbench.config import Config, TrainConfig
 from gsbench.effects import choose
@@ -17,7 +18,6 @@ from gsbench.run import trackers
 from gsbench.run.candidates import FOLDER
 from gsbench.run.comparing import candidates, check_candidates, check_compare
 from gsbench.schedule import Schedule
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train import checkpoint
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from interrupted import assert_same_bits, bits, counted_steps, run_through_kills
 from tiny_run import overrides, run_here, write_moving_square
+from tiny_training import compose, moving_square
 
 from gsbench.config import Config
 from gsbench.effects import choose
@@ -19,7 +20,6 @@ from gsbench.run.candidates import FOLDER
 from gsbench.run.lengths import lengths
 from gsbench.run.setup import build
 from gsbench.scenes import View
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 from tiny_run import overrides, run_here, write_moving_square
+from tiny_training import compose, moving_square
 
 from gsbench.config import Config
 from gsbench.effects import choose
 from gsbench.measure.record import TimeScreen
 from gsbench.run.identity import Run
 from gsbench.run.resolve import resolve
-from gsbench.stability.training_cases import compose, moving_square
 
 
 def run_of(config: Config) -> Run:

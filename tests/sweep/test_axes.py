@@ -29,7 +29,6 @@ def schema() -> None:
         (["+exp=nosuch"], ["+exp=nosuch"]),
         (["--config-dir", "/tmp", "model=7dgs"], ["--config-dir", "/tmp", "model=7dgs"]),
         (["model=7dgs", "--config-dir", "."], ["model=7dgs", "--config-dir", "."]),
-        (["+exp=stability"], ["+exp=stability"]),
         (["+exp=mini", "scene=dust", "+launch=slurm"], ["--multirun", "+exp=mini", "scene=dust", "+launch=slurm"]),
         (["+exp=mini", "scene=suzanne", "+launch=local"], ["+exp=mini", "scene=suzanne", "+launch=local"]),
         (["+exp=mini", "+launch=slurm", "--cfg", "job"], ["+exp=mini", "+launch=slurm", "--cfg", "job"]),

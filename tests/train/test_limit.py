@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 from test_wiring import trainer
+from tiny_training import moving_square
 
 from gsbench.config import DensifyConfig
-from gsbench.stability.training_cases import moving_square
 from gsbench.train.densify import gaussian_limit
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from models.small import seeded
+from tiny_training import compose
 from train.test_wiring import trainer
 
 from gsbench.errors import InputError
@@ -15,7 +16,6 @@ from gsbench.models.freetime import FreeTimeModel
 from gsbench.run import setup
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
-from gsbench.stability.training_cases import compose
 from gsbench.train.penalties import strain
 from gsbench.train.penalties.strain import LEAST_DISTANCE, Strain
 

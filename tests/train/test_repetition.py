@@ -8,9 +8,9 @@ import pytest
 import torch
 from interrupted import assert_same_bits
 from test_wiring import trainer
+from tiny_training import moving_square
 
 from gsbench.kernels.recording import Recording
-from gsbench.stability.training_cases import moving_square
 from gsbench.train.checkpoint import without_times
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer

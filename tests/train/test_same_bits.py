@@ -9,13 +9,13 @@ import torch
 from interrupted import assert_same_bits
 from test_resume import comparable_state
 from tiny_run import command, environment
+from tiny_training import compose, moving_square
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsbench import kernels
 from gsbench.run import fitting
 from gsbench.run.setup import build
-from gsbench.stability.training_cases import compose, moving_square
 
 # What each library chooses by itself on a processor without AVX-512: the kernels of gsbench, torch, its MKL, and numpy
 # with its OpenBLAS.

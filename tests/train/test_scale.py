@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from numerics.trainings import MODELS, Training, fit, psnr
+from tiny_training import compose, moving_square
 
 from gsbench.scenes.scene import Points, Scene, View
-from gsbench.stability.training_cases import MODELS, Training, compose, moving_square
-from gsbench.stability.trainings import fit, psnr
 
 TIMES = 128.0  # a power of two, so that few roundings differ
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from interrupted import assert_same_bits
 from test_wiring import trainer
+from tiny_training import compose, moving_square
 
 from gsbench.errors import InputError
 from gsbench.run.checks import check_scene
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 
 PATIENT = ("train.curve_points=20", "train.patience=0.2", "train.densify.every=5", "train.densify.reset_every=1000000",

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_training import compose, moving_square
 
 from gsbench.config import PenaltiesConfig
 from gsbench.errors import InputError
@@ -22,7 +23,6 @@ from gsbench.models.sliced import tensors_of
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
-from gsbench.stability.training_cases import compose, moving_square
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
 from gsbench.train.penalties import PENALTIES

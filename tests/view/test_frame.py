@@ -22,12 +22,11 @@ from gsbench.measure.images import Pixels, rounding_image, to_bytes
 from gsbench.models import Query
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.render import rasterize_slice, render
-from gsbench.models.twins import exact_model, render_twins
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
+from gsbench.stability.float64_render import check_exactness, float64_model, render_twice
 from gsbench.view import video
-from gsbench.view.float32_error import check_exactness
 from gsbench.view.frame import (
     CLASS,
     COST,
@@ -196,7 +195,7 @@ def test_the_bound_is_that_of_the_stability_command(agr: FrameRenderer) -> None:
     near = camera_of(0.5, agr)
     camera = replace(near, K=near.K * torch.tensor([0.3, 0.3, 1.0]))  # a wide angle: some pixels show nothing
     error = agr.float32_error(camera, NOW)
-    exact = render_twins(agr.run.model, exact_model(agr.run.model), camera, 0.4, BLACK, False).exact
+    exact = render_twice(agr.run.model, float64_model(agr.run.model), camera, 0.4, BLACK, False).exact
     bound, covered = 255 * exact.bound, exact.culprit >= 0
     assert (error.image == rounding_image(bound.numpy())).all()
     assert 0.2 < float(covered.double().mean()) < 0.95

@@ -1,8 +1,8 @@
 """Test the rasterizer in float32: single Gaussians against mpmath, many Gaussians against brute force in float64."""
 
+import math
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,26 +10,25 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.raster import EPS2D, NEAR, rasterize
-from gsbench.stability import brute, oracle
-from gsbench.stability.cases import Case, Cell, device_of
-from gsbench.stability.slices import fastest, worst
+from numerics import brute, oracle
+from numerics.brute import Arguments
+from numerics.cases import Case, Cell, device_of, fastest, worst
 
 UNDECIDED = 1e-3  # relative distance to a threshold below which float32 may decide either way
-Arguments = dict[str, Any]
 # image and alpha [1, H, W, .], decided [1, H, W], gradients
 ImageTruth = tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]
 
 
 def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
-    """Yield, for each backend, the largest errors of image and gradients over all images of one test case."""
+    """Yield, for each backend, the largest errors of image and gradients over all images of one case."""
     pictures = case()
     truths = [(alone if case.area == "projection" else together)(arguments) for arguments in pictures]
-    if case.bound.gradient != case.bound.gradient:  # NaN: pixels are at a threshold on purpose, so all of them count
+    if math.isnan(case.bound.gradient):  # pixels are at a threshold on purpose, so all of them count
         truths = [(image, alpha, torch.ones_like(decided), {}) for image, alpha, decided, _ in truths]
     for backend in backends:
-        found = [compare(a, known, backend) for a, known in zip(pictures, truths, strict=True)]
-        forward, gradient, bad = (torch.tensor(x, dtype=torch.float64) for x in zip(*found, strict=True))
-        drawn = sum(int((known[1] > 0).any()) for known in truths)
+        errors = [compare(a, exact, backend) for a, exact in zip(pictures, truths, strict=True)]
+        forward, gradient, bad = (torch.tensor(x, dtype=torch.float64) for x in zip(*errors, strict=True))
+        drawn = sum(int((exact[1] > 0).any()) for exact in truths)
         yield Cell(
             case.area, case.name, "-", "-", backend, worst(forward),
             worst(gradient) if truths[0][3] else float("nan"), float(bad.mean()),
@@ -45,11 +44,10 @@ def _all(pictures: list[Arguments], backend: str) -> None:
 
 def weights(arguments: Arguments) -> tuple[Tensor, Tensor]:
     """Return fixed random float64 weights of image and alpha; the loss is the weighted sum of their pixels."""
-    shape = (1, arguments["height"], arguments["width"])
-    g = torch.Generator().manual_seed(1)
-    D = arguments["colors"].shape[-1]
-    return (torch.randn(*shape, D, generator=g, dtype=torch.float64),
-            torch.randn(*shape, 1, generator=g, dtype=torch.float64))  # fmt: skip
+    shape, g = (1, arguments["height"], arguments["width"]), torch.Generator().manual_seed(1)
+    channels = (arguments["colors"].shape[-1], 1)
+    image, alpha = (torch.randn(*shape, D, generator=g, dtype=torch.float64) for D in channels)
+    return image, alpha
 
 
 def inputs_of(arguments: Arguments) -> list[str]:
@@ -64,8 +62,7 @@ def together(arguments: Arguments) -> ImageTruth:
         picture = brute.render(**exact)
     decided = picture.slack > UNDECIDED
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
-    gradients = brute.differentiate(exact, weight, weight_alpha)
-    return picture.image, picture.alpha, decided, gradients
+    return picture.image, picture.alpha, decided, brute.differentiate(exact, weight, weight_alpha)
 
 
 def alone(arguments: Arguments) -> ImageTruth:
@@ -73,19 +70,18 @@ def alone(arguments: Arguments) -> ImageTruth:
 
     The Gaussian has one colour channel with value 1, so that the image equals alpha.
     """
-    size = (arguments["width"], arguments["height"])
-    pixels = [(i + 0.5, j + 0.5) for j in range(size[1]) for i in range(size[0])]
+    width, height = arguments["width"], arguments["height"]
+    pixels = [(i + 0.5, j + 0.5) for j in range(height) for i in range(width)]
     names = [name for name in inputs_of(arguments) if name != "colors"]
-    parts = [arguments[name].flatten() for name in names]
-    x, shape = torch.cat(parts).tolist(), (1, size[1], size[0], 1)
+    x, shape = torch.cat([arguments[name].flatten() for name in names]).tolist(), (1, height, width, 1)
     if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # camera axes are world axes, so z is the depth
         none = torch.zeros(shape, dtype=torch.float64)
         return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in inputs_of(arguments)}
-    view: Arguments = {"viewmat": arguments["viewmats"][0].tolist(), "K": arguments["Ks"][0].tolist(), "size": size,
-                       "eps2d": float(torch.tensor(EPS2D))}  # fmt: skip
+    view: Arguments = {"viewmat": arguments["viewmats"][0].tolist(), "K": arguments["Ks"][0].tolist(),
+                       "size": (width, height), "eps2d": float(torch.tensor(EPS2D))}  # fmt: skip
     function = partial(oracle.alphas, **view)
-    seen = oracle.evaluate(partial(function, pixels=pixels), x)
-    free = torch.tensor([float(v) for v in seen], dtype=torch.float64).view(shape)
+    alphas = oracle.evaluate(partial(function, pixels=pixels), x)
+    free = torch.tensor([float(v) for v in alphas], dtype=torch.float64).view(shape)
     decided = ((free / ALPHA_MIN - 1).abs() > UNDECIDED)[..., 0]
     if "shapes" in arguments:  # float32 may decide either way at the rim of a Beta profile too
         squares = oracle.evaluate(partial(oracle.distances, pixels=pixels, **view), x)
@@ -116,27 +112,27 @@ def differentiate(
     return image.detach(), alpha.detach(), dict(zip(inputs, gradients, strict=True))
 
 
-def compare(arguments: Arguments, known: ImageTruth, backend: str) -> tuple[float, float, float]:
+def compare(arguments: Arguments, exact: ImageTruth, backend: str) -> tuple[float, float, float]:
     """Return the largest error of image and alpha, the largest error of gradients, and 1 if a value is not finite.
 
     Image errors are relative to the largest colour value, or to 1 if that is larger. Pixels within rounding error of a
     threshold do not count.
     """
-    image, alpha, decided, exact = known
+    image, alpha, decided, exact_gradients = exact
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     try:
         got, covered, gradients = differentiate(arguments, backend, weight, weight_alpha)
-    except InputError:  # each test case must be rendered, so a refusal is an error
+    except InputError:  # each case must be rendered, so a refusal is an error
         return float("nan"), float("nan"), 1.0
     finite = got.isfinite().all() & covered.isfinite().all() & all(g.isfinite().all() for g in gradients.values())
     brightest = max(1.0, float(arguments["colors"].abs().max())) if arguments["colors"].numel() else 1.0
     errors = torch.cat([(got - image).abs().amax(-1) / brightest, (covered - alpha).abs().amax(-1)])
     forward = worst(torch.where(torch.cat([decided, decided]), errors, 0.0))
-    slopes = [_relative(gradients[name].double(), truth) for name, truth in exact.items()]
+    slopes = [_relative(gradients[name].double(), truth) for name, truth in exact_gradients.items()]
     return forward, max(slopes, default=0.0), float(not finite)
 
 
-def _relative(found: Tensor, exact: Tensor) -> float:
-    """Return |found - exact| / |exact|, or |found| if the exact gradient is zero."""
+def _relative(got: Tensor, exact: Tensor) -> float:
+    """Return |got - exact| / |exact|, or |got| if the exact gradient is zero."""
     size = float(exact.norm())
-    return float((found - exact).norm()) / (size if size > 0 else 1.0)
+    return float((got - exact).norm()) / (size if size > 0 else 1.0)

@@ -1,28 +1,38 @@
-"""Test conditional 3D Gaussians of a million random ill-conditioned 7D Gaussians against an exact float64 method.
+"""Test slices of many random ill-conditioned Gaussians against float64: a million of 7DGS, thousands of other models.
 
-The exact method is modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005). mpmath would need weeks
-for a million Gaussians, so each audit compares Gram-Schmidt with mpmath on a few of them (`verify`).
+The exact slices of 7DGS are those of modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005), and of
+other models those of the torch model in float64. mpmath would need weeks for a million Gaussians, so each audit
+compares both with mpmath on a few (`verify`, `verify_moving`).
 """
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from gsbench.kernels.backends import BACKENDS
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import Query, build
+from gsbench.models.beta import softplus_inverse
 from gsbench.models.factors import KINDS, Triangle
-from gsbench.models.slicing import subtract
+from gsbench.models.slicing import SCHEMES
 from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
-from gsbench.stability import oracle
-from gsbench.stability.cases import device_of
+from gsbench.models.ubs import joint_factor
+from numerics import oracle, slices
+from numerics.cases import ONE_SCHEME, Bound, Cell, backends_with, device_of
+from numerics.slice_cases import LN_10, Observed, ordinary
 
 Floats = NDArray[np.float64]
 CHUNK = 50_000  # Gaussians in one chunk, to limit memory
+SUBTRACTING = 50_000  # Gaussians that are sliced by the schemes that subtract covariances
 BELOW = np.tril_indices(7, -1)
 NEVER = -110.0  # log lambda; its exp is zero in float32, so that no Gaussian is culled at any query
+PERCENTILE = 0.999  # the quantile of errors over random Gaussians that must be below the bound
+SEED = 0
+MOVING = ("dgs", "dbs", "ubs", "freetime")
+VERIFIED, VERIFIED_MOVING = 8, 2  # Gaussians that are computed in mpmath too
 
 
 @dataclass(frozen=True)
@@ -47,13 +57,10 @@ class Hard:
 
 @dataclass(frozen=True)
 class PopulationTruth:
-    """The exact conditional mean [N, 3] and covariance [N, 3, 3] of each Gaussian, and the gradient of a loss.
+    """The exact conditional means and covariances, and the gradient of a loss by the raw parameters of the factor."""
 
-    The gradient is with respect to the raw parameters of the factor.
-    """
-
-    mean: Floats
-    cov: Floats
+    mean: Floats  # [N, 3]
+    cov: Floats  # [N, 3, 3]
     gradient: Floats  # [N, 28]
 
 
@@ -66,7 +73,34 @@ class Errors:
     bad: NDArray[np.bool_]  # not finite, or an indefinite covariance
 
 
-def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
+def percentile(errors: Floats) -> float:
+    """Return the 99.9th percentile of errors; NaN counts as infinite."""
+    return float(np.quantile(np.nan_to_num(errors, nan=np.inf), PERCENTILE, method="higher"))
+
+
+# ---- 7DGS
+
+
+def hard_slices(order: str, N: int, backends: list[str]) -> tuple[list[Cell], float]:
+    """Measure the errors of N slices of 7DGS whose factors have diagonal entries down to 1e-5.
+
+    Return a result for each scheme and backend, and the largest error of the truth against mpmath.
+    """
+    hard = draw(Generator().manual_seed(SEED), N, order)
+    exact, cells = truth(hard, order), []
+    for scheme in SCHEMES:
+        count = N if scheme == "square_root" else min(N, SUBTRACTING)
+        for backend in backends_with(scheme, "7dgs", backends):
+            start = time.perf_counter()
+            errors = judge(hard.rows(slice(count)), exact, order, scheme, backend)
+            ms = 1e3 * (time.perf_counter() - start)
+            cells.append(Cell("population", f"hard_slices_{order}", "7dgs", scheme, backend, percentile(errors.cov),
+                              percentile(errors.gradient), float(errors.bad.mean()), ms, Bound(),
+                              f"{count} slices"))  # fmt: skip
+    return cells, verify(hard, order)
+
+
+def draw(generator: Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
     """Draw N random 7D Gaussians with ill-conditioned triangular factors.
 
     Diagonal entries are 10^-u with u uniform in [0, decades], and entries below are standard normal. The direction and
@@ -75,7 +109,7 @@ def draw(generator: torch.Generator, N: int, order: str, decades: Tensor | float
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
     off_diagonal = torch.randn(N, 21, generator=generator, dtype=torch.float64)
-    L = np.tril(factor(Hard(log_diagonal, off_diagonal, u)))
+    L = factor(Hard(log_diagonal, off_diagonal, u))
     q = conditioned(order)
     offset = np.einsum("nij,nj->ni", L[:, q], torch.randn(N, 7, generator=generator, dtype=torch.float64).numpy())
     return Hard(log_diagonal.float(), off_diagonal.float(), torch.from_numpy(offset).float())
@@ -115,7 +149,7 @@ def truth(hard: Hard, order: str) -> PopulationTruth:
 
 
 def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute the result of `truth` (exact conditional Gaussians and gradients) from arrays with the Gaussians last."""
+    """Compute `truth` from and to arrays with the Gaussians last."""
     L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
     p = [i for i in range(7) if i not in q]
     Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
@@ -170,61 +204,41 @@ def _solve_upper(T: Floats, B: Floats) -> Floats:
     return X
 
 
-def verify(hard: Hard, order: str, count: int = 8) -> float:
+def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
     """Return the largest relative error of the float64 `truth` against mpmath, on the first `count` Gaussians."""
     some = hard.rows(slice(count))
-    found = truth(some, order)
+    approximate = truth(some, order)
     w, W = weights(count)
-    layout = {
-        "log_diagonal": 7,
-        "shape": 3,
-        "motion": 12,
-        "coupling": 6,
-        "means": 3,
-        "directions": 3,
-        "times": 1,
-        "opacities": 1,
-    }
-    worst = 0.0
+    exact, largest = _oracle(order), 0.0
     for i in range(count):
         raw = [some.log_diagonal[i], some.off_diagonal[i], torch.zeros(3), some.offset[i], torch.zeros(1)]
         x = torch.cat(raw).tolist()
-        exact = _slice(layout, order)
         values = np.array(oracle.evaluate(exact, x), float)
         mean, cov = values[:3], values[3:12]
         weight = np.concatenate([w[i] / np.linalg.norm(mean), W[i].ravel() / np.linalg.norm(cov), [0]])
         gradient = np.array(oracle.gradient(exact, x, weight.tolist(), first=28), float)
-        worst = max(worst, _relative(found.cov[i].ravel(), cov), _relative(found.gradient[i], gradient))
-    return worst
+        for got, true in ((approximate.cov[i].ravel(), cov), (approximate.gradient[i], gradient)):
+            largest = max(largest, float(np.linalg.norm(got - true) / np.linalg.norm(true)))
+    return largest
 
 
-def _slice(layout: dict[str, int], order: str) -> oracle.Function:
+def _oracle(order: str) -> oracle.Function:
+    layout = {"log_diagonal": 7, "shape": 3, "motion": 12, "coupling": 6, "means": 3, "directions": 3, "times": 1,
+              "opacities": 1}  # fmt: skip
     names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
     log_lambda = {"direction": NEVER, "time": NEVER}
     places = Triangle(names).places
     kinds = [7 + place for kind in KINDS for place in places[kind]]
     return lambda x: oracle.slice_triangular(
-        [*x[:7], *(x[i] for i in kinds), *x[28:]], layout, names, 0.5, log_lambda, [0.0] * 3, 0.0, relative=False
+        [*x[:7], *(x[i] for i in kinds), *x[28:]], layout, [0.0] * 3, 0.0, names, 0.5, log_lambda, relative=False
     )
 
 
-def _relative(found: Floats, exact: Floats) -> float:
-    return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
-
-
-def judge(hard: Hard, known: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
-    """Measure the float32 errors of the conditional 3D Gaussians of ill-conditioned 7D Gaussians.
-
-    Args:
-        hard: the 7D Gaussians.
-        known: the exact conditional 3D Gaussians.
-        order: the order of rows in the triangular factor.
-        scheme: the algorithm that computes the conditional Gaussian.
-        backend: the name of the backend.
-    """
+def judge(hard: Hard, exact: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
+    """Measure the float32 errors of the conditional 3D Gaussians by one scheme and backend."""
     model = all_seen(order, scheme, backend)
     w, W = weights(len(hard))
-    parts = [_judge(model, hard, known, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
+    parts = [_judge(model, hard, exact, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
     cov, gradient, bad = (np.concatenate(x) for x in zip(*parts, strict=True))
     return Errors(cov, gradient, bad)
 
@@ -239,43 +253,32 @@ def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
     return model.to(device_of(backend))
 
 
+def at_the_origin(model: TriangularModel, dtype: torch.dtype = torch.float32) -> Query:
+    """Return the viewpoint and the time at which `Hard` Gaussians are sliced, on the device of a model."""
+    there = {"device": device_of(model.backend.name), "dtype": dtype}
+    return Query(torch.zeros(3, **there), torch.zeros((), **there))
+
+
 def _judge(
-    model: TriangularModel, hard: Hard, known: PopulationTruth, w: Floats, W: Floats, rows: slice
+    model: TriangularModel, hard: Hard, exact: PopulationTruth, w: Floats, W: Floats, rows: slice
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     some = hard.rows(rows)
     leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
     raw = raw_parameters(Hard(*leaves, some.offset), model)
-    device = device_of(model.backend.name)
-    there = {name: value.to(device) for name, value in raw.items()}
-    out = model.slice_geometry(there, Query(torch.zeros(3, device=device), torch.zeros((), device=device)))
+    there = {name: value.to(device_of(model.backend.name)) for name, value in raw.items()}
+    out = model.slice_geometry(there, at_the_origin(model))
     mean, F = out.means.cpu(), out.factors.cpu()
-    exact_mean, exact_cov = torch.from_numpy(known.mean[rows]), torch.from_numpy(known.cov[rows])
+    exact_mean, exact_cov = torch.from_numpy(exact.mean[rows]), torch.from_numpy(exact.cov[rows])
     cov = F.double() @ F.double().mT
     loss = (torch.from_numpy(w[rows]) * mean / exact_mean.norm(dim=1, keepdim=True)).sum()
     loss = loss + (torch.from_numpy(W[rows]) * cov / exact_cov.norm(dim=(1, 2), keepdim=True)).sum()
     gradient = torch.cat(torch.autograd.grad(loss, leaves), 1).double()
-    exact_gradient = torch.from_numpy(known.gradient[rows])
+    exact_gradient = torch.from_numpy(exact.gradient[rows])
     bad = ~(mean.isfinite().all(1) & F.isfinite().all((1, 2)) & gradient.isfinite().all(1))
-    bad |= indefinite(model, raw)
+    bad |= slices.indefinite(model, raw)
     cov_error = (cov - exact_cov).norm(dim=(1, 2)) / exact_cov.norm(dim=(1, 2))
     gradient_error = (gradient - exact_gradient).norm(dim=1) / exact_gradient.norm(dim=1)
     return cov_error.detach().numpy(), gradient_error.numpy(), bad.numpy()
-
-
-@torch.no_grad()
-def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
-    """Return which conditional covariances [N] have a negative eigenvalue or are not finite.
-
-    The scheme `square_root` returns a factor F of the covariance F F^T, which has no negative eigenvalue, as models
-    without schemes do.
-    """
-    scheme = str(getattr(model, "scheme", "square_root"))
-    if scheme == "square_root":
-        return torch.zeros(len(raw["means"]), dtype=torch.bool)
-    cov = subtract(model.factors(raw), scheme)[1].double()  # type: ignore[operator]
-    finite = cov.isfinite().all((1, 2))
-    least = torch.linalg.eigvalsh(torch.where(finite[:, None, None], cov, 0.0))[:, 0]
-    return ~finite | (least < 0)
 
 
 def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
@@ -284,3 +287,83 @@ def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
             "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),
             "opacities": torch.zeros(N)}  # fmt: skip
+
+
+# ---- dGS, dBS, UBS and FreeTimeGS
+
+
+def moving_slices(name: str, N: int, backends: list[str]) -> tuple[list[Cell], float]:
+    """Measure the errors of N random slices of a model in float32.
+
+    Return a result for each backend, and the largest error of the truth against mpmath.
+    """
+    observed, cells = draw_moving(Generator().manual_seed(SEED), name, N), []
+    exact = moving_truth(observed)
+    for backend in backends:
+        start = time.perf_counter()
+        model, raw = slices.load(observed, ONE_SCHEME, backend)
+        errors = slices.compare(*slices.differentiate(model, raw, observed, exact.weights), exact)
+        ms = 1e3 * (time.perf_counter() - start)
+        forward, gradient = (percentile(x.numpy()) for x in (errors.forward, errors.gradient))
+        cells.append(Cell("population", "hard_slices", name, ONE_SCHEME, backend, forward, gradient,
+                          errors.bad.double().mean().item(), ms, Bound(), f"{N} slices"))  # fmt: skip
+    return cells, verify_moving(observed)
+
+
+def moving_truth(observed: Observed, weights: Tensor | None = None) -> slices.SliceTruth:
+    """Compute the slices and the gradient of a loss by the torch model in float64."""
+    model, raw = slices.load(observed, ONE_SCHEME, "reference")
+    double = {name: value.detach().double().requires_grad_() for name, value in raw.items()}
+    zero = torch.zeros(len(double["means"]), 14 if "betas" in double else 13, dtype=torch.float64)
+    outputs, _ = slices.differentiate(model.double(), double, observed, zero)
+    random, scale = slices.weights_of(outputs, observed.raw["means"])
+    weights = random if weights is None else weights
+    return slices.SliceTruth(outputs, weights, scale, slices.differentiate(model, double, observed, weights)[1])
+
+
+def verify_moving(observed: Observed) -> float:
+    """Return the largest error of `moving_truth` against mpmath, on the first Gaussians."""
+    first = replace(observed, raw={name: value[:VERIFIED_MOVING] for name, value in observed.raw.items()})
+    exact = slices.truth(first)
+    approximate = moving_truth(first, exact.weights)
+    errors = slices.compare(approximate.outputs, approximate.gradient, exact)
+    return float(torch.maximum(errors.forward, errors.gradient).max())
+
+
+def draw_moving(g: Generator, model: str, N: int) -> Observed:
+    """Draw N random Gaussians with sizes 10^-u, u uniform in [0, 5], about one size away from the time and direction.
+
+    In dGS, dBS and FreeTimeGS the lives and widths of view are 10^-v, v uniform in [-1, 2].
+    """
+    observed = ordinary(g, model, N)
+    raw = observed.raw
+
+    def normal(width: int) -> Tensor:
+        return torch.randn(N, width, generator=g)
+
+    def logs(width: int, least: float, most: float) -> Tensor:
+        return -LN_10 * (least + (most - least) * torch.rand(N, width, generator=g))
+
+    if "betas" in raw:
+        raw["betas"] = normal(raw["betas"].shape[1])
+        raw["scales"][:, :3] = softplus_inverse(logs(3, 0, 5).exp().double()).float()
+    else:
+        raw["scales"] = logs(3, 0, 5)
+    towards = observed.towards()
+    if model == "freetime":
+        raw["durations"], raw["velocities"] = logs(1, -1, 2), normal(3)
+        raw["times"] = observed.time + raw["durations"].exp() * normal(1)
+    elif model == "ubs":
+        raw["scales"][:, 3:] = softplus_inverse(logs(4, 0, 5).exp().double()).float()
+        raw["lower"] = normal(raw["lower"].shape[1])
+        offset = (joint_factor(raw)[:, 3:] @ normal(7)[..., None])[..., 0]
+        raw["directions"], raw["times"] = towards - offset[:, :3], observed.time - offset[:, 3:]
+    else:
+        raw["precision"], raw["coupling"] = normal(7), normal(12)
+        diagonal = [0, 2, 5, 6]
+        raw["precision"][:, diagonal] = -logs(4, -1, 2)
+        offset = normal(4) * raw["precision"][:, diagonal].neg().exp()
+        raw["directions"] = towards - offset[:, :3]
+        times = observed.time - offset[:, 3:]
+        raw["times"] = times.clamp(1e-3, 1 - 1e-3).logit() if model == "dgs" else times
+    return observed

@@ -46,29 +46,18 @@ def render(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
 ) -> Picture:  # fmt: skip
-    """Render exact images of 3D Gaussians in float64, from the arguments of `gsbench.raster.rasterize`.
+    """Render exact images from the arguments of `gsbench.raster.rasterize` in float64.
 
-    Args:
-        means: [N, 3], float64 as all tensors here.
-        factors: [N, 3, 3], factors F of the covariances F F^T.
-        opacities: [N].
-        colors: [N, D] or [C, N, D].
-        viewmats: [C, 4, 4], world to camera.
-        Ks: [C, 3, 3], intrinsics.
-        width: width of the images, pixels.
-        height: height of the images, pixels.
-        offsets2d: [C, N, 2] is added to the projected means, pixels.
-        background: colour [D].
-        options: near, far, eps2d, antialias and shapes of `rasterize`.
+    `offsets2d` [C, N, 2] is added to the projected means, in pixels.
     """
     C, N, D = len(viewmats), len(means), colors.shape[-1]
     background = torch.zeros(D).double() if background is None else background
     image, alpha = means.new_zeros(C, height * width, D), means.new_zeros(C, height * width, 1)
     touched, slack = torch.zeros(C, N, height * width, dtype=torch.bool), means.new_zeros(C, height * width)
     for c in range(C):
-        own = colors if colors.dim() == 2 else colors[c]
         moved = None if offsets2d is None else offsets2d[c]
-        splats = _project(means, factors, opacities, own, viewmats[c], Ks[c], width, height, moved, **options)
+        splats = _project(means, factors, opacities, _colors_of(colors, c), viewmats[c], Ks[c], width, height, moved,
+                          **options)  # fmt: skip
         for at, pixels in _pixels(width, height, N):
             image[c, at], alpha[c, at], some, slack[c, at] = _blend(splats, pixels, background)
             touched[c, splats.order[:, None], at] = some
@@ -77,10 +66,7 @@ def render(
 
 
 def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) -> dict[str, Tensor]:
-    """Compute exact gradients of a loss by autograd in float64.
-
-    The loss is the sum of weight [C, H, W, D] x image + weight_alpha [C, H, W, 1] x alpha.
-    """
+    """Compute exact gradients of the loss sum(weight [C, H, W, D] image + weight_alpha [C, H, W, 1] alpha)."""
     inputs = {name: arguments[name].detach().requires_grad_() for name in DIFFERENTIABLE if name in arguments}
     rest = {name: value for name, value in arguments.items() if name not in DIFFERENTIABLE}
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
@@ -88,14 +74,17 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
     background = weight.new_zeros(weight.shape[-1]) if background is None else background
     for c in range(len(viewmats)):
         for at, pixels in _pixels(width, height, len(inputs["means"])):
-            own = inputs["colors"] if inputs["colors"].dim() == 2 else inputs["colors"][c]
-            splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], own, viewmats[c], Ks[c],
-                              width, height, None, shapes=inputs.get("shapes"), **rest)  # fmt: skip
+            splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], _colors_of(inputs["colors"], c),
+                              viewmats[c], Ks[c], width, height, shapes=inputs.get("shapes"), **rest)  # fmt: skip
             image, alpha, _, _ = _blend(splats, pixels, background)
             loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
             if loss.requires_grad:
                 loss.backward()
     return {name: torch.zeros_like(x) if x.grad is None else x.grad for name, x in inputs.items()}
+
+
+def _colors_of(colors: Tensor, camera: int) -> Tensor:  # [N, D] or [C, N, D] -> [N, D]
+    return colors if colors.dim() == 2 else colors[camera]
 
 
 def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -106,7 +95,7 @@ def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
 
 def _project(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmat: Tensor, K: Tensor,
-    width: int, height: int, offsets: Tensor | None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
+    width: int, height: int, offsets: Tensor | None = None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
     antialias: bool = False, shapes: Tensor | None = None,
 ) -> _Splats:  # fmt: skip
     R = viewmat[:3, :3]
@@ -145,15 +134,14 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     touched = a >= 1 / 255
     after = torch.where(touched, 1 - a, 1.0).cumprod(0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    blended = touched & (after >= 1e-4)
-    weight = torch.where(blended, a * before, 0.0)
+    weight = torch.where(touched & (after >= 1e-4), a * before, 0.0)
     alpha = weight.sum(0)[:, None]
     image = weight.T @ splats.colors + (1 - alpha) * background
     going = before >= 1e-4  # the first Gaussian that would take the transmittance below this ends the pixel
     distance = torch.where(going, (255 * a - 1).abs(), torch.inf)
     if splats.shapes is not None:  # a Beta profile may end, or change too fast for float32, at its rim
-        seen = 255 * splats.opacities[:, None] * RIM ** splats.shapes[:, None] > 1
-        distance = torch.where(going & seen, torch.minimum(distance, (1 - 2 * power).abs()), distance)
+        visible = 255 * splats.opacities[:, None] * RIM ** splats.shapes[:, None] > 1
+        distance = torch.where(going & visible, torch.minimum(distance, (1 - 2 * power).abs()), distance)
     distance = torch.where(going & touched, torch.minimum(distance, (after / 1e-4 - 1).abs()), distance)
     slack = distance.amin(0) if len(distance) else torch.full((len(pixels),), torch.inf).double()
     return image, alpha, touched & going, slack.detach()

@@ -11,18 +11,11 @@ from torch import Tensor
 from gsbench.kernels.backends import BACKENDS
 from gsbench.models import GaussianModel, Query
 from gsbench.raster import rasterize
-from gsbench.stability import (
-    colors,  # noqa: F401  # its cases enter the list
-    moving_population,
-    picture_cases,  # noqa: F401
-    pictures,
-    slices,
-    slicing_cases,
-)
-from gsbench.stability.audit import present
-from gsbench.stability.cases import CASES, of_area
-from gsbench.stability.slicing_cases import COUNT, Observed
 from gsbench.train.losses import photometric
+from numerics import pictures, population, slices
+from numerics.audit import CASES
+from numerics.cases import of_area, present
+from numerics.slice_cases import COUNT, JOINT, Observed
 
 WIDTH, HEIGHT = 16, 12
 SLICES = [(case.name, model) for case in of_area("slicing") for model in case.subjects]
@@ -34,20 +27,20 @@ raw_values = st.floats(-100, 100, width=32)
 
 def appearance(model: str, seed: int) -> dict[str, Tensor]:
     """Coefficients of colours, of the model's shape."""
-    g = torch.Generator().manual_seed(seed)
-    if model == "4dgs":
-        return {"sh0": torch.randn(COUNT, 1, 1, 3, generator=g), "shN": torch.randn(COUNT, 47, 3, generator=g)}
-    return {"sh0": torch.randn(COUNT, 1, 3, generator=g), "shN": torch.randn(COUNT, 15, 3, generator=g)}
+    g, waves = torch.Generator().manual_seed(seed), 3 if model == "4dgs" else 1
+    sh0 = torch.randn(COUNT, 1, 1, 3, generator=g) if model == "4dgs" else torch.randn(COUNT, 1, 3, generator=g)
+    return {"sh0": sh0, "shN": torch.randn(COUNT, 16 * waves - 1, 3, generator=g)}
 
 
-def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, time: float, backend: str) -> None:
+def whole_path(model: GaussianModel, raw: dict[str, Tensor], observed: Observed, backend: str, seed: int) -> None:
     """Slice, draw, compare with a photograph, and differentiate; everything must be finite."""
-    inputs = {name: value.clone().requires_grad_() for name, value in raw.items()}
-    moment = torch.tensor(time)
-    means, factors, opacities, shapes = model.slice_geometry(inputs, Query(center, moment))
-    shown = model.shade(inputs, means, opacities, Query(center, moment))
+    raw = raw | appearance(observed.model, seed)
+    inputs = {name: value.detach().clone().requires_grad_() for name, value in raw.items()}
+    query = Query(observed.center, torch.tensor(observed.time))
+    means, factors, opacities, shapes = model.slice_geometry(inputs, query)
+    shown = model.shade(inputs, means, opacities, query)
     viewmat = torch.eye(4)
-    viewmat[:3, 3] = -center
+    viewmat[:3, 3] = -observed.center
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])
     image = rasterize(
         means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend, shapes=shapes
@@ -61,54 +54,42 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], center: Tensor, tim
 
 
 def check_case(which: tuple[str, str], severity: float, seed: int, backend: str) -> None:
-    name, model_name = which
-    observed: Observed = CASES[name](severity, seed, model=model_name)
-    model, raw = slices.load(observed, "square_root", backend)
-    raw = {name: value.detach() for name, value in raw.items()} | appearance(model_name, seed)
-    whole_path(model, raw, observed.center, observed.time, backend)
+    name, model = which
+    observed: Observed = CASES[name](severity, seed, model=model)
+    whole_path(*slices.load(observed, "square_root", backend), observed, backend, seed)
 
 
-def check_any_numbers(model_name: str, values: list[float], seed: int, backend: str) -> None:
+def check_any_numbers(model: str, values: list[float], seed: int, backend: str) -> None:
     """Raw parameters replaced at random by numbers that no recipe would give."""
-    case = "ordinary_gaussians" if model_name in slicing_cases.ALL else "ordinary_moving_gaussians"
-    observed: Observed = CASES[case](1.0, seed, model=model_name)
-    model, raw = slices.load(observed, "square_root", backend)
-    raw = {name: value.detach() for name, value in raw.items()}
+    case = "ordinary_gaussians" if model in JOINT else "ordinary_moving_gaussians"
+    observed: Observed = CASES[case](1.0, seed, model=model)
     g = torch.Generator().manual_seed(seed)
     for value in values:
-        name = sorted(raw)[int(torch.randint(len(raw), (), generator=g))]
-        flat = raw[name].view(-1)
+        name = sorted(observed.raw)[int(torch.randint(len(observed.raw), (), generator=g))]
+        flat = observed.raw[name].view(-1)
         flat[int(torch.randint(len(flat), (), generator=g))] = value
-    whole_path(model, raw | appearance(model_name, seed), observed.center, observed.time, backend)
+    whole_path(*slices.load(observed, "square_root", backend), observed, backend, seed)
 
 
 def check_picture(name: str, severity: float, seed: int, backend: str) -> None:
     for arguments in CASES[name](severity, seed):
-        inputs: dict[str, Any] = {k: arguments[k].clone().requires_grad_() for k in
-                                  pictures.inputs_of(arguments)}  # fmt: skip
+        inputs = {k: arguments[k].clone().requires_grad_() for k in pictures.inputs_of(arguments)}
         out = rasterize(**(arguments | inputs), backend=backend)
         assert out.image.isfinite().all()
-        gradients = torch.autograd.grad((out.image.square().sum() + out.alpha.sum()), list(inputs.values()),
-                                        materialize_grads=True)  # fmt: skip
+        loss = out.image.square().sum() + out.alpha.sum()
+        gradients = torch.autograd.grad(loss, list(inputs.values()), materialize_grads=True)
         assert all(g.isfinite().all() for g in gradients)
 
 
 def searched(examples: int) -> tuple[Any, Any, Any]:
     """The three searches, of so many examples in all."""
-    hard = settings(max_examples=examples // 2, deadline=None)(
-        given(st.sampled_from(SLICES), severities, seeds, backends)(check_case)
+    models = st.sampled_from([*JOINT, *population.MOVING])
+    searches = (
+        (2, given(st.sampled_from(SLICES), severities, seeds, backends)(check_case)),
+        (4, given(models, st.lists(raw_values, max_size=12), seeds, backends)(check_any_numbers)),
+        (4, given(st.sampled_from(PICTURES), severities, seeds, backends)(check_picture)),
     )
-    wild = settings(max_examples=examples // 4, deadline=None)(
-        given(
-            st.sampled_from([*slicing_cases.ALL, *moving_population.MODELS]),
-            st.lists(raw_values, max_size=12),
-            seeds,
-            backends,
-        )(check_any_numbers)
-    )
-    drawn = settings(max_examples=examples // 4, deadline=None)(
-        given(st.sampled_from(PICTURES), severities, seeds, backends)(check_picture)
-    )
+    hard, wild, drawn = (settings(max_examples=examples // part, deadline=None)(check) for part, check in searches)
     return hard, wild, drawn
 
 

@@ -1,4 +1,4 @@
-"""What a user learns when a training diverges, and what a trained model's factors are like."""
+"""What a user learns when a training diverges: the step, the parameter, the Gaussian, and the case it resembles."""
 
 import contextlib
 import io
@@ -8,23 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from numerics import audit
+from tiny_training import compose, moving_square
 
 from gsbench import models
-from gsbench.errors import InputError
-from gsbench.models.factors import KINDS
 from gsbench.scenes import View
-from gsbench.stability import (
-    __main__ as command,
-)
-from gsbench.stability import (
-    colors,  # noqa: F401  # its cases enter the list
-    picture_cases,  # noqa: F401
-    slicing_cases,  # noqa: F401
-    spectrum,
-    training_cases,
-    trainings,
-)
-from gsbench.stability.cases import CASES
 from gsbench.train import checkpoint, diagnosis
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.finite_check import DivergedError
@@ -36,7 +24,7 @@ POISONED = 7
 
 
 def trainer(name: str, steps: int = 12) -> Trainer:
-    config, scene = training_cases.compose(name, steps, "train.densify.stop=1"), training_cases.moving_square()
+    config, scene = compose(name, steps, "train.densify.stop=1"), moving_square()
     config.train.curve_points = 1
     model = models.build(name, agr=config.agr, sh_degree=3, **config.model.options)
     assert scene.points is not None
@@ -49,13 +37,13 @@ def poison(run: Trainer, parameter: str, after: int) -> None:
     gradients, steps = run.gradients, [0]
 
     def poisoned(batch: Sequence[View], *penalties: object) -> list[Seen]:
-        seen = gradients(batch, *penalties)
+        views = gradients(batch, *penalties)
         steps[0] += 1
         if steps[0] > after:
             gradient = run.model.splats[parameter].grad
             assert gradient is not None
             gradient[POISONED].view(-1)[-1] = math.nan
-        return seen
+        return views
 
     run.gradients = poisoned  # type: ignore[assignment]
 
@@ -97,7 +85,7 @@ def test_resemblance(name: str) -> None:
     model = trainer("7dgs").model
     parameter, at, value = CHANGES[name]
     model.splats[parameter].data[POISONED, at] = value
-    assert name in CASES
+    assert name in audit.CASES
     assert diagnosis.resembles(model, POISONED) == name
     assert diagnosis.resembles(model, POISONED + 1) is None
 
@@ -126,7 +114,7 @@ def test_resemblance_in_time_is_in_clips() -> None:
 
 def test_without_harmonics() -> None:
     """Catches a diagnosis that takes the largest of no coefficients, so that the run leaves no record."""
-    model, points = models.build("3dgs", sh_degree=0), training_cases.moving_square().points
+    model, points = models.build("3dgs", sh_degree=0), moving_square().points
     assert points is not None
     model.initialise(points, 4.4, generator(0))
     for parameter in model.splats.values():
@@ -137,53 +125,3 @@ def test_without_harmonics() -> None:
     assert gradient is not None
     gradient[POISONED].view(-1)[-1] = math.nan
     assert "Gaussian 7 of 80 in 'sh0' (1 in all): it resembles the stability case 'loud" in diagnosis.explain(model)
-
-
-def test_spectrum(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too."""
-    model = trainer("7dgs").model
-    for kind in KINDS:
-        model.splats[kind].data.zero_()
-    logs = torch.tensor([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0])
-    model.splats["log_diagonal"].data[:] = logs
-    path = tmp_path / "checkpoint.pt"
-    checkpoint.save(path, Checkpoint("training", "data", {"model": model.state_dict()}))
-    joint, sliced = spectrum.measure(path).values()
-    torch.testing.assert_close(torch.from_numpy(joint), torch.full((80,), math.exp(6)).double(), rtol=1e-6, atol=0)
-    torch.testing.assert_close(torch.from_numpy(sliced), torch.full((80,), math.exp(2)).double(), rtol=1e-6, atol=0)
-    assert command.main(["--checkpoint", str(path), "--out", str(tmp_path)]) == 0
-    assert "schur in float32: 0.00 % indefinite" in capsys.readouterr().out
-    assert (tmp_path / spectrum.FILE_NAME).exists()
-
-
-def test_indefinite_covariances_are_counted(tmp_path: Path) -> None:
-    """Catches a count that looks at the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3."""
-    model = trainer("7dgs").model
-    model.splats["log_diagonal"].data[:] = torch.tensor([0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5])
-    for kind, size in (("motion", 1e3), ("coupling", 1.0)):
-        model.splats[kind].data.normal_(0, size, generator=generator(0))
-    path = tmp_path / "checkpoint.pt"
-    checkpoint.save(path, Checkpoint("training", "data", {"model": model.state_dict()}))
-    for share, error in spectrum.failures(path).values():
-        assert share > 0.5
-        assert error > 1
-
-
-def test_spectrum_of_what_is_no_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a stack trace for a file that is none, or a model that slices nothing."""
-    path = tmp_path / "checkpoint.pt"
-    path.write_text("no")
-    assert command.main(["--checkpoint", str(path), "--out", str(tmp_path)]) == 2
-    assert "expected a checkpoint" in capsys.readouterr().err
-    checkpoint.save(path, Checkpoint("training", "data", {"model": trainer("3dgs").model.state_dict()}))
-    with pytest.raises(InputError, match="4dgs, 6dgs or 7dgs"):
-        spectrum.measure(path)
-
-
-def test_a_scene_in_float64_is_trained_in_float64() -> None:
-    """Catches a tensor of the trainer that stays float32: the audit's drift is measured against such a training."""
-    scene = trainings.double(training_cases.moving_square())
-    training = training_cases.Training("3dgs", training_cases.compose("3dgs", 2), scene)
-    fitted = trainings.fit(training, "reference")
-    assert all(p.dtype == torch.float64 for p in fitted.model.parameters())
-    assert math.isfinite(trainings.psnr(fitted))

@@ -7,6 +7,8 @@ from typing import Any
 import hard_scenes
 import pytest
 import torch
+from numerics import brute, picture_cases
+from numerics.cases import CASES
 from torch import Tensor
 
 from benchmarks.scene import camera, model
@@ -15,8 +17,6 @@ from gsbench.errors import InputError
 from gsbench.models import Query
 from gsbench.raster import rasterize
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, Gaussians, exact_image
-from gsbench.stability import brute, picture_cases
-from gsbench.stability.cases import CASES
 
 NAMES = ("means", "factors", "opacities", "colors", "shapes")
 NOISES = (0.0, 6e-8, 1e-3)  # of Gaussians in float32: none, a rounding, and what no model has
@@ -39,23 +39,23 @@ def images(arguments: dict[str, Any], noise: float = 0.0, seed: int = 0) -> tupl
     exact[2] = exact[2].clamp(0, 1)
     cameras = viewmats, Ks, width, height
     image = rasterize(*single[:4], *cameras, shapes=single[4], backend="cpu", **rest).image[0]
-    found = exact_image(tuple(exact), single, viewmats[0], Ks[0], width, height, **rest)
+    bounded = exact_image(tuple(exact), single, viewmats[0], Ks[0], width, height, **rest)
     if rest.get("background") is not None:
         rest["background"] = rest["background"].double()
     cameras = viewmats.double(), Ks.double(), width, height
     true = rasterize(*exact[:4], *cameras, shapes=exact[4], backend="reference", **rest).image[0]
-    return image, found, true
+    return image, bounded, true
 
 
 def check(seeds: Iterable[int]) -> None:
     ratios = []
     for seed in seeds:
-        image, found, true = images(hard_scenes.scene(seed), NOISES[seed % len(NOISES)], seed)
-        error = (image.double() - found.image).abs().amax(-1)
-        assert (error <= found.bound).all(), seed
-        assert (found.image - true).abs().max() <= 1e-12 * max(1.0, float(true.abs().max())), seed
-        decided = (error > 0) & ~found.undecided
-        ratios.append((found.bound / error)[decided])
+        image, bounded, true = images(hard_scenes.scene(seed), NOISES[seed % len(NOISES)], seed)
+        error = (image.double() - bounded.image).abs().amax(-1)
+        assert (error <= bounded.bound).all(), seed
+        assert (bounded.image - true).abs().max() <= 1e-12 * max(1.0, float(true.abs().max())), seed
+        decided = (error > 0) & ~bounded.undecided
+        ratios.append((bounded.bound / error)[decided])
     assert torch.cat(ratios).median() <= LOOSEST
 
 
@@ -80,10 +80,10 @@ def test_every_instruction_set_and_number_of_threads_has_the_same_bits() -> None
             kernels.use_instruction_set(name)
             torch.set_num_threads(count)
             for seed in range(20):
-                found = images(hard_scenes.scene(seed), NOISES[seed % len(NOISES)], seed)[1]
-                assert torch.equal(found.image, true.setdefault(seed, found.image)), (name, count, seed)
+                bounded = images(hard_scenes.scene(seed), NOISES[seed % len(NOISES)], seed)[1]
+                assert torch.equal(bounded.image, true.setdefault(seed, bounded.image)), (name, count, seed)
                 # Without fused multiply-add, float32 projects to other numbers.
-                assert torch.equal(found.bound, bounds.setdefault((seed, name == "v2"), found.bound)), (name, count)
+                assert torch.equal(bounded.bound, bounds.setdefault((seed, name == "v2"), bounded.bound)), (name, count)
     finally:
         kernels.use_instruction_set(sets[-1])
         torch.set_num_threads(threads)
@@ -99,17 +99,17 @@ def test_no_error_of_2000_scenes_is_above_its_bound() -> None:
 @pytest.mark.parametrize("name", ["3dgs", "4dgs", "6dgs", "7dgs", "7dgs_agr", "ubs", "dbs", "freetime"])
 def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
     """Catches a slice, a colour or a shape whose rounding is not carried to the pixels."""
-    made = model(name.removesuffix("_agr"), 2_000, agr=name.endswith("_agr"), sigma=0.05)
+    gaussians = model(name.removesuffix("_agr"), 2_000, agr=name.endswith("_agr"), sigma=0.05)
     viewmat, K = (x[0] for x in camera(32))
     with torch.no_grad():
         query = Query.at(-viewmat[:3, 3], 0.4)
-        single = made.slice(query)
-        exact = copy.deepcopy(made).double().slice(Query.at(query.center.double(), 0.4))
+        single = gaussians.slice(query)
+        exact = copy.deepcopy(gaussians).double().slice(Query.at(query.center.double(), 0.4))
         image = rasterize(*single[:4], viewmat[None], K[None], 32, 32, shapes=single.shapes).image[0]
-        found = exact_image(exact, single, viewmat, K, 32, 32)
-    error = (image.double() - found.image).abs().amax(-1)
-    assert (error <= found.bound).all()
-    assert 0 < found.bound[found.culprit >= 0].median() < 1e-5
+        bounded = exact_image(exact, single, viewmat, K, 32, 32)
+    error = (image.double() - bounded.image).abs().amax(-1)
+    assert (error <= bounded.bound).all()
+    assert 0 < bounded.bound[bounded.culprit >= 0].median() < 1e-5
     wrong = single._replace(colors=single.colors + 1e-3)
     assert exact_image(exact, wrong, viewmat, K, 32, 32).bound.max() > 3e-4
 
@@ -135,9 +135,9 @@ def test_a_branch_that_rounding_decides_is_named(branch: int) -> None:
     """Catches a pixel that may jump and is not counted, and one that is counted where nothing can jump."""
     name, *cases = HARD_AND_EASY[branch]
     for (severity, which), undecided in zip(cases, (True, False), strict=True):
-        found = images(CASES[name](severity)[which])[1]
-        assert bool((found.branches & branch).any()) == undecided
-        assert float(found.bound.max()) > 1e-5 or not undecided
+        bounded = images(CASES[name](severity)[which])[1]
+        assert bool((bounded.branches & branch).any()) == undecided
+        assert float(bounded.bound.max()) > 1e-5 or not undecided
 
 
 def test_the_culprit_is_the_gaussian_with_the_error() -> None:
@@ -148,17 +148,17 @@ def test_the_culprit_is_the_gaussian_with_the_error() -> None:
     exact = tuple(None if x is None else x.double() for x in single)
     third = int(single[0][:, 2].argsort()[2])
     single[0][third, 0] += 1e-2
-    found = exact_image(exact, single, arguments["viewmats"][0], arguments["Ks"][0], 16, 12)
-    assert (found.culprit == third).double().mean() > 0.9
+    bounded = exact_image(exact, single, arguments["viewmats"][0], arguments["Ks"][0], 16, 12)
+    assert (bounded.culprit == third).double().mean() > 0.9
 
 
 def test_without_gaussians_the_image_is_the_background() -> None:
     """Catches an error where a scene, or a tile, has no Gaussian."""
     for arguments in CASES["no_gaussians"]():
-        image, found, _ = images(arguments)
-        assert torch.equal(found.image.float(), image)
-        assert (found.culprit == -1).all()
-        assert found.bound.max() < 1e-6
+        image, bounded, _ = images(arguments)
+        assert torch.equal(bounded.image.float(), image)
+        assert (bounded.culprit == -1).all()
+        assert bounded.bound.max() < 1e-6
 
 
 def test_other_gaussians_are_refused() -> None:

@@ -3,10 +3,9 @@
 from typing import Any
 
 import torch
+from numerics import picture_cases
+from numerics.cases import CASES, of_area
 from torch import Generator, Tensor
-
-from gsbench.stability import picture_cases
-from gsbench.stability.cases import CASES, of_area
 
 PICTURES = [case.name for case in of_area("projection") + of_area("blending") if case.name != "faint_crowd"]
 MOST = 300  # Gaussians in a scene
@@ -21,23 +20,23 @@ def scene(seed: int) -> dict[str, Any]:
         cases = CASES[PICTURES[_pick(g, len(PICTURES))]](severity, seed)
         return dict(cases[_pick(g, len(cases))])
     N = 1 + _pick(g, MOST)
-    made = picture_cases.crowd(g, N, 0.05 * 10 ** (1.5 * _number(g)))
+    arguments = picture_cases.crowd(g, N, 0.05 * 10 ** (1.5 * _number(g)))
     kinds = torch.randint(8, (N,), generator=g) if _pick(g, 2) else torch.full((N,), _pick(g, 8))
-    _harden(made, kinds, g)
+    _harden(arguments, kinds, g)
     if _pick(g, 2):
-        made["shapes"] = 10 ** (3 * (2 * _rand(g, N) - 1) * _rand(g, N))
+        arguments["shapes"] = 10 ** (3 * (2 * _rand(g, N) - 1) * _rand(g, N))
     if _pick(g, 2):
-        made["viewmats"] = _turned(g)[None]
+        arguments["viewmats"] = _turned(g)[None]
     if _pick(g, 2):
         D = (1, 3, 4)[_pick(g, 3)]
-        made["colors"] = torch.randn(N, D, generator=g) * 10 ** (2 * _rand(g, N, 1))
-        made["background"] = torch.randn(D, generator=g)
-    return made | {"antialias": _pick(g, 3) == 0, "eps2d": (0.3, 0.3, 1e-3, 0.0)[_pick(g, 4)]}
+        arguments["colors"] = torch.randn(N, D, generator=g) * 10 ** (2 * _rand(g, N, 1))
+        arguments["background"] = torch.randn(D, generator=g)
+    return arguments | {"antialias": _pick(g, 3) == 0, "eps2d": (0.3, 0.3, 1e-3, 0.0)[_pick(g, 4)]}
 
 
-def _harden(made: dict[str, Any], kinds: Tensor, g: Generator) -> None:
+def _harden(arguments: dict[str, Any], kinds: Tensor, g: Generator) -> None:
     """Change the Gaussians of each kind in place."""
-    means, factors, opacities, N = made["means"], made["factors"], made["opacities"], len(kinds)
+    means, factors, opacities, N = arguments["means"], arguments["factors"], arguments["opacities"], len(kinds)
     axes = torch.linalg.qr(torch.randn(N, 3, 3, generator=g))[0]
     thin = 2 * axes * 10 ** (-4 * _rand(g, N, 1, 3) * _rand(g, N, 1, 1))
     away = 10 ** (3 * _rand(g, N, 1))
@@ -50,8 +49,8 @@ def _harden(made: dict[str, Any], kinds: Tensor, g: Generator) -> None:
     means[kinds == COPLANAR, 2] = 4.0 * torch.where(_rand(g, N) < 0.5, 1.0, nearly)[kinds == COPLANAR]
     opacities[kinds == FAINT] = (1 / 255 * (1 + 1e-6 * torch.randn(N, generator=g)))[kinds == FAINT]
     if _pick(g, 2):
-        made["near"] = float(means[_pick(g, N), 2].clamp(min=0.01))
-        means[kinds == NEAR, 2] = made["near"] * nearly[kinds == NEAR]
+        arguments["near"] = float(means[_pick(g, N), 2].clamp(min=0.01))
+        means[kinds == NEAR, 2] = arguments["near"] * nearly[kinds == NEAR]
 
 
 def _turned(g: Generator) -> Tensor:

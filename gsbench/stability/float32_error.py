@@ -1,0 +1,315 @@
+"""Measure the error of float32 in the images of a model: its bound, its change of PSNR, and the Gaussians behind it."""
+
+import math
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError, one_line
+from gsbench.kernels.raster import Viewport
+from gsbench.measure.images import STEPS, Pixels, rounding_image
+from gsbench.measure.quality import capped_psnr, evenly
+from gsbench.models import GaussianModel, Query
+from gsbench.models.joint import JointModel
+from gsbench.models.sliced import Gaussians3D
+from gsbench.models.slicing import reduce, subtract
+from gsbench.raster import EPS2D, FAR, NEAR
+from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U
+from gsbench.raster.reference import project
+from gsbench.scenes.scene import Camera, View
+from gsbench.stability.float64_render import float64_camera, float64_image, float64_model, render_twice
+
+VIEWS = 3  # of a run's `psnr_float32`, evenly spaced; a view takes ten to twenty times as long as a frame
+WORST = 10  # Gaussians that are listed
+PERCENTILES = (50, 90, 99, 99.9, 100)  # of condition numbers
+# What makes a Gaussian hard: the ratio of its axes, its opacity, and pixels by which rounding moves its mean.
+FLAT, OPAQUE, MOVED = 1e-3, 0.99, 1e-3
+BRANCHES = {"skipped": SKIPPED, "stopped": STOPPED, "order": ORDERED}
+
+
+class Shot(NamedTuple):
+    """A camera and a time of which the image is rendered, with the photograph if there is one."""
+
+    name: str
+    camera: Camera
+    time: float | None
+    photograph: Tensor | None  # [H, W, 3] in [0, 1]
+
+    @classmethod
+    def of(cls, view: View) -> "Shot":
+        """Return the shot of a data set's view."""
+        return cls(view.name, view.camera, view.time, view.image)
+
+
+@dataclass(frozen=True)
+class ViewExactness:
+    """The error of float32 in the image of one view; pixel values are in steps of 8 bits, 1/255."""
+
+    name: str
+    largest: float  # error of a channel of a pixel
+    rms: float
+    bound: float  # largest bound on the error
+    median_bound: float  # of the pixels that show a Gaussian
+    undecided: float  # share of the pixels in which rounding may decide what is blended, or in which order
+    psnr: float | None = None  # of the float32 image, dB; None: no photograph
+    psnr_change: float | None = None  # minus that of the float64 image
+    psnr_bound: float | None = None  # no rounding within the pixels' bounds changes PSNR by more
+
+
+@dataclass(frozen=True)
+class Culprit:
+    """A Gaussian with the largest share of the bound in some pixels of a view."""
+
+    index: int
+    view: str
+    pixels: int  # in which its share is the largest
+    bound: float  # sum of the bounds of these pixels, steps of 8 bits
+    why: list[str]  # what makes it hard
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """How hard the covariances of 4DGS, 6DGS or 7DGS are in float32, for all Gaussians and without AGR."""
+
+    condition_numbers: dict[str, list[float]]  # PERCENTILES of those of the joint factor, and of the sliced one
+    indefinite: dict[str, float]  # share of the sliced covariances by schur and by cholesky, which subtract
+    error: dict[str, float]  # 99th percentile of their relative errors
+
+
+@dataclass(frozen=True)
+class Exactness:
+    """The errors of float32 in all views of a model."""
+
+    title: str
+    gaussians: int
+    views: list[ViewExactness]
+    worst: list[Culprit]
+    conditioning: Conditioning | None  # None: the model has no covariance over time or direction
+    shown: tuple[str, Tensor, ExactImage] = field(repr=False)  # the view with the largest bound: name, float32, exact
+
+    @property
+    def psnr_change(self) -> float | None:
+        """Return the largest change of a view's PSNR by float32, in dB; None without photographs."""
+        changes = [abs(view.psnr_change) for view in self.views if view.psnr_change is not None]
+        return max(changes) if changes else None
+
+
+def measure(
+    model: GaussianModel, shots: Sequence[Shot], background: Sequence[float], title: str, antialias: bool = False
+) -> Exactness:
+    """Render each shot in float32 by the CPU kernels and in float64, and compare.
+
+    Args:
+        model: a trained model on the CPU, float32.
+        shots: the cameras and times, at least one.
+        background: the background colour, three numbers.
+        title: the name of the model in reports.
+        antialias: whether opacities are scaled by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
+
+    Raises:
+        InputError: there is no shot, or the CPU kernels are not installed.
+    """
+    if not shots:
+        raise InputError("expected at least one view to render, got none")
+    double = float64_model(model)
+    behind = torch.tensor(background, dtype=torch.float32)
+    views, culprits, shown = [], [], None
+    for shot in shots:
+        both = render_twice(model, double, shot.camera, shot.time, behind, antialias)
+        views.append(compare(shot, both.image, both.exact))
+        with torch.inference_mode():
+            culprits += blame(double, both.gaussians, shot, both.exact)
+        if shown is None or both.exact.bound.max() > shown[2].bound.max():
+            shown = (shot.name, both.image, both.exact)
+    assert shown is not None
+    culprits.sort(key=lambda culprit: -culprit.bound)
+    first = {culprit.index: culprit for culprit in reversed(culprits)}  # of each Gaussian its worst view
+    worst = [culprit for culprit in culprits if first[culprit.index] is culprit][:WORST]
+    return Exactness(title, len(model), views, worst, conditioning(double), shown)
+
+
+def compare(shot: Shot, image: Tensor, exact: ExactImage) -> ViewExactness:
+    """Compare a float32 image [H, W, 3] with the exact one, and both with the photograph if there is one."""
+    error = (image.double() - exact.image).abs()
+    plain = ViewExactness(
+        shot.name,
+        largest=STEPS * float(error.max()),
+        rms=STEPS * float(error.square().mean().sqrt()),
+        bound=STEPS * float(exact.bound.max()),
+        median_bound=STEPS * exact.median_bound,
+        undecided=float(exact.undecided.double().mean()),
+    )
+    if shot.photograph is None:
+        return plain
+    psnr = capped_psnr(image, shot.photograph)
+    away = (exact.image.clamp(0, 1) - shot.photograph.double()).abs()
+    bound = exact.bound[..., None]
+    share = float((2 * away * bound + bound.square()).mean() / away.square().mean().clamp(min=1e-300))
+    most = -10 * math.log10(1 - share) if share < 1 else math.inf
+    return replace(plain, psnr=psnr, psnr_change=psnr - capped_psnr(exact.image, shot.photograph), psnr_bound=most)
+
+
+def psnr_float32(
+    model: GaussianModel,
+    views: Sequence[View],
+    background: Tensor,  # [3] float32
+    antialias: bool,
+) -> tuple[float | None, str]:
+    """Return the largest change of a view's PSNR by float32 in dB, or None and the reason why it is not measured.
+
+    PSNR is capped (gsbench.measure.exact_views), so that a view that is rendered exactly has no change.
+    """
+    if model.backend.name != "cpu":
+        return None, f"needs raster.backend=cpu, whose images have a float64 twin; this run has {model.backend.name}"
+    try:
+        double = float64_model(model)
+        changes = []
+        for shot in map(Shot.of, evenly(views, VIEWS)):
+            both = render_twice(model, double, shot.camera, shot.time, background, antialias)
+            changes.append(abs(compare(shot, both.image, both.exact).psnr_change or 0.0))
+    except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
+        return None, f"the model has no image in float64: {one_line(error)}"
+    if not all(map(math.isfinite, changes)):
+        return None, "an image has a pixel that is not a number"
+    return max(changes), ""
+
+
+# ---- which Gaussians, and why
+
+
+def blame(double: GaussianModel, gaussians: Gaussians3D, shot: Shot, exact: ExactImage) -> list[Culprit]:
+    """Return the Gaussians with the largest shares of the bounds in a view, and what makes each of them hard.
+
+    Args:
+        double: the model in float64.
+        gaussians: its 3D Gaussians in this view.
+        shot: the camera and the time.
+        exact: the exact image.
+    """
+    blamed = exact.culprit.flatten() >= 0
+    ids = exact.culprit.flatten()[blamed].long()
+    bounds, branches = exact.bound.flatten()[blamed], exact.branches.flatten()[blamed]
+    sums = bounds.new_zeros(len(gaussians.means)).index_add_(0, ids, bounds)
+    rows = sums.argsort(descending=True)[:WORST]
+    rows = rows[sums[rows] > 0]
+    why, culprits = reasons(gaussians, shot.camera, rows), []
+    for row, words, negative in zip(rows.tolist(), why, by_published_formula(double, rows), strict=True):
+        mask = ids == row
+        words += ["indefinite"] if negative else []
+        words += [name for name, bit in BRANCHES.items() if bounds[mask & (branches & bit > 0)].sum() > sums[row] / 2]
+        culprits.append(Culprit(row, shot.name, int(mask.sum()), STEPS * float(sums[row]), words))
+    return culprits
+
+
+def reasons(
+    gaussians: Gaussians3D,  # float64
+    camera: Camera,
+    rows: Tensor,  # [M]
+) -> list[list[str]]:
+    """Return of some Gaussians whether each is flat, far, huge or opaque in a view."""
+    means, factors, opacities = (part[rows] for part in gaussians[:3])
+    shapes = None if gaussians.shapes is None else gaussians.shapes[rows]
+    exact = float64_camera(camera)
+    viewport = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, False)
+    splats = project(means, factors, opacities, exact.viewmat, exact.K, *viewport, shapes)
+    axes = torch.linalg.svdvals(factors)
+    moved = U * (means.norm(dim=-1) + exact.center.norm()) * exact.K[0, 0] / splats.depths
+    named = {
+        "flat": axes[:, -1] < FLAT * axes[:, 0],
+        "far": moved > MOVED,
+        "huge": splats.half_sizes.amax(-1) > max(camera.width, camera.height),
+        "opaque": opacities > OPAQUE,
+    }
+    return [[name for name, holds in named.items() if holds[i]] for i in range(len(rows))]
+
+
+def by_published_formula(double: GaussianModel, rows: Tensor) -> Iterable[bool]:
+    """Return of some Gaussians [M] whether the papers' formula makes their covariance indefinite in float32.
+
+    That formula, cov = S_pp - K S_pq^T, subtracts covariances (docs/stability.md). AGR is left out. A model without
+    such a covariance has none that is indefinite.
+    """
+    if not isinstance(double, JointModel) or not len(rows):
+        return [False] * len(rows)
+    return _is_indefinite(subtract(double.factors(double.raw_of(rows)).float(), "schur")[1].double()).tolist()
+
+
+@torch.inference_mode()
+def conditioning(double: GaussianModel) -> Conditioning | None:
+    """Return the condition numbers of a float64 model's covariance factors, and what subtraction makes of them."""
+    if not isinstance(double, JointModel):
+        return None
+    joint = double.factors(double.raw_of(torch.arange(len(double))))
+    sliced = reduce(joint).T_pp
+    exact = sliced @ sliced.mT
+    names = {f"joint factor, {joint.shape[-1]} x {joint.shape[-1]}": joint, "sliced factor, 3 x 3": sliced}
+    numbers = {name: np.percentile(np.linalg.cond(F.numpy()), PERCENTILES).tolist() for name, F in names.items()}
+    indefinite, errors = {}, {}
+    for scheme in ("schur", "cholesky"):
+        cov = subtract(joint.float(), scheme)[1].double()
+        indefinite[scheme] = float(_is_indefinite(cov).double().mean())
+        error = (cov - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))
+        errors[scheme] = float(np.quantile(error.numpy(), 0.99))
+    return Conditioning(numbers, indefinite, errors)
+
+
+def _is_indefinite(cov: Tensor) -> Tensor:
+    return torch.linalg.eigvalsh(cov)[:, 0] < 0
+
+
+# ---- a frame of the viewer
+
+
+class Float32Error(NamedTuple):
+    """The bound on the error of float32 in a frame: its image, and a summary in steps of 8 bits, 1/255."""
+
+    image: Pixels  # [H, W, 3] RGB, on the scale of `gsbench.measure.images.rounding_image`
+    largest: float  # bound of a pixel
+    median: float  # bound of the pixels that show a Gaussian
+    undecided: float  # share of the pixels in which rounding may decide what is blended, or in which order
+    seconds: float  # that it took
+
+
+@torch.inference_mode()
+def float32_error(
+    double: GaussianModel,
+    single: Gaussians3D,
+    query: Query,
+    camera: Camera,
+    background: Tensor,  # [3] float32
+    antialias: bool,
+) -> Float32Error:
+    """Bound the error of each pixel of a float32 image.
+
+    Args:
+        double: the model in float64; used by one thread at a time.
+        single: the slice of the float32 model that the image shows.
+        query: the viewpoint and the time of that slice, float64.
+        camera: the camera of the image.
+        background: the background colour.
+        antialias: whether opacities are scaled, as in `gsbench.raster.rasterize`.
+
+    Raises:
+        InputError: the model does not compute in float64, or a Gaussian has a value that is not finite.
+    """
+    start = time.perf_counter()
+    try:
+        gaussians = double.slice(query)
+    except InputError:
+        raise
+    except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
+        raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
+    exact = float64_image(gaussians, single, camera, background, antialias)
+    bound = STEPS * exact.bound
+    return Float32Error(
+        rounding_image(bound.numpy()),
+        largest=float(bound.max()),
+        median=STEPS * exact.median_bound,
+        undecided=float(exact.undecided.double().mean()),
+        seconds=time.perf_counter() - start,
+    )

@@ -1,0 +1,257 @@
+"""How exact a model's images are: the numbers of the command and of a record, what is written and what is refused."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_run import main_here, overrides, write_moving_square
+from tiny_training import compose, moving_square
+
+from gsbench import kernels
+from gsbench.models import GaussianModel, Query, build
+from gsbench.models.cameras import around
+from gsbench.models.factors import KINDS
+from gsbench.run import setup
+from gsbench.run.load import load_run
+from gsbench.scenes import Points, View
+from gsbench.scenes.trained import TrainedGaussians, ply_of
+from gsbench.stability import float32_error, report
+from gsbench.stability.__main__ import main
+from gsbench.stability.float64_render import float64_camera
+from gsbench.train.seeding import generator
+
+pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
+BLACK = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of 7DGS."""
+    root = tmp_path_factory.mktemp("exact")
+    assert main_here(*overrides(write_moving_square(root / "data"), root / "results", "model=7dgs", "agr=false")) == 0
+    return next(path.parent for path in root.rglob("checkpoint.pt"))
+
+
+def write_ply(path: Path) -> Path:
+    """A PLY of ten Gaussians around the origin."""
+    g = torch.Generator().manual_seed(0)
+    fields = {"means": torch.randn(10, 3, generator=g), "log_scales": torch.full((10, 3), -1.0),
+              "quats": torch.randn(10, 4, generator=g), "logits": torch.zeros(10),
+              "dc": torch.randn(10, 3, generator=g), "rest": torch.zeros(10, 15, 3)}  # fmt: skip
+    path.write_bytes(ply_of(TrainedGaussians(**fields)))
+    return path
+
+
+# ---- the command
+
+
+def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches other views than those of the record, another PSNR than it, and an error that its bound does not hold.
+
+    Also a picture that --json writes into the run's folder, which may be read-only, and one that is missing.
+    """
+    (run / "exactness.png").unlink(missing_ok=True)
+    content = set(run.iterdir())
+    assert main([str(run), "--json"]) == 0
+    assert set(run.iterdir()) == content
+    numbers = json.loads(capsys.readouterr().out)
+    record = json.loads((run / "record.json").read_text())
+    assert [view["name"] for view in numbers["views"]] == [view["name"] for view in record["per_view"]]
+    for view, known in zip(numbers["views"], record["per_view"], strict=True):
+        assert view["psnr"] == pytest.approx(known["psnr"], abs=0.05)  # the record's images are rounded to 8 bits
+        assert 0 < view["largest"] <= view["bound"] < 0.5
+        assert abs(view["psnr_change"]) <= view["psnr_bound"] < 0.01
+    assert 0 < len(numbers["worst"]) <= float32_error.WORST
+    assert list(numbers["conditioning"]["condition_numbers"]) == ["joint factor, 7 x 7", "sliced factor, 3 x 3"]
+    assert "decimal of the mean PSNR" in numbers["verdict"]
+    assert main([str(run)]) == 0
+    text = capsys.readouterr().out
+    assert "schur in float32: 0.00 % indefinite" in text
+    assert f"Written: {run / 'exactness.png'}" in text
+    assert (run / "exactness.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a PLY that is not read, is seen from inside, or is said to have a PSNR."""
+    assert main([str(write_ply(tmp_path / "third party.ply")), "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    rows = [line for line in text.splitlines() if line.startswith("| orbit")]
+    assert len(rows) == 10
+    assert all(row.endswith("| - | - | - |") and "0.0e+00" not in row for row in rows)
+    assert "Rounding to 8 bits changes an image" in text
+    assert (tmp_path / "out/third party.exactness.png").exists()
+
+
+def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a stack trace for a folder without a run, a file that is no PLY, and an --out that is a file."""
+    (tmp_path / "broken.ply").write_text("no")
+    for arguments, expected in (
+        ([tmp_path], "expected the folder of a run"),
+        ([tmp_path / "broken.ply"], "expected a PLY"),
+        ([write_ply(tmp_path / "right.ply"), "--out", tmp_path / "broken.ply"], f"{tmp_path / 'broken.ply'}"),
+    ):
+        assert main([*map(str, arguments)]) == 2
+        line = capsys.readouterr().err.splitlines()[-1]  # the PLY has a note on its columns
+        assert line.startswith("gsbench.stability: error: ")
+        assert expected in line
+
+
+def test_an_exact_view_has_no_change(run: Path) -> None:
+    """Catches a mean PSNR whose change is NaN, infinity less infinity, as one view is the background alone."""
+    model = load_run(run).model
+    empty = float32_error.Shot("empty", around(model, 4.0, 32, 32, 0.0), 0.0, torch.zeros(32, 32, 3))
+    with torch.no_grad():
+        model.splats["opacities"].fill_(-50.0)
+    exactness = float32_error.measure(model, [empty], BLACK, "")
+    assert (exactness.views[0].psnr, exactness.views[0].psnr_change) == (100.0, 0.0)
+    assert "no decimal of the mean PSNR" in report.verdict(exactness)
+
+
+@pytest.mark.parametrize(("change", "words"), [(0.2, "the first decimal"), (2e-4, "the fourth decimal"),
+                                               (3.0, "the digits before"), (0.0, "no decimal")])  # fmt: skip
+def test_the_verdict_names_the_decimal(change: float, words: str) -> None:
+    """Catches a decimal off by one, and the logarithm of zero."""
+    view = float32_error.ViewExactness("a", 1e-3, 1e-4, 1e-2, 1e-3, 0.0, 30.0, change, 1.0)
+    shown = ("a", torch.zeros(0), float32_error.ExactImage(*[torch.zeros(0)] * 4))
+    assert f"changes {words}" in report.verdict(float32_error.Exactness("a", 1, [view], [], None, shown))
+
+
+# ---- which Gaussians, and why
+
+
+def hard_model() -> GaussianModel:
+    """Five Gaussians of 3DGS in view of a camera at -4 along y; each but the first is hard in its own way."""
+    model = build("3dgs", sh_degree=0)
+    means = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [-0.5, 0, 0], [0, 0, 0.5], [0, 0, -0.5]])
+    model.initialise(Points(means, torch.rand(5, 3)), 1.0, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        model.splats["scales"].fill_(-2.0)
+        model.splats["scales"][1, 0] -= 8.0
+        model.splats["scales"][2] = 4.0
+        model.splats["opacities"].zero_()
+        model.splats["opacities"][3] = 6.0
+    return model.requires_grad_(False)
+
+
+def test_why_a_gaussian_is_hard() -> None:
+    """Catches a reason given to the wrong Gaussian."""
+    model = hard_model()
+    camera = around(model, 4.0, 32, 32, 0.0, 0.0)
+    exact = model.double().slice(Query.of(float64_camera(camera), None))
+    far_away = exact._replace(means=exact.means + torch.tensor([1e6, 0.0, 0.0]))
+    shift = torch.eye(4)
+    shift[:3, 3] = camera.viewmat[:3, 3] - camera.viewmat[:3, :3] @ torch.tensor([1e6, 0.0, 0.0])
+    shift[:3, :3] = camera.viewmat[:3, :3]
+    rows = torch.arange(5)
+    assert float32_error.reasons(exact, camera, rows) == [[], ["flat"], ["huge"], ["opaque"], []]
+    moved = float32_error.reasons(far_away, float32_error.Camera(shift, camera.K, 32, 32), rows)
+    assert all("far" in words for words in moved)
+
+
+@pytest.mark.parametrize(("name", "motion"), [("7dgs", 300), ("7dgs_nodir", 3000)])
+def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name: str, motion: int) -> None:
+    """Catches a Gaussian whose published covariance is indefinite in float32 and is not named, or the reverse."""
+    model = build(name, sh_degree=0, lambda_t=0.5, **({"lambda_d": 0.5} if name == "7dgs" else {}))
+    g = torch.Generator().manual_seed(0)
+    model.initialise(Points(torch.rand(20, 3, generator=g), torch.rand(20, 3, generator=g)), 1.0, g)
+    with torch.no_grad():
+        model.splats["motion"][10:] = motion * torch.randn(10, model.splats["motion"].shape[1], generator=g)
+    negative = list(float32_error.by_published_formula(model.double(), torch.arange(20)))
+    assert not any(negative[:10])
+    assert any(negative[10:])
+
+
+def model_of(name: str, log_diagonal: Sequence[float] | None = None, motion: float = 0.0) -> GaussianModel:
+    model, points = setup.build(compose(name, 100)), moving_square().points
+    assert points is not None
+    model.initialise(points, 4.4, generator(0))
+    if log_diagonal:
+        model.splats["log_diagonal"].data[:] = torch.tensor(log_diagonal)
+        for kind in KINDS:
+            model.splats[kind].data.zero_()
+        for kind, size in (("motion", motion), ("coupling", motion / 1e3)):
+            model.splats[kind].data.normal_(0, size, generator=generator(0))
+    return model.double()
+
+
+def test_condition_numbers() -> None:
+    """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too.
+
+    Also a share of indefinite covariances by the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3.
+    """
+    plain = float32_error.conditioning(model_of("7dgs", [0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0]))
+    assert plain is not None
+    for numbers, decades in zip(plain.condition_numbers.values(), (6, 2), strict=True):
+        assert numbers == pytest.approx([math.exp(decades)] * len(float32_error.PERCENTILES))
+    assert set(plain.indefinite.values()) == {0.0}
+    assert max(plain.error.values()) < 1e-5
+    hard = float32_error.conditioning(model_of("7dgs", [0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5], motion=1e3))
+    assert hard is not None
+    assert min(hard.indefinite.values()) > 0.5
+    assert min(hard.error.values()) > 1
+    assert float32_error.conditioning(model_of("3dgs")) is None
+
+
+# ---- the metric of a record
+
+
+def psnr_float32(model: GaussianModel, views: Sequence[View]) -> tuple[float | None, str]:
+    return float32_error.psnr_float32(model, views, torch.zeros(3), False)
+
+
+def small_model(backend: str) -> tuple[GaussianModel, list[View]]:
+    config, square = compose("7dgs", 100, f"raster.backend={backend}"), moving_square()
+    model = setup.build(config)
+    assert square.points is not None
+    model.initialise(square.points, square.extent, generator(config.seed))
+    return model, square.train[:8]
+
+
+def test_it_is_the_largest_change_of_three_spaced_views() -> None:
+    """Catches a mean or a sum instead of the largest change, other views, and a bound instead of a change."""
+    model, views = small_model("cpu")
+    change, why = psnr_float32(model, views)
+    assert not why
+    shots = [float32_error.Shot.of(views[i]) for i in (0, 2, 5)]
+    assert len(shots) == float32_error.VIEWS
+    known = float32_error.measure(model, shots, BLACK, "").views
+    assert change == max(abs(view.psnr_change or 0.0) for view in known) > 0
+
+
+def test_a_run_without_the_cpu_kernels_has_a_reason() -> None:
+    """Catches a backend whose images are compared with those of another one."""
+    change, why = psnr_float32(*small_model("reference"))
+    assert change is None
+    assert "needs raster.backend=cpu" in why
+
+
+@pytest.mark.parametrize("kind", [RuntimeError, TypeError])
+def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches an error of a user's model in float64 that ends a trained run."""
+    model, views = small_model("cpu")
+    right = type(model).slice
+
+    def single(self: Any, query: Query) -> Any:
+        if query.center.dtype == torch.float64:
+            raise kind("expected scalar type Float but found Double")
+        return right(self, query)
+
+    monkeypatch.setattr(type(model), "slice", single)
+    change, why = psnr_float32(model, views)
+    assert change is None
+    assert why == "the model has no image in float64: expected scalar type Float but found Double"
+
+
+def test_equal_images_have_no_change() -> None:
+    """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped."""
+    model, views = small_model("cpu")
+    double = float32_error.float64_model(model)
+    rendered = [float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).image
+                for view in views]  # fmt: skip
+    equal = [replace(view, pixels=image) for view, image in zip(views, rendered, strict=True)]
+    assert psnr_float32(model, equal) == (0.0, "")

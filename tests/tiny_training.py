@@ -1,0 +1,49 @@
+"""A training small enough for a test: its settings, and a scene of a few pixels in memory."""
+
+import math
+
+import hydra
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from gsbench.config import CONF, Config, register_schema
+from gsbench.scenes.scene import Camera, Points, Scene, View
+
+SIZE = 16  # pixels a side
+VIEWS = 12
+POINTS = 80
+
+
+def compose(model: str, steps: int, *overrides: str) -> Config:
+    """The settings of a short training with the experiment `+exp=mini`; its scene is not loaded."""
+    register_schema()
+    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
+             "train.densify.every=25", *overrides]  # fmt: skip
+    if GlobalHydra.instance().is_initialized():
+        composed = hydra.compose("config", names)
+    else:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            composed = hydra.compose("config", names)
+    config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
+    return config
+
+
+def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Scene:
+    """A bright square on black that moves with time, seen by cameras on a circle of four units around the origin."""
+    train = []
+    for i in range(views):
+        moment, angle = i / max(1, views - 1), 2 * math.pi * i / views
+        image = torch.zeros(SIZE, SIZE, 3, dtype=dtype)
+        left = 3 + round(5 * moment)
+        image[5:11, left : left + 5] = torch.tensor([1.0, 0.9, 0.7], dtype=dtype)
+        c, s = math.cos(angle), math.sin(angle)
+        viewmat = torch.eye(4, dtype=dtype)
+        viewmat[:3, :3] = torch.tensor([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+        viewmat[2, 3] = 4.0
+        focal = SIZE * 1.4
+        K = torch.tensor([[focal, 0.0, SIZE / 2], [0.0, focal, SIZE / 2], [0.0, 0.0, 1.0]], dtype=dtype)
+        train.append(View(f"train/{i}", Camera(viewmat, K, SIZE, SIZE), moment, image))
+    g = torch.Generator().manual_seed(0)
+    points = Points(torch.rand(POINTS, 3, generator=g) * 1.6 - 0.8, torch.rand(POINTS, 3, generator=g))
+    return Scene("moving-square", train, [], train, (0.0, 0.0, 0.0), 4.4, points, "of tests/tiny_training.py")
