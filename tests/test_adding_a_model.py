@@ -14,7 +14,7 @@ from tiny_run import ROOT, environment, overrides, write_moving_square
 from benchmarks.against import WITHOUT_EDITABLE
 from gsbench.measure import record
 from gsbench.measure.record import Record
-from gsbench.scenes.trained import ply_of, read_trained
+from gsbench.scenes.gaussian_ply import ply_of, read_trained
 
 
 def blocks() -> dict[str, str]:

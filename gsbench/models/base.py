@@ -22,9 +22,9 @@ from gsbench.models.elementary import exp, sqrt
 from gsbench.models.query import Query, unit
 from gsbench.models.refinement import OCTAVES, Refinement
 from gsbench.models.sliced import Conditioned, Gaussians3D, Geometry
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 from gsbench.schedule import ActiveComponents
 
 Raw = dict[str, Tensor]  # raw parameters (before exp, sigmoid and normalisation) by name, N rows each

@@ -15,8 +15,8 @@ from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.elementary import exp, log, log1p
 from gsbench.models.sliced import reach
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 
 LARGEST_SHIFT = 4.0  # the exponent at which a variable has its full effect on the mean
 FADED = 20.0  # a 2 y^2 at which ln(1 - tanh(y^2)) is below BETA_LOG_MIN

@@ -15,8 +15,8 @@ from gsbench.models.gated import GatedModel
 from gsbench.models.query import Query
 from gsbench.models.registry import register
 from gsbench.models.sliced import Conditioned, Geometry
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 
 
 @register("3dgs")

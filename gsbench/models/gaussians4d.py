@@ -23,9 +23,9 @@ from gsbench.models.query import Query, unit
 from gsbench.models.registry import register
 from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import size_of
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 
 MAX_DEGREE = 32  # largest degree of the Fourier series; the frames of a scene do not resolve higher frequencies
 

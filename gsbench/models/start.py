@@ -3,9 +3,9 @@
 import torch
 
 from gsbench.models.base import GaussianModel
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import SH_C0
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 
 
 @torch.no_grad()

@@ -20,8 +20,8 @@ from gsbench.models.joint import JointModel
 from gsbench.models.query import Query, times_inside, unit
 from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 
 # The order of position, time and direction among the rows of the triangular factor.
 FACTOR_ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}

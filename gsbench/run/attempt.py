@@ -21,8 +21,8 @@ from gsbench.run.log import RunLog
 from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.placement import gaussians_to_standard
-from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train.loop import Trainer
 
 

@@ -15,7 +15,7 @@ from gsbench.run.identity import Run
 from gsbench.run.resolve import Resolved, plain
 from gsbench.run.setup import build
 from gsbench.scenes import Scene
-from gsbench.scenes.trained import TrainedGaussians
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 

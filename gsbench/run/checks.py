@@ -22,7 +22,7 @@ from gsbench.models.gated import as_gated
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
-from gsbench.scenes.trained import TrainedGaussians, read_trained, share_seen
+from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
 from gsbench.train.losses import WINDOW
 from gsbench.train.penalties import check_penalties
 

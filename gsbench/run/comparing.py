@@ -15,7 +15,7 @@ from gsbench.run.identity import Run, label_of
 from gsbench.run.resolve import Resolved, is_auto, with_candidate, with_model
 from gsbench.run.setup import build, build_with_placeholders
 from gsbench.scenes import Scene
-from gsbench.scenes.trained import TrainedGaussians
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import Schedule
 from gsbench.train.loop import Trainer, comparison_of
 from gsbench.train.optim import check_rates

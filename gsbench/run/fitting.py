@@ -18,9 +18,9 @@ from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import Run
 from gsbench.run.load import plain_description
 from gsbench.scenes import Points, Scene
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen
 from gsbench.scenes.scene import STANDARD
-from gsbench.scenes.trained import TrainedGaussians
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.finite_check import DivergedError

@@ -15,7 +15,7 @@ from gsbench.run.candidates import Candidates, Result, best, highest
 from gsbench.run.identity import Run
 from gsbench.run.resolve import Resolved
 from gsbench.scenes import Scene
-from gsbench.scenes.trained import TrainedGaussians
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.train.loop import Trainer, length_choice_of
 
 

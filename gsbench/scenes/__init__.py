@@ -22,7 +22,7 @@ class _Layout:
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
-    reader: str  # module of this package with load(root, *, downscale, background, resize); imported when it is needed
+    reader: str  # module.function of this package: (root, *, downscale, background, resize) -> Scene; imported late
     reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
 
 
@@ -31,21 +31,21 @@ _LAYOUTS = (
         "transforms_train.json",
         "transforms_{train,val,test}.json beside the PNG images they name (D-NeRF: data.zip, linked in "
         "github.com/albertpumarola/D-NeRF; 7DGS-PBR: the Data link of gaozhongpai.github.io/7dgs)",
-        "blender",
+        "transforms.load_blender",
     ),
     _Layout(
         "cameras_parameters.txt",
         "cameras_parameters.txt beside images <Scene>_undist_<frame>_<camera>.png (Technicolor: by request to the "
         "authors of Sabater et al. 2017)",
-        "technicolor",
+        "technicolor.load",
         ("sparse",),
     ),
     _Layout(
         "sparse",
         "images (PNG or JPEG) beside a COLMAP model in sparse/0 (your own capture)",
-        "captured",
+        "colmap.load",
     ),
-    _Layout("transforms.json", "nerfstudio's transforms.json beside the images it names", "nerfstudio"),
+    _Layout("transforms.json", "nerfstudio's transforms.json beside the images it names", "transforms.load_nerfstudio"),
 )
 
 
@@ -106,8 +106,9 @@ def load(
     layout = present[0]
     more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
     more |= {} if repair is None else {"repair": _repair(repair, layout)}
-    reader = importlib.import_module(f"gsbench.scenes.{layout.reader}")
-    scene: Scene = reader.load(root, downscale=downscale, background=background, resize=resize, **more)
+    module, function = layout.reader.split(".")
+    reader = getattr(importlib.import_module(f"gsbench.scenes.{module}"), function)
+    scene: Scene = reader(root, downscale=downscale, background=background, resize=resize, **more)
     if others := ", ".join(other.marker for other in present[1:] if other.marker not in layout.reads_too):
         scene = replace(scene, notes=(f"{layout.marker} is read, and not {others}", *scene.notes))
     for note in scene.notes:
@@ -117,7 +118,7 @@ def load(
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
     """Check and return the numbers of the first and the last frame; raise InputError for a layout without frames."""
-    if layout.reader != "technicolor":
+    if layout.marker != "cameras_parameters.txt":
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
         raise InputError(f"frames: expected the numbers of the first and the last frame, got {frames!r:.80}")
@@ -128,7 +129,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
     """Check and return the names of images to replace; raise InputError for a layout without frames."""
-    if layout.reader != "technicolor":
+    if layout.marker != "cameras_parameters.txt":
         raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")

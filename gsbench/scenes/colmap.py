@@ -1,6 +1,10 @@
-"""Read a COLMAP sparse model (cameras, images, points3D; .bin or .txt); the files are checked."""
+"""Load captures: images, a COLMAP model of their cameras (.bin or .txt), and times from file names or times.csv.
+
+A damaged file, or a camera that is not read, raises `InputError`, which names the file and the record.
+"""
 
 import math
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,9 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.reading import read_file
-from gsbench.scenes.lens import Lens
-from gsbench.scenes.scene import Points
+from gsbench.scenes import files, shots, times
+from gsbench.scenes.files import ImageFinder
+from gsbench.scenes.placement import standard_scene
+from gsbench.scenes.scene import HELD_OUT, Points, Scene, hold_out
+from gsbench.scenes.shots import MASKS, Lens, Shot
 
+IMAGES = "images"  # the folder of the images
 _MAX_FILE = 1 << 32  # bytes
 # COLMAP, "Output format": the fixed parts of the records of its binary files.
 _COUNT = struct.Struct("<Q")
@@ -55,12 +63,76 @@ class PosedImage:
     camera: int  # key of `read_cameras`
 
 
-def read_part(folder: Path, part: str) -> ModelFile:
-    """Read one of the parts `cameras`, `images` and `points3D` of a model, whose folder is for example sparse/0.
+def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
+    """Load a scene from images and a COLMAP model; see `gsbench.scenes.load` for the arguments.
+
+    - `images/` has a PNG or a JPEG for each image that the model registers. If the one that the model names is missing,
+      an image of the same name with another suffix is read.
+    - `sparse/0/`, or `sparse/`, has the model: cameras, images and points3D, as .bin or .txt. Its points are the
+      initial points. Of several models the one with the most images is read.
+    - Times come from `times.csv` with the columns `name,time`, otherwise from a number in each name, which
+      `gsbench.scenes.times` chooses. They are scaled to [0, 1]. If no name has a number, the scene has no times.
+    - `masks/` may have an 8-bit grey PNG for each image, with the number of the object in each pixel.
+
+    The distortion of lenses is undone by OpenCV. The principal point may lie anywhere. Every eighth image in the order
+    of time and then of name is a test view, from the eighth on; the others are for training.
 
     Raises:
-        InputError: the folder has neither <part>.bin nor <part>.txt, or the file cannot be read.
+        InputError: something is missing, damaged or contradictory; the message names the file.
     """
+    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
+    root = root.resolve()
+    folder, notes = largest_model(root / "sparse")
+    cameras, posed, points = (read_part(folder, part) for part in ("cameras", "images", "points3D"))
+    listed, digests, more = _list_shots(root, posed, read_cameras(cameras))
+    initial = read_points(points)
+    loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
+    digests |= {
+        shot.path.relative_to(root).as_posix(): digest for shot, digest in zip(listed, loaded.digests, strict=True)
+    }
+    digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in (cameras, posed, points)}
+    train, test = hold_out(loaded.views, HELD_OUT)
+    return standard_scene(
+        name=name,
+        train=train,
+        val=[],
+        test=test,
+        background=background,
+        points=initial,
+        fingerprint=files.fingerprint(digests),
+        notes=(*more, *notes, *loaded.notes),
+        up=None,
+    )
+
+
+def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[list[Shot], dict[str, str], list[str]]:
+    """Return the images of a model in the order of time, the SHA-256 of times.csv by name, if it exists, and notes."""
+    listed = read_images(posed)
+    if len(listed) < HELD_OUT:
+        raise InputError(f"{posed.path}: expected at least {HELD_OUT} images, as one in {HELD_OUT} is a test view, "
+                         f"got {len(listed)}", docs="data.md#your-own-capture")  # fmt: skip
+    for image in listed:
+        if image.camera not in lenses:
+            raise InputError(f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number "
+                             f"{image.camera}")  # fmt: skip
+    names, viewmats = [image.name for image in listed], np.stack([image.viewmat for image in listed])
+    places = times.places_of(viewmats, [lenses[image.camera].key for image in listed])
+    timed, digests = times.of_images(root, names, viewmats, places, posed.path)
+    result, finder = [], ImageFinder(root)
+    for image, time in zip(listed, timed.values, strict=True):
+        where = f"{posed.path}: image {image.name[:80]!a}"
+        path = finder.find(f"{IMAGES}/{image.name}", where)
+        name = files.without_suffix(path.relative_to(root / IMAGES).as_posix())
+        mask = files.find_inside(root, f"{MASKS}/{name}.png", where) if (root / MASKS).is_dir() else None
+        viewmat = torch.from_numpy(image.viewmat)
+        named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
+        result.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
+    ordered = sorted(result, key=lambda shot: (shot.time or 0.0, shot.name))
+    return ordered, digests, timed.notes + finder.notes()
+
+
+def read_part(folder: Path, part: str) -> ModelFile:
+    """Read one of the parts `cameras`, `images` and `points3D` of a model, whose folder is for example sparse/0."""
     for path in (folder / f"{part}.bin", folder / f"{part}.txt"):
         if path.exists():
             return ModelFile(path, read_file(path, str(path), _MAX_FILE))
@@ -74,9 +146,6 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
 
     COLMAP writes a folder 0, 1, .. for each part of a capture that it could not join. Of equals, the first is taken,
     and `sparse` itself last.
-
-    Raises:
-        InputError: the images of one of several models cannot be read.
     """
     parts = sorted(sparse.iterdir(), key=lambda path: (len(path.name), path.name)) if sparse.is_dir() else []
     models = [
@@ -94,11 +163,7 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
 
 
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
-    """Return the cameras of a model by their numbers.
-
-    Raises:
-        InputError: the file is damaged, or a camera has a lens model that is not read, such as a fisheye.
-    """
+    """Return the cameras of a model by their numbers."""
     rows = _text_cameras(file) if file.path.suffix == ".txt" else _binary_cameras(file)
     found = {}
     for number, model, width, height, values in rows:
@@ -109,11 +174,7 @@ def read_cameras(file: ModelFile) -> dict[int, Lens]:
 
 
 def read_images(file: ModelFile) -> list[PosedImage]:
-    """Return the registered images of a model.
-
-    Raises:
-        InputError: the file is damaged, has no image, or names one twice.
-    """
+    """Return the registered images of a model."""
     rows = _text_images(file) if file.path.suffix == ".txt" else _binary_images(file)
     found: dict[str, PosedImage] = {}
     for name, pose, camera in rows:
@@ -132,11 +193,7 @@ def read_images(file: ModelFile) -> list[PosedImage]:
 
 
 def read_points(file: ModelFile) -> Points:
-    """Return positions (float64) and colours of the points of a model.
-
-    Raises:
-        InputError: the file is damaged or has no points.
-    """
+    """Return positions (float64) and colours of the points of a model."""
     path = file.path
     rows = _text_points(file) if path.suffix == ".txt" else _binary_points(file)
     values = np.array(rows, np.float64).reshape(-1, 6)

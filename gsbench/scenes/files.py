@@ -16,7 +16,7 @@ _DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")  # with which absolute paths begin o
 def find_inside(
     root: Path,  # the scene's folder, resolved
     name: str,  # a path relative to `root`, as the data set writes it
-    where: str,  # the file and field that hold `name`, for the message
+    where: str,
 ) -> Path:
     """Return the path of a file; raise InputError if `name` leaves the scene's folder `root`.
 
@@ -55,14 +55,11 @@ class ImageFinder:
     def find(
         self,
         name: str,  # a path relative to the scene's folder, with or without suffix, with / or Windows' backslashes
-        where: str,  # the file and field that hold `name`, for the message
+        where: str,
     ) -> Path:
         """Return the path of the image: `name` itself if it is a file, otherwise that of another suffix, or of case.
 
         If there is neither, the path of the PNG or of what `name` says is returned, for a message that names it.
-
-        Raises:
-            InputError: `name` leaves the scene's folder.
         """
         path = find_inside(self._root, name, where)
         if not os.path.isfile(path) and "\\" in name:

@@ -1,4 +1,7 @@
-"""Read PNG and JPEG images: check the file, decode it, composite it over the background, and reduce its size."""
+"""Read PNG and JPEG images: check the file, decode it, composite it over the background, and reduce its size.
+
+A file that is damaged or of another kind raises `InputError`; `where` is its path, and the file that names it.
+"""
 
 import io
 import os
@@ -21,6 +24,8 @@ from gsbench.process.memory import available, require
 from gsbench.reading import read_file
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Size = tuple[int, int]  # width and height, pixels
+Color = tuple[float, float, float]  # RGB in [0, 1]
 
 
 class DamagedError(InputError):
@@ -58,23 +63,13 @@ def quiet_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(before)
 
 
-def read_image(
-    path: Path,
-    where: str,  # the path, and the file and field that name it, for the message
-) -> bytes:
+def read_image(path: Path, where: str) -> bytes:
     """Return the bytes of an image file; raise InputError if the file is missing, too large or not a regular file."""
     return read_file(path, where, _MAX_FILE)
 
 
-def photo_size(
-    data: bytes,
-    where: str,  # the file's path, for the message
-) -> tuple[int, int]:
-    """Return the width and height of a PNG, which is checked as by `png_size`, or of a JPEG, whose header is.
-
-    Raises:
-        InputError: the data is neither, has zero or too many pixels, or colours that are not RGB or RGBA.
-    """
+def photo_size(data: bytes, where: str) -> Size:
+    """Return the width and height of a PNG, which is checked as by `png_size`, or of a JPEG, whose header is."""
     if not data.startswith((_JPEG, _SIGNATURE)):
         raise DamagedError(f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it")
     if not data.startswith(_JPEG):
@@ -95,16 +90,8 @@ def is_turned(
         return image.getexif().get(_ORIENTATION, 1) != 1
 
 
-def png_size(
-    data: bytes,
-    where: str,  # the file's path, for the message
-    kind: Kind = COLORS,
-) -> tuple[int, int]:
-    """Return the width and height of a PNG after checking the length and checksum of all chunks, without decoding.
-
-    Raises:
-        InputError: the data is not a PNG, is damaged, has zero or too many pixels, or an unexpected colour type.
-    """
+def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
+    """Return the width and height of a PNG after checking the length and checksum of all chunks, without decoding."""
     if not data.startswith(_SIGNATURE):
         raise DamagedError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
     size = (0, 0)
@@ -126,16 +113,8 @@ def png_size(
         at += 12 + length
 
 
-def reduced_size(
-    size: tuple[int, int],  # width and height
-    downscale: int,
-    where: str,  # the image's path, for the message
-) -> tuple[int, int]:
-    """Return the width and height of an image that is reduced `downscale` times, each rounded, halves up.
-
-    Raises:
-        InputError: no pixel would be left.
-    """
+def reduced_size(size: Size, downscale: int, where: str) -> Size:
+    """Return the width and height of an image that is reduced `downscale` times, each rounded, halves up."""
     width, height = ((2 * side + downscale) // (2 * downscale) for side in size)
     if not width or not height:
         raise InputError(f"{where}: expected a downscale that leaves pixels, got downscale={downscale} for "
@@ -145,7 +124,7 @@ def reduced_size(
 
 def stays_in_8_bits(
     data: bytes,  # of the first image of a scene, which was checked
-    size: tuple[int, int],  # width and height of every image
+    size: Size,
     count: int,
     downscale: int,
 ) -> bool:
@@ -158,17 +137,13 @@ def stays_in_8_bits(
 
 
 def count_readers(
-    size: tuple[int, int],  # width and height of every image
+    size: Size,
     count: int,
     downscale: int,
-    where: str,  # the first image's path, for the message
+    where: str,
     kept: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
-    """Return how many threads can decode images at the same time, given the free memory and the size of all images.
-
-    Raises:
-        TooLargeError: the memory does not suffice for one thread.
-    """
+    """Return how many threads can decode images at the same time, given the free memory and the size of all images."""
     pixels = size[0] * size[1]
     all_kept, decoding = count * kept * pixels // downscale**2, _DECODING * pixels
     what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
@@ -178,15 +153,8 @@ def count_readers(
     return threads if free is None else max(1, min(threads, (free - all_kept) // decoding))
 
 
-def decode_photo(
-    data: bytes,
-    where: str,  # the file's path, for the message
-) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
-    """Decode a PNG as `decode_png` does, or a JPEG to RGB; its EXIF orientation is ignored, as COLMAP ignores it.
-
-    Raises:
-        InputError: the data is neither, is damaged or truncated, has no pixels, or is neither RGB nor RGBA.
-    """
+def decode_photo(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
+    """Decode a PNG as `decode_png` does, or a JPEG to RGB; its EXIF orientation is ignored, as COLMAP ignores it."""
     if not data.startswith(_JPEG):
         return decode_png(data, where)
     photo_size(data, where)
@@ -194,16 +162,10 @@ def decode_photo(
         return np.array(image)
 
 
-def decode_png(
-    data: bytes,
-    where: str,  # the file's path, for the message
-) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
+def decode_png(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
     """Decode an 8- or 16-bit PNG to RGB or RGBA pixels.
 
     The file is checked first, because OpenCV may fill the missing rows of a truncated file with black.
-
-    Raises:
-        InputError: the data is not a PNG, is damaged, has no pixels, or is neither RGB nor RGBA.
     """
     png_size(data, where)
     pixels = _decode(data, where)
@@ -213,16 +175,8 @@ def decode_png(
     return cv2.cvtColor(pixels, to_rgb)  # type: ignore[return-value]  # OpenCV's stubs do not keep the dtype
 
 
-def decode_regions(
-    data: bytes,
-    size: tuple[int, int],  # width and height of the image that it belongs to
-    where: str,  # the file's path, for the message
-) -> NDArray[np.uint8]:  # [H, W]
-    """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel.
-
-    Raises:
-        InputError: the data is not such a PNG, is damaged, or has another size than the image of the mask.
-    """
+def decode_regions(data: bytes, size: Size, where: str) -> NDArray[np.uint8]:  # [H, W]
+    """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel."""
     own = png_size(data, where, NUMBERS)
     if own != size:
         raise InputError(f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {own[0]}x{own[1]}")
@@ -231,7 +185,7 @@ def decode_regions(
 
 def subsample(
     numbers: Pixels,  # [H, W] the number of the object in each pixel
-    size: tuple[int, int],  # width w and height h of the reduced image
+    size: Size,
 ) -> Tensor:  # [h, w] 8 bits
     """Reduce a mask: each pixel has the number at its centre."""
     rows, columns = (
@@ -243,7 +197,7 @@ def subsample(
 
 def alpha_of(
     pixels: Pixels,  # [H, W, 3|4] as stored
-    size: tuple[int, int],  # width w and height h of the reduced image
+    size: Size,
 ) -> Tensor | None:  # [h, w] 8 bits
     """Return the alpha channel of an image, reduced by averaging; None for an image without alpha."""
     if pixels.shape[2] == 3:
@@ -257,7 +211,7 @@ def alpha_of(
 def composite(
     pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
     background: tuple[float, float, float],
-    size: tuple[int, int],  # width w and height h of the reduced image
+    size: Size,
     resize: str | None = None,  # one of gsbench.scenes.RESIZES
 ) -> Tensor:  # [h, w, 3] float32 in [0, 1]
     """Composite an image with straight alpha over a background colour, then reduce it: a pixel is the mean of its area.
@@ -318,7 +272,7 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
     return pixels
 
 
-def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
+def _check_header(header: bytes, where: str, kind: Kind) -> Size:
     """Check the header chunk IHDR of a PNG and return width and height (PNG specification, section 11.2.2)."""
     width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
     _check_size(width, height, where)
@@ -329,7 +283,7 @@ def _check_header(header: bytes, where: str, kind: Kind) -> tuple[int, int]:
     return width, height
 
 
-def _check_size(width: int, height: int, where: str) -> tuple[int, int]:
+def _check_size(width: int, height: int, where: str) -> Size:
     """Return the size of an image; raise InputError if it has no or too many pixels."""
     if width == 0 or height == 0:
         raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")

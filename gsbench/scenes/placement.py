@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import far_outside, is_seen
 from gsbench.scenes.scene import STANDARD, UP, Placement, Points, Scene, View, scene_extent, up_of
-from gsbench.scenes.trained import TrainedGaussians
 
 _SIZE_TOLERANCE = math.sqrt(2)  # a scene keeps its size if that differs by at most this factor ..
 _PLACE_TOLERANCE = 0.25  # .. and its place if cameras look at a point so near to the origin, in units of the size
@@ -56,9 +56,6 @@ def standard_scene(
         repaired: the names of damaged images that were replaced.
         up: which way is up; None: it is estimated from the cameras.
         notes: what the reader tells about the files, a line each.
-
-    Raises:
-        InputError: the positions of the cameras are too large for a float, or no camera sees a point.
     """
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
     centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
@@ -193,9 +190,6 @@ def _seen_points(
     """Return points that cameras see, once for each camera, with their depths, and the share of points that are seen.
 
     The points are None if a data set has none.
-
-    Raises:
-        InputError: no camera sees a point, so that a training would move none.
     """
     if points is None:
         return None, 1.0

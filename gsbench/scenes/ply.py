@@ -1,6 +1,10 @@
-"""Read the vertices of an ascii or binary PLY file into a structured numpy array; the file is checked."""
+"""Read the vertices of an ascii or binary PLY file into a structured numpy array; the file is checked.
+
+A damaged file raises `InputError`, and a compressed one with the command that opens it.
+"""
 
 import re
+import shlex
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +14,6 @@ from numpy.typing import NDArray
 from gsbench.errors import InputError
 from gsbench.process.memory import require
 from gsbench.reading import read_file
-from gsbench.scenes.formats import check_readable
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -27,6 +30,11 @@ MAX_FILE = 1 << 32  # bytes; 17 million Gaussians of 3DGS
 _ASCII_VALUE = 100  # bytes of memory that a value needs while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
+_COMPRESSED = {  # by the first bytes, or by the suffix
+    b"NGSP": "SPZ", b"\x1f\x8b": "gzip, as SPZ", b"PK\x03\x04": "ZIP, as SOG",
+    ".spz": "SPZ", ".sog": "SOG", ".splat": "SPLAT", ".ksplat": "KSPLAT",
+}  # fmt: skip
+_PICKLE, _HEAD = b"data.pkl", 256  # name of the first file in a checkpoint of PyTorch, and where it stands
 
 
 class _Element(NamedTuple):
@@ -51,14 +59,11 @@ def read_vertices(path: Path) -> NDArray[np.void]:
 
     The vertices and the elements before them must have scalar properties only, as in files of COLMAP and 3DGS. Other
     elements are ignored.
-
-    Raises:
-        InputError: the file is not such a PLY, or has fewer values than its header states.
     """
     data = read_file(path, str(path), MAX_FILE)
     end = _HEADER_END.search(data, 0, _HEADER_LIMIT)
     if not data.startswith(b"ply"):
-        check_readable(path, data)
+        _check_readable(path, data)
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
@@ -117,11 +122,7 @@ def _read_properties(
 
 
 def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> NDArray[np.void]:
-    """Parse the vertices of an ascii PLY, which `skipped` values of other elements precede.
-
-    Raises:
-        InputError: a number cannot be represented by the type of its property, or the file is truncated.
-    """
+    """Parse the vertices of an ascii PLY, which `skipped` values of other elements precede."""
     count, dtype = vertices
     names, expected = dtype.names or (), skipped + vertices.values
     # A value needs at least two bytes, so a wrong count in the header is found before memory is allocated.
@@ -145,3 +146,24 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> ND
         with np.errstate(over="ignore"):  # becomes infinite, and is refused where the property is read
             rows[name] = column
     return rows
+
+
+def _check_readable(path: Path, data: bytes) -> None:
+    """Raise InputError if the bytes of a file that is no PLY, or its suffix, are of a compressed format."""
+    if data.startswith(b"PK\x03\x04") and _PICKLE in data[:_HEAD]:
+        raise refused(path, "expected a PLY of 3DGS, this file is a checkpoint of PyTorch: export a PLY with the "
+                             "program that wrote it")  # fmt: skip
+    for mark, form in _COMPRESSED.items():
+        if data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark:
+            raise compressed(path, form)
+
+
+def compressed(path: Path, form: str) -> InputError:
+    """Return the error of a compressed file, with the command that opens it."""
+    convert = f"npx -y @playcanvas/splat-transform@3.7.0 {shlex.quote(str(path))} trained.ply"
+    return refused(path, f"expected a PLY of 3DGS, this file is compressed ({form}): {convert}")
+
+
+def refused(path: Path, message: str) -> InputError:
+    """Return the error of a file that is no PLY of 3DGS."""
+    return InputError(f"{path}: {message}", docs="viewing.md#start-from-a-ply")

@@ -51,9 +51,6 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
         cameras: the cameras of the training views.
         radius: the radius of the cameras around their mean, world units.
         generator: the source of all random numbers.
-
-    Raises:
-        InputError: the part of space that all cameras see is too small.
     """
     K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]
@@ -97,9 +94,6 @@ def read_ply(path: str | Path) -> Points:
     """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
     Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1].
-
-    Raises:
-        InputError: the file is not such a PLY, is truncated, or has values that are not finite or outside of [0, 1].
     """
     vertices = read_vertices(Path(path))
     means = _columns(vertices, ("x", "y", "z"), path)
@@ -125,9 +119,6 @@ def nearest_distances(
     """Return the root mean square distance of each point to its `k` nearest neighbours, the initial scale of 3DGS.
 
     The result is at least sqrt(1e-7), as in the code of 3DGS.
-
-    Raises:
-        InputError: there are at most `k` points, or a point is not finite.
     """
     check_tensor(means, "points")
     if type(k) is not int or k < 1 or means.dim() != 2 or means.shape[1] != 3:

@@ -9,6 +9,7 @@ from gsbench.errors import InputError
 
 UP = (0.0, 0.0, 1.0)  # in Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 STANDARD = 4.0  # the distance of cameras from what they look at, in the coordinates of a training; D-NeRF's
+HELD_OUT = 8  # every eighth view in the order of time is a test view, where a capture has no split
 _LEAN = 0.01  # weight of the mean up vector against cameras without roll: decides where these leave a choice
 
 
@@ -161,9 +162,6 @@ class Scene:
         """Return a copy of the scene in which every n-th training view is a validation view, from the n-th on.
 
         The extent stays, so that learning rates do. Test views are not used.
-
-        Raises:
-            InputError: the scene has validation views, or too few training views.
         """
         if self.val:
             raise InputError(f"scene.val_every: expected no views of val, {self.name} has {len(self.val)}")

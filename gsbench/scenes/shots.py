@@ -1,21 +1,92 @@
-"""Read the images of a scene, undo the distortion of lenses and reduce the images: shots become views."""
+"""Read the images of a scene, undo the distortion of lenses and reduce the images: shots become views.
+
+In messages `where` is the path of an image and the file that names it.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.scenes import files, images
-from gsbench.scenes.lens import Lens
+from gsbench.scenes.images import Pixels, Size
 from gsbench.scenes.scene import Camera, View
 
+_HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres are at +0.5 here, and at integers in OpenCV
+_LEAST_RATIO = 1.1  # below it, an image whose sides are not exactly in one ratio to the camera's may have been cropped
+_OUTSIDE = 2.0  # pixels that OpenCV's rectangle without blank pixels may exceed the image, as it samples the border
 MASKS = "masks"  # the folder with the object number of each pixel, in PNG files
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Hold the intrinsics of a camera, in pixels of the full image, and the distortion of its lens."""
+
+    width: int
+    height: int
+    K: NDArray[np.float64]  # [3, 3] pixel centres at +0.5
+    distortion: tuple[float, float, float, float]  # k1, k2 (radial), p1, p2 (tangential), as in OpenCV
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What is equal for equal lenses."""
+        return (self.width, self.height, *self.K.ravel().tolist(), *self.distortion)
+
+    def resized(self, width: int, height: int) -> "Lens | None":
+        """Return the lens of an image of width x height pixels, which was resized from the camera's by one ratio.
+
+        The sides of the image may be rounded. None: its sides have two ratios to the camera's, so that it was cropped
+        or is of another camera.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        ratio = max(self.width / width, width / self.width)
+        is_exact = width * self.height == height * self.width
+        off = min(abs(self.height * width / self.width - height), abs(self.width * height / self.height - width))
+        if not is_exact and not (ratio > _LEAST_RATIO and off < 1):
+            return None
+        scale = np.diag([width / self.width, height / self.height, 1])
+        return replace(self, width=width, height=height, K=scale @ self.K)
+
+    def pinhole(self) -> NDArray[np.float64]:  # [3, 3]
+        """Return the intrinsics of the undistorted image, which has the same size; without distortion K itself.
+
+        The image shows the largest rectangle that has no blank pixels (`cv2.getOptimalNewCameraMatrix` with alpha = 0).
+        """
+        if not any(self.distortion):
+            return self.K
+        size = self.width, self.height
+        return cv2.getOptimalNewCameraMatrix(self.K - _HALF, np.array(self.distortion), size, 0)[0] + _HALF
+
+    def undistort(
+        self,
+        pixels: Pixels,  # [H, W] or [H, W, 3]
+        where: str,
+        interpolation: int = cv2.INTER_LINEAR,
+    ) -> Pixels:
+        """Return the image that the camera `pinhole()` sees; without distortion the image itself."""
+        if not any(self.distortion):
+            return pixels
+        size = self.width, self.height
+        try:
+            K = self.pinhole() - _HALF
+            x, y = cv2.initUndistortRectifyMap(
+                self.K - _HALF, np.array(self.distortion), np.eye(3), K, size, cv2.CV_32FC1
+            )
+            inside = [(at >= -_OUTSIDE) & (at <= n - 1 + _OUTSIDE) for at, n in zip((x, y), size, strict=True)]
+            if K[0, 0] > 0 and K[1, 1] > 0 and all(part.all() for part in inside):
+                return cv2.remap(pixels, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+        except cv2.error:
+            pass
+        raise InputError(f"{where}: OpenCV cannot undo the distortion k1 k2 p1 p2 = {self.distortion}: undo it by "
+                         "`colmap image_undistorter`")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,7 +111,7 @@ class Shots:
     notes: list[str]
 
 
-def size_of(path: Path, where: str) -> tuple[int, int]:
+def size_of(path: Path, where: str) -> Size:
     """Return the width and height of an image file in pixels; raise InputError if it is not a whole PNG or JPEG."""
     return images.photo_size(images.read_image(path, where), where)
 
@@ -56,10 +127,6 @@ def read(
 
     Images of a small scene are stored as floats, those of a large scene in 8 bits. K is scaled as the image is, by the
     ratio of the sizes along each axis.
-
-    Raises:
-        InputError: an image is damaged, its sides are not its camera's nor resized by one ratio, the images differ in
-            size, or an image with alpha has a lens with distortion; the message names the file.
     """
     first = shots[0]
     data = images.read_image(first.path, first.where)
@@ -95,7 +162,7 @@ def read(
     return Shots(list(views), list(digests), notes)
 
 
-def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot) -> Lens:
+def _lens_of_image(size: Size, expected: Size, shot: Shot) -> Lens:
     """Return the lens in pixels of the image; raise InputError if its size is not its camera's or the first image's."""
     lens = shot.lens.resized(*size)
     if lens is None:
@@ -109,7 +176,7 @@ def _lens_of_image(size: tuple[int, int], expected: tuple[int, int], shot: Shot)
     return lens
 
 
-def _notes(shots: Sequence[Shot], size: tuple[int, int], reduced: tuple[int, int], downscale: int) -> list[str]:
+def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> list[str]:
     """Return sentences on images that are resized, and on sizes that `downscale` does not divide."""
     notes = []
     cameras = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
@@ -123,7 +190,7 @@ def _notes(shots: Sequence[Shot], size: tuple[int, int], reduced: tuple[int, int
     return notes
 
 
-def _read_mask(shot: Shot, path: Path, lens: Lens, size: tuple[int, int]) -> Tensor:  # [H, W] 8 bits
+def _read_mask(shot: Shot, path: Path, lens: Lens, size: Size) -> Tensor:  # [H, W] 8 bits
     """Read and undistort the mask of an image: a PNG with the number of the object in each pixel."""
     where = f"{path} (the mask of {shot.name}{shot.path.suffix}; without a folder '{MASKS}' a scene has no regions)"
     numbers = images.decode_regions(images.read_image(path, where), (lens.width, lens.height), where)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images
+from gsbench.scenes.images import Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import Camera, Points, Scene, View
@@ -127,11 +128,7 @@ def _number(text: str, where: str) -> float:
     return number
 
 
-def _camera(
-    row: dict[str, float],
-    size: tuple[int, int],  # width and height of the image
-    reduced: tuple[int, int],  # those of the reduced image
-) -> Camera:
+def _camera(row: dict[str, float], size: Size, reduced: Size) -> Camera:
     """Make a camera from a row of the table."""
     viewmat = torch.eye(4, dtype=torch.float64)
     rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])  # scipy has w last
@@ -231,7 +228,7 @@ def _read_views(
     return [view for view, _ in read_all], digests
 
 
-def _decode(data: bytes, path: Path, size: tuple[int, int]) -> images.Pixels:
+def _decode(data: bytes, path: Path, size: Size) -> images.Pixels:
     """Decode an image; raise InputError if it is damaged, is not opaque, or has another size than the first image."""
     if images.png_size(data, str(path)) != size:
         raise InputError(f"{path}: expected {size[0]}x{size[1]} as the first image, got another size")
@@ -241,7 +238,7 @@ def _decode(data: bytes, path: Path, size: tuple[int, int]) -> images.Pixels:
     return decoded
 
 
-def _decode_or_advise(data: bytes, image: _Image, size: tuple[int, int]) -> images.Pixels:
+def _decode_or_advise(data: bytes, image: _Image, size: Size) -> images.Pixels:
     """Decode an image; if a training image is damaged, the error names the option that replaces it."""
     try:
         return _decode(data, image.path, size)

@@ -2,6 +2,7 @@
 
 Names have numbers of frames, of cameras, of takes and of pixels. Which one is the time follows from the cameras: images
 with the same pose and intrinsics are of one fixed camera, whose own number is constant there and whose time is not.
+Times that cannot be determined raise `InputError`. `places` are from `places_of`, `source` is the file of the names.
 """
 
 import csv
@@ -108,11 +109,7 @@ def of_images(
     places: Sequence[Hashable],  # from `places_of`
     source: Path,  # the file that names the images, for messages
 ) -> tuple[Times, dict[str, str]]:
-    """Return the times from times.csv, if it exists, otherwise from names, and the SHA-256 of times.csv by name.
-
-    Raises:
-        InputError: as `of_table` and `of_names`.
-    """
+    """Return the times from times.csv, if it exists, otherwise from names, and the SHA-256 of times.csv by name."""
     path = table_of(root)
     if path is None:
         return of_names(names, viewmats, places, source), {}
@@ -132,12 +129,7 @@ def of_names(
     places: Sequence[Hashable],  # from `places_of`
     source: Path,  # the file that names the images, for messages
 ) -> Times:
-    """Return the time of each image from a number in its name, scaled to [0, 1]; None for all without such numbers.
-
-    Raises:
-        InputError: only some names have numbers, it cannot be told which number is the time, or two images of a fixed
-            camera have the same time.
-    """
+    """Return the time of each image from a number in its name, scaled to [0, 1]; None for all without such numbers."""
     columns = _columns(names, source)
     changing = [column for column in columns if len(set(column.values)) > 1]
     if not changing:
@@ -163,9 +155,6 @@ def of_table(
 
     The table has a first line with `name` and `time`, in any case and order. Columns are separated by commas,
     semicolons or tabs. Blank lines, other columns and rows of other images are left out. Names may lack their suffix.
-
-    Raises:
-        InputError: the table is not such a table, lacks an image, or gives two images of a fixed camera the same time.
     """
     try:
         lines = data.decode("utf-8-sig").splitlines()
@@ -214,9 +203,6 @@ def of_fields(
 
     Times in [0, 1] stay as they are; a sentence says so if they cover less than half of it. Others, such as seconds or
     numbers of frames, are scaled over all files together. If all are equal, the scene has no times.
-
-    Raises:
-        InputError: the files have times in different units.
     """
     listed = [value for times in values.values() for value in times]
     first, last = min(listed), max(listed)
@@ -241,7 +227,7 @@ def check_distinct(
     names: Sequence[str],  # of images
     times: Sequence[float | None],
     places: Sequence[Hashable],  # from `places_of`
-    where: str,  # the file, for the message
+    where: str,
 ) -> None:
     """Raise InputError if two images of a fixed camera have the same time."""
     if all(time is not None for time in times):

@@ -19,7 +19,7 @@ from gsbench.models.start import start_from
 from gsbench.process.ending import end_with
 from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
-from gsbench.scenes.trained import MAX_DEGREE, read_trained
+from gsbench.scenes.gaussian_ply import MAX_DEGREE, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.stability.float32_error import Shot, measure
 from gsbench.train.seeding import generator

@@ -18,9 +18,9 @@ from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.query import Query
 from gsbench.models.sliced import reach
 from gsbench.run.load import LoadedRun
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 from gsbench.scenes.placement import gaussians_to_user
 from gsbench.scenes.points import SH_C0
-from gsbench.scenes.trained import TrainedGaussians, ply_of
 
 LEAST_SCALE = 1e-20  # world units; keeps the logarithm of a zero scale finite
 LARGEST_OPACITY = 1 - 2**-24  # the largest float32 below 1, whose logit is finite

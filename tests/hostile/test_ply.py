@@ -8,8 +8,8 @@ import torch
 from mutations import damage_bytes, replace_file
 from workers import Case, Pool, generator, sample
 
+from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.trained import read_trained
 
 COUNTS = ("0", "1", "2", "3", "4", "-1", "003", "1e3", "1000000000000", "9" * 18, "9" * 30, "x", "")
 KINDS = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}

@@ -20,7 +20,7 @@ from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated, has_gates
 from gsbench.models.simplifications import simplifications_of
 from gsbench.models.sliced import reach, tensors_of
-from gsbench.scenes.trained import ply_of, read_trained
+from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.train.penalties import MeanOpacity, MeanSize
 from gsbench.train.penalties.base import Penalty

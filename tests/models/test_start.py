@@ -12,8 +12,8 @@ from gsbench.models.base import Raw
 from gsbench.models.factors import quaternions_in_space, rotation, rotation4d
 from gsbench.models.sliced import Conditioned
 from gsbench.models.start import start_from
+from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
-from gsbench.scenes.trained import TrainedGaussians
 from gsbench.schedule import ActiveComponents
 
 N = 12

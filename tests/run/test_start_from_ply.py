@@ -9,7 +9,7 @@ from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
-from gsbench.scenes.trained import TrainedGaussians, ply_of
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 
 
 def write_trained(path: Path, count: int = 8, away: int = 0) -> TrainedGaussians:

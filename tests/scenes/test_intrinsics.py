@@ -132,7 +132,7 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
 )  # fmt: skip
 def test_one_ratio(image: tuple[int, int], camera: tuple[int, int], fits: bool) -> None:
     """Catches a cropped image taken for a reduced one, and rounded sizes refused."""
-    from gsbench.scenes.lens import Lens
+    from gsbench.scenes.shots import Lens
 
     lens = Lens(*camera, np.eye(3), (0, 0, 0, 0)).resized(*image)
     assert (lens is not None) == fits

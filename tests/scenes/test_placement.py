@@ -15,10 +15,10 @@ from tiny_run import overrides, run_here, write_moving_square
 from gsbench import load_run, load_scene
 from gsbench.errors import InputError
 from gsbench.scenes import Scene, sample
+from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.placement import place_and_size
 from gsbench.scenes.points import far_outside, size_of
 from gsbench.scenes.scene import STANDARD, Points
-from gsbench.scenes.trained import read_trained
 
 COUNT = 16
 MOVES = {

@@ -12,8 +12,8 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MAX
 from gsbench.models.factors import rotation
 from gsbench.raster import rasterize
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of, read_trained, share_seen
 from gsbench.scenes.scene import Camera
-from gsbench.scenes.trained import TrainedGaussians, ply_of, read_trained, share_seen
 
 N = 5
 NEEDED = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",

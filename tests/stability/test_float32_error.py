@@ -19,7 +19,7 @@ from gsbench.models.factors import KINDS
 from gsbench.run import setup
 from gsbench.run.load import load_run
 from gsbench.scenes import Points, View
-from gsbench.scenes.trained import TrainedGaussians, ply_of
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 from gsbench.stability import float32_error, report
 from gsbench.stability.__main__ import main
 from gsbench.stability.float64_render import float64_camera

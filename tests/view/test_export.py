@@ -23,7 +23,7 @@ from gsbench.models.render import render
 from gsbench.run.load import LoadedRun, load_run
 from gsbench.run.setup import load_scene
 from gsbench.scenes import Points
-from gsbench.scenes.trained import TrainedGaussians, ply_of, read_trained
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of, read_trained
 from gsbench.view import slice_ply, video
 
 FOUR = ("--seconds", "0.5", "--fps", "8")

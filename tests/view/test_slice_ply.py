@@ -15,7 +15,7 @@ from gsbench.models.cameras import UP, intrinsics, look_at
 from gsbench.models.render import render
 from gsbench.raster import rasterize
 from gsbench.scenes import Camera
-from gsbench.scenes.trained import ply_of
+from gsbench.scenes.gaussian_ply import ply_of
 from gsbench.schedule import ActiveComponents
 from gsbench.view.slice_ply import decompose, trained_of
 

@@ -2,10 +2,11 @@
 
 Columns: `x y z [nx ny nz] f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`. Scales are logarithms, the opacity is a
 logit, and the rotation is a quaternion wxyz. The columns `f_rest_*` are the SH coefficients above degree 0, first all
-of the red channel, then green, then blue.
+of the red channel, then green, then blue. A file that would look different without a part raises `InputError`.
 """
 
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +20,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN
 from gsbench.process.memory import require
-from gsbench.scenes.formats import FILTER, check_columns, shortened
-from gsbench.scenes.ply import read_vertices
+from gsbench.scenes.ply import compressed, read_vertices, refused
 from gsbench.scenes.scene import Camera
 
 MAX_DEGREE = 3  # largest SH degree of gsbench's models; a file may have degree 4
@@ -36,6 +36,18 @@ PLY_ROW = 4 * (17 + 3 * ((MAX_DEGREE + 1) ** 2 - 1))  # bytes of a Gaussian in a
 _LARGEST = 1e30  # largest accepted number; its square in double and its sums in single precision are finite
 _LARGEST_LOGIT = math.log(ALPHA_MAX / (1 - ALPHA_MAX))
 _VALUE = 40  # bytes that a number of a Gaussian needs while it is read: in the file, in double and in single precision
+FILTER = "filter_3D"  # Mip-Splatting: standard deviation of the 3D smoothing filter, world units
+_METHODS = {  # columns without which the Gaussians of a method look different
+    "Spacetime Gaussians (STG)": r"trbf_\w+|motion_\d+|omega_\d+|f_t_\d+",
+    "Beta Splatting": r"betas?(_\d+)?|sb_params_\d+",
+    "4DGS": r"t|scale_t|rot_r_\d+",
+    "Scaffold-GS": r"f_offset_?\d+|f_anchor_feat_?\d+",
+}
+_PACKED = re.compile(r"packed_\w+")  # SuperSplat
+_HARMLESS = re.compile(  # normals, colours beside f_dc_*, identities, features of segmentations
+    r"n[xyz]|red|green|blue|alpha|confidence|(\w+_)?(ids?|idx|index|labels?|class|segment|cluster|instance|object)(_\d+)?|"
+    r"(obj|object|ins|instance|sem|semantics?|language|clip|dino|identity)_\w+|semantics?"
+)
 
 
 @dataclass(frozen=True)
@@ -60,16 +72,12 @@ def read_trained(path: Path) -> TrainedGaussians:
     An opacity of exactly 0 or 1, which converters of compressed files write as an infinite logit, becomes 0.001 or
     0.999, the largest alpha that is blended. The 3D filter of Mip-Splatting becomes a part of scales and opacities.
     Lines on stderr say both, which columns are left out, and that a deformation network beside the file is.
-
-    Raises:
-        InputError: the file is not such a PLY, lacks a column, has one that may change the look and is not known, or
-            has another value that is not finite.
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    left_out = check_columns(names, [name for columns in _COLUMNS.values() for name in columns], path)
+    left_out = _check_columns(names, [name for columns in _COLUMNS.values() for name in columns], path)
     if left_out:
-        print(f"{path}: columns that change no image are left out: {shortened(left_out)}", file=sys.stderr)
+        print(f"{path}: columns that change no image are left out: {_shortened(left_out)}", file=sys.stderr)
     if networks := _deformations(path):
         print(f"{path}: {networks[0]} is not read: the Gaussians are those before it moves them", file=sys.stderr)
     count = sum(name.startswith("f_rest_") for name in names)
@@ -93,11 +101,7 @@ def read_trained(path: Path) -> TrainedGaussians:
 
 
 def ply_of(trained: TrainedGaussians) -> bytes:
-    """Return trained 3D Gaussians as the bytes of a binary PLY file of 3DGS with SH degree 3.
-
-    Raises:
-        InputError: a value is not finite, or the SH degree is above 3.
-    """
+    """Return trained 3D Gaussians as the bytes of a binary PLY file of 3DGS with SH degree 3."""
     N, K = len(trained), (MAX_DEGREE + 1) ** 2
     if trained.rest.shape[1] > K - 1:
         raise InputError(f"PLY: expected harmonics up to degree {MAX_DEGREE}, got {trained.rest.shape[1]} above 0")
@@ -165,9 +169,6 @@ def _fuse(
     """Make the 3D filter of Mip-Splatting a part of scales and opacities, as its export for viewers does; say so.
 
     With the squared scales S and the squared filter f^2: S' = S + f^2, and opacity' = opacity sqrt(det S / det S').
-
-    Raises:
-        InputError: a filter is negative.
     """
     if not (filters >= 0).all():
         raise InputError(f"{path}: {FILTER}: expected sizes of at least 0, some are negative: export the file anew")
@@ -189,3 +190,41 @@ def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Te
         raise InputError(f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
                          f"Gaussians have others: remove them")  # fmt: skip
     return torch.from_numpy(table.astype(np.float32))
+
+
+def _check_columns(names: Sequence[str], needed: Sequence[str], path: Path) -> list[str]:
+    """Return the columns of a file that change no image and that gsbench leaves out.
+
+    Args:
+        names: the columns of the file.
+        needed: the columns of 3DGS without `f_rest_*`.
+        path: the file, for messages.
+    """
+    if any(map(_PACKED.fullmatch, names)):
+        raise compressed(path, "SuperSplat's columns packed_*")
+    for method, pattern in _METHODS.items():
+        if columns := [name for name in names if re.fullmatch(pattern, name)]:
+            raise refused(path, f"expected Gaussians of 3DGS, the columns {_shortened(columns):.200} are of {method} "
+                                 f"and change the look: give a PLY of 3D Gaussians, for instance those of one time, "
+                                 f"or remove the columns")  # fmt: skip
+    missing = [name for name in needed if name not in names]
+    if missing == ["scale_2"]:
+        raise refused(path, "expected scale_0..2, found two scales, of surfels (2DGS): add a column scale_2 of -16, "
+                             "which makes them flat Gaussians")  # fmt: skip
+    if missing:
+        raise refused(path, f"expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and f_rest_*, "
+                             f"found no '{missing[0]}': is it a cloud of points?")  # fmt: skip
+    others = [name for name in names if name not in (*needed, FILTER) and not name.startswith("f_rest_")]
+    if unknown := [name for name in others if not _HARMLESS.fullmatch(name)]:
+        raise refused(path, f"expected the columns of 3DGS, found {_shortened(unknown):.200} too, which gsbench does "
+                             f"not know: remove them if they do not change the look")  # fmt: skip
+    return others
+
+
+def _shortened(names: Sequence[str]) -> str:
+    """List names; those that differ by a number alone become one, such as ``motion_0..8``."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        stem = name.rstrip("0123456789")
+        groups.setdefault(stem, []).append(name.removeprefix(stem))
+    return ", ".join(stem + (f"{ends[0]}..{ends[-1]}" if len(ends) > 1 else ends[0]) for stem, ends in groups.items())
