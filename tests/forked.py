@@ -139,6 +139,7 @@ def become(asked: dict[str, Any]) -> None:
     os.environ.update(asked["environment"])
     sys.argv = asked["argv"]
     signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and those under nohup
 
 
 if __name__ == "__main__":
