@@ -10,12 +10,13 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.process.ending import end_with
-from gsbench.report import against_lines, against_table, layout, live, paper_tables, select, tables
-from gsbench.report.against import DIFFERS, Comparison, compare
+from gsbench.report import frame, layout, live, paper_tables, reproduction, select, tables
+from gsbench.report.frame import Results
 from gsbench.report.latex import latex
 from gsbench.report.numbers import numbers
 from gsbench.report.page import build
 from gsbench.report.publish import publish
+from gsbench.report.render import page, text
 
 PRINTED = Path("-")  # the value of --json without a FILE
 
@@ -36,14 +37,14 @@ def main(arguments: list[str] | None = None) -> int:
     differs = False
     try:
         chosen = select.parse(options.select)
-        records, faults = tables.load(options.results)
-        records = chosen.of(records)
+        results = frame.load(options.results)
+        records, faults = chosen.of(list(results.runs.record)), list(results.faults)
         if options.publish:
             print(publish(options.results, options.publish))
         elif records and options.tables:
             _paper_tables(records, options)
         elif records and options.against:
-            differs = _against(records, faults, options)
+            differs = _against(results, options)
         elif records:
             _tables(records, faults, chosen.columns, options)
         if records and options.figures:
@@ -106,19 +107,23 @@ def _paper_tables(records: list[Record], options: argparse.Namespace) -> None:
     print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.NAMES)}")
 
 
-def _against(records: list[Record], faults: list[str], options: argparse.Namespace) -> bool:
+def _against(results: Results, options: argparse.Namespace) -> bool:
     """Print and write the comparison with another folder, and return whether PSNR differs."""
-    compared = _compared(records, options.results, options.against)
-    made = against_table.tables(compared)
-    if not _is_printed(options, made, lambda: against_table.content(compared)):
+    other = frame.load(options.against)
+    for fault in other.faults:
+        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
+    compared = reproduction.compare(results, other, (str(options.results), str(options.against)))
+    made = [reproduction.section(compared)]
+    if not _is_printed(options, [], lambda: reproduction.content(compared, results.runs, other.runs)):
+        records = list(results.runs.record)
         built = tables.build(records, train=options.train)
         print(layout.terminal(built))
         tables.write(records, options.results, built)
-        page = build.write(records, options.results, faults, against=compared)
-        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {page}")
-        print(f"\n{layout.terminal(made)}")
-        print("\n".join(against_lines.lines(compared, records, page)))
-    return compared.verdict == DIFFERS
+        written = page.write(results, options.results, more=made)
+        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {written}")
+        print(f"\n{text.terminal(made)}")
+        print("\n".join(reproduction.lines(compared, results.runs, written)))
+    return compared.verdict == reproduction.DIFFERS
 
 
 def _is_printed(options: argparse.Namespace, built: list[layout.Table], content: Callable[[], object]) -> bool:
@@ -130,14 +135,6 @@ def _is_printed(options: argparse.Namespace, built: list[layout.Table], content:
     elif options.json:
         write_atomically(options.json, f"{as_json(content())}\n".encode())
     return bool(options.latex or options.json == PRINTED)
-
-
-def _compared(records: list[Record], folder: Path, other: Path) -> Comparison:
-    """Compare the records of two folders, and print which records of the second folder cannot be read."""
-    theirs, faults = tables.load(other)
-    for fault in faults:
-        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    return compare(records, theirs, (str(folder), str(other)))
 
 
 if __name__ == "__main__":

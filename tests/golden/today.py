@@ -21,8 +21,7 @@ from tiny_run import run_here
 from gsbench.config import CONF, register_schema
 from gsbench.config_roles import training_hash
 from gsbench.measure.record import Record
-from gsbench.report import against_table, frontier, paper_tables
-from gsbench.report.against import compare
+from gsbench.report import frame, frontier, paper_tables, reproduction
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import groups
 from gsbench.report.numbers import numbers
@@ -37,7 +36,7 @@ from gsbench.train import checkpoint
 PUBLISHED = Path(__file__).resolve().parents[2] / "results" / "published"
 Numbers = dict[str, float]  # by "what/scene/model/metric"
 UNITS = {"psnr": "psnr_db", "seconds": "train_s", "ms": "frame_ms", "mb": "model_mb"}
-VERDICTS = {"agrees": 1.0, "cannot be told": 0.0, "differs": -1.0}
+VERDICTS = {"agrees": 1.0, "undecided": 0.0, "differs": -1.0}
 WORDS = {"yes": 1.0, "no": 0.0, "not known": math.nan}
 # Files behind the page: the columns that name a row, and the name of every number in it.
 PAGE: dict[str, tuple[list[str], dict[str, str]]] = {
@@ -113,15 +112,15 @@ def paper(study: str) -> Numbers:
 
 def against(study: str, seeds: Sequence[int], others: Sequence[int]) -> Numbers:
     """The comparison (`--against`) of some seeds of a study with others."""
-    sides = [[run for run in records(study) if run.seed in which] for which in (seeds, others)]
-    compared = against_table.content(compare(sides[0], sides[1], ("ours", "theirs")))
-    values = {"verdict": VERDICTS[compared["verdict"]]}
-    for row in compared["rows"]:
-        for quantity, judged in row["judged"].items():
-            key = f"{row['dataset']}/{row['scene']}/{row['model']}/{UNITS.get(quantity, quantity)}"
-            values[f"{key} verdict"] = VERDICTS[judged["verdict"]]
-            for part in ("difference", "high", "p_holm"):
-                values[f"{key} {part}"] = judged[part]
+    results = frame.load(PUBLISHED / study)
+    sides = [results.of(results.runs.seed.isin(which)) for which in (seeds, others)]
+    compared = reproduction.compare(sides[0], sides[1], ("ours", "theirs"))
+    values = {"verdict": VERDICTS[compared.verdict]}
+    for row in compared.table.to_dict("records"):
+        model = f"{row['model']} {row['variant']}".rstrip()
+        key = f"{row['dataset']}/{row['scene']}/{model}/{row['quantity']}"
+        values[f"{key} verdict"] = VERDICTS[row["verdict"]]
+        values |= {f"{key} {part}": row[part] for part in ("difference", "high", "p_holm")}
     return values
 
 

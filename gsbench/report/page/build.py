@@ -13,11 +13,9 @@ from markupsafe import Markup
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
 from gsbench.report import layout
-from gsbench.report.against import Comparison
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Group, groups
 from gsbench.report.family import Family
-from gsbench.report.page import against as other
 from gsbench.report.page import cost, evidence, figures, messages, on_demand, time_to_quality, worth
 from gsbench.report.page.content import Canvas, DataTable, PageSection, Runs
 from gsbench.report.page.gallery import GalleryView, gallery
@@ -62,7 +60,6 @@ def write(
     faults: Sequence[str] = (),
     *,
     reload: int = 0,
-    against: Comparison | None = None,
 ) -> Path:
     """Write the HTML report of run records to ``report.html`` in their folder, and return its path.
 
@@ -71,10 +68,9 @@ def write(
         folder: the folder that has the records and their images; the report is written there.
         faults: the records that are left out, and why.
         reload: seconds after which an open report reloads itself; 0 for never.
-        against: the comparison with another folder; None if there is none.
     """
     path = folder / FILE_NAME
-    write_atomically(path, render(records, folder, faults, reload=reload, against=against).encode())
+    write_atomically(path, render(records, folder, faults, reload=reload).encode())
     return path
 
 
@@ -84,13 +80,10 @@ def render(
     faults: Sequence[str] = (),
     *,
     reload: int = 0,
-    against: Comparison | None = None,
 ) -> str:
     """Return the HTML report as text; the arguments are those of `write`."""
     found, runs = groups(records), Runs()
     chapters = _chapters(found, folder, runs)
-    for group, chapter in zip(found, chapters, strict=True):
-        chapter.sections[-1:-1] = [other.against_section(against, group)] if against else []
     return _template().render(
         title=messages.shorten(folder.resolve().name, 80) or "results",
         chapters=chapters,

@@ -1,10 +1,9 @@
-"""Two folders of records side by side: what agrees, what differs, what cannot be told, and why."""
+"""Two folders of records side by side: what agrees, what differs, what is undecided, and why."""
 
 import dataclasses
 import json
 import math
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 import pytest
@@ -14,9 +13,21 @@ from gsbench.measure import record as files
 from gsbench.measure.machine import Hardware
 from gsbench.measure.record import Record
 from gsbench.report.__main__ import main
-from gsbench.report.against import AGREES, DIFFERS, LIMITS, UNTOLD, Comparison, compare
-from gsbench.report.against_lines import LONGEST, compared, lines, trained
-from gsbench.report.page.messages import duration
+from gsbench.report.frame import Results, tables
+from gsbench.report.reproduction import (
+    AGREES,
+    DIFFERS,
+    LIMITS,
+    LONGEST,
+    UNDECIDED,
+    Reproduction,
+    compare,
+    compared,
+    duration,
+    lines,
+    section,
+    trained,
+)
 
 
 def runs(seeds=3, **more: object) -> list[Record]:
@@ -24,8 +35,12 @@ def runs(seeds=3, **more: object) -> list[Record]:
     return frontier(seeds=seeds, lengths=(1000,), **more)
 
 
-def held(ours: list[Record], theirs: list[Record]) -> Comparison:
-    return compare(ours, theirs, ("mine", "published"))
+def as_tables(records: list[Record]) -> Results:
+    return tables([(Path(str(i)), record) for i, record in enumerate(records)], [])
+
+
+def reproduced(ours: list[Record], theirs: list[Record]) -> Reproduction:
+    return compare(as_tables(ours), as_tables(theirs), ("here", "published"))
 
 
 def moved(record: Record, psnr: float) -> Record:
@@ -36,26 +51,32 @@ def costing(record: Record, **changes: object) -> Record:
     return dataclasses.replace(record, cost=dataclasses.replace(record.cost, **changes))
 
 
-def told(record: Record, **changes: object) -> Record:
+def measured_by(record: Record, **changes: object) -> Record:
     return dataclasses.replace(record, provenance=dataclasses.replace(record.provenance, **changes))
 
 
 LOST = {"status": "failed", "reason": "out of memory", "metrics": None, "missing": {}, "cost": None}
 
 
-def verdicts(of: Comparison, quantity: str) -> set[str]:
-    return {row.judged[quantity].verdict for row in of.rows}
+def verdicts(of: Reproduction, quantity: str) -> set[str]:
+    return set(of.of(quantity).verdict)
+
+
+def reason(of: Reproduction, quantity: str, model: str = "3dgs", scene: str = "suzanne") -> str:
+    rows = of.of(quantity)
+    (text,) = rows.reason[(rows.model == model) & (rows.scene == scene)]
+    return text
 
 
 def test_the_same_numbers_agree():
     """Catches a comparison that cannot even tell that nothing differs."""
-    of = held(runs(seeds=1), runs())
+    of = reproduced(runs(seeds=1), runs())
     assert of.verdict == AGREES
     assert compared(of) == [
         "Bit-equal with the run of the same seed in published: 10 of 10 runs",
         "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB",
     ]
-    assert verdicts(of, "gaussians") == verdicts(of, "mb") == {AGREES}
+    assert verdicts(of, "gaussians") == verdicts(of, "model_mb") == {AGREES}
 
 
 def spread_out(seeds: int) -> list[Record]:
@@ -65,64 +86,67 @@ def spread_out(seeds: int) -> list[Record]:
 
 
 def test_bits_agree_whatever_the_spread_of_seeds():
-    """Catches equal bits that "cannot be told" because seeds differ by decibels, statistics of runs that are equal, and
+    """Catches equal bits that are undecided because seeds differ by decibels, statistics of runs that are equal, and
     equal bits of a few runs that speak for another."""
-    of = held(spread_out(1), spread_out(3))
-    assert [verdicts(of, quantity) for quantity in ("psnr", "gaussians", "mb")] == [{AGREES}] * 3
-    assert {row.judged["psnr"].difference.mean for row in of.rows} == {0.0}
-    assert all(row.bit_equal == row.shared == [0] for row in of.rows)
-    more = held(spread_out(3), spread_out(2))  # seed 2 is in one folder only
+    of = reproduced(spread_out(1), spread_out(3))
+    assert [verdicts(of, quantity) for quantity in ("psnr_db", "gaussians", "model_mb")] == [{AGREES}] * 3
+    assert set(of.of("psnr_db").difference) == {0.0}
+    assert set(of.seeds.seed) == {0}
+    assert of.seeds.bit_equal.all()
+    more = reproduced(spread_out(3), spread_out(2))  # seed 2 is in one folder only
     assert more.verdict == AGREES
     assert compared(more)[0].endswith("20 of 20 runs")
     ours = [moved(r, 0.001) if r.seed == 1 else r for r in spread_out(2)]
-    other = held(ours, spread_out(3))
+    other = reproduced(ours, spread_out(3))
     assert compared(other)[0].endswith("10 of 20 runs")
-    assert other.verdict == UNTOLD
+    assert other.verdict == UNDECIDED
 
 
 @pytest.mark.parametrize("changes", [{"num_gaussians": 1}, {"bytes": 1}])
 def test_runs_of_equal_psnr_and_other_gaussians_are_not_bit_equal(changes):
     """Catches bits that are told from PSNR alone, and views whose PSNR differs in the last digit."""
     ours = [costing(r, **changes) for r in runs(seeds=1)]
-    assert not any(row.bit_equal for row in held(ours, runs()).rows)
+    assert not reproduced(ours, runs()).seeds.bit_equal.any()
     views = [dataclasses.replace(r.per_view[0], psnr=math.nextafter(r.per_view[0].psnr, 99)) for r in runs(seeds=1)]
     ours = [dataclasses.replace(r, per_view=[v, *r.per_view[1:]]) for r, v in zip(runs(seeds=1), views, strict=True)]
-    assert not any(row.bit_equal for row in held(ours, runs()).rows)
+    assert not reproduced(ours, runs()).seeds.bit_equal.any()
 
 
 def test_a_single_run_agrees_where_another_seed_would_lie():
     """Catches one seed that can never agree with three as these are too far apart, and one that always does."""
     noisy = {0: 0.6, 1: -0.7, 2: 0.1}
     theirs = [moved(r, noisy[r.seed]) for r in runs()]
-    near, far, beyond = (held([moved(r, psnr) for r in runs(seeds=1)], theirs) for psnr in (0.7, 1.4, -5.0))
-    assert all(row.judged["psnr"].difference.half > LIMITS["psnr"].widest for row in near.rows)
+    near, far, beyond = (reproduced([moved(r, psnr) for r in runs(seeds=1)], theirs) for psnr in (0.7, 1.4, -5.0))
+    assert (
+        (near.table.high - near.table.difference)[near.table.quantity == "psnr_db"].gt(LIMITS.widest["psnr_db"]).all()
+    )
     assert near.verdict == AGREES
-    assert UNTOLD in verdicts(far, "psnr")
+    assert UNDECIDED in verdicts(far, "psnr_db")
     assert "more seeds are needed" in compared(far)[-1]
     assert beyond.verdict == DIFFERS
     pairs = [moved(r, 0.7 + noisy[r.seed]) for r in runs(seeds=2)]
-    assert held(pairs, theirs).verdict == UNTOLD  # two runs have a mean, whose interval is too wide
+    assert reproduced(pairs, theirs).verdict == UNDECIDED  # two runs have a mean, whose interval is too wide
 
 
 def test_other_seeds_agree():
     """Catches a spread over seeds that is called a difference."""
-    of = held([r for r in runs() if r.seed == 0], [r for r in runs(seeds=4) if r.seed])
-    assert (of.verdict, len(of.rows)) == (AGREES, 10)
+    of = reproduced([r for r in runs() if r.seed == 0], [r for r in runs(seeds=4) if r.seed])
+    assert (of.verdict, len(of.of("psnr_db"))) == (AGREES, 10)
 
 
 @pytest.mark.parametrize("psnr", [-1.5, 1.5])
 def test_one_model_that_differs_is_found(psnr):
     """Catches a model that trains to another quality on this machine and passes for the published one."""
     ours = [moved(r, psnr if (r.model, r.scene) == ("7dgs", "suzanne") else 0) for r in runs() if r.seed == 0]
-    of = held(ours, runs())
+    of = reproduced(ours, runs())
     assert of.verdict == DIFFERS
-    assert [(row.model, row.scene) for row in of.of("psnr", DIFFERS)] == [("7dgs", "suzanne")]
+    assert of.of("psnr_db", DIFFERS)[["model", "scene"]].to_numpy().tolist() == [["7dgs", "suzanne"]]
     assert compared(of)[0].endswith("9 of 10 runs")
     assert compared(of)[1].startswith("PSNR differs in 1 of 10 models on scenes, agrees in 9; largest difference ")
     assert compared(of)[1].endswith(" dB, 7dgs on suzanne")
 
 
-@pytest.mark.parametrize("quantity", ["gaussians", "mb", "seconds", "ms"])
+@pytest.mark.parametrize("quantity", ["gaussians", "model_mb", "train_s", "frame_ms"])
 def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
     """Catches a spread of 10 to 20 % over seeds that is called a difference, or whose unit is lost: means of thousands
     of Gaussians and of thousandths of a second."""
@@ -134,31 +158,30 @@ def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
                        render_ms=times)  # fmt: skip
 
     ours = [spread(r, 1.0, 1.2, 1.12) for r in runs()]
-    of = held(ours, [spread(r, 0.9, 1.02, 0.98) for r in runs()])
+    of = reproduced(ours, [spread(r, 0.9, 1.02, 0.98) for r in runs()])
     assert verdicts(of, quantity) == {AGREES}
-    row = of.rows[0].judged[quantity]
-    assert 0.1 < row.difference.mean / fmean(row.theirs) < 0.2
-    assert row.difference.half / fmean(row.theirs) == pytest.approx(0.16, abs=0.02)
+    row = of.of(quantity).iloc[0]
+    assert 0.1 < row.difference / row.theirs < 0.2
+    assert (row.high - row.difference) / row.theirs == pytest.approx(0.16, abs=0.02)
 
 
 def test_one_run_on_each_side_cannot_be_told():
     """Catches a verdict without any knowledge of the spread over seeds; equal numbers need none."""
     ours = [moved(r, 0.3) for r in runs(seeds=1)]
-    of = held(ours, runs(seeds=1))
-    assert of.verdict == UNTOLD
+    of = reproduced(ours, runs(seeds=1))
+    assert of.verdict == UNDECIDED
     assert "no spread over seeds is known (in 10)" in compared(of)[-1]
-    assert held(runs(seeds=1), runs(seeds=1)).verdict == AGREES
+    assert reproduced(runs(seeds=1), runs(seeds=1)).verdict == AGREES
 
 
 def test_a_noisy_model_is_held_against_its_own_spread():
-    """Catches a model whose seeds differ by 2 dB and that is told apart by the calm of the others."""
+    """Catches a model whose seeds differ by 2 dB and that differs by the calm of the others."""
     noisy = {0: 1.0, 1: -2.0, 2: 1.5}
     theirs = [moved(r, noisy[r.seed]) if (r.model, r.scene) == ("7dgs", "suzanne") else r for r in runs()]
     ours = [moved(r, -3.0) if (r.model, r.scene) == ("7dgs", "suzanne") else r for r in runs(seeds=1)]
-    of = held(ours, theirs)
-    assert of.of("psnr", DIFFERS) == []
-    (row,) = [row for row in of.rows if (row.model, row.scene) == ("7dgs", "suzanne")]
-    assert row.judged["psnr"].reason == "the interval is too wide: more seeds are needed"
+    of = reproduced(ours, theirs)
+    assert of.of("psnr_db", DIFFERS).empty
+    assert reason(of, "psnr_db", "7dgs") == "the interval is too wide: more seeds are needed"
 
 
 @pytest.mark.parametrize(
@@ -170,61 +193,61 @@ def test_a_noisy_model_is_held_against_its_own_spread():
 )
 def test_other_trainings_and_data_are_not_compared(changes, why):
     """Catches a verdict on numbers that measure something else."""
-    of = held([told(r, **changes) for r in runs()], runs())
-    assert of.verdict == UNTOLD
-    assert all(verdicts(of, quantity) == {UNTOLD} for quantity in LIMITS)
-    assert compared(of)[-1] == f"Cannot be told: {why} (in 10)"
+    of = reproduced([measured_by(r, **changes) for r in runs()], runs())
+    assert of.verdict == UNDECIDED
+    assert all(verdicts(of, quantity) == {UNDECIDED} for quantity in LIMITS.index)
+    assert compared(of)[-1] == f"Undecided: {why} (in 10)"
 
 
 def test_another_length_is_said_to_be_one():
     """Catches a shorter training that is "not in both", and one that is not told beside runs that are compared."""
     short = frontier(seeds=1, lengths=(250, 500))
     why = "Cannot be compared: train.iterations 250 instead of 1000 (in 10, others in 10)"
-    assert compared(held(short, runs())) == [why]
-    assert compared(held([*short, *runs(seeds=1)], runs()))[2:] == [why]
-    assert held(runs(models=("3dgs",)), runs(models=("7dgs",))).otherwise == {}
+    assert compared(reproduced(short, runs())) == [why]
+    assert compared(reproduced([*short, *runs(seeds=1)], runs()))[2:] == [why]
+    assert reproduced(runs(models=("3dgs",)), runs(models=("7dgs",))).otherwise == {}
 
 
 def test_measured_otherwise_is_not_compared():
     """Catches PSNR of renders through 8 bits beside that of floats."""
     ours = [dataclasses.replace(r, protocol=r.protocol | {"quantise": True}) for r in runs()]
-    assert "measured otherwise: quantise False there, True" in compared(held(ours, runs()))[-1]
+    assert "measured otherwise: quantise False there, True" in compared(reproduced(ours, runs()))[-1]
 
 
 def test_seconds_are_compared_on_one_machine_alone():
-    """Catches a stranger's seconds told apart from ours, and those of a machine that had other work."""
+    """Catches a stranger's seconds that differ from ours, and those of a machine that had other work."""
     here = Hardware("Invented CPU", 2, 24, "25", "1", "1", "v3")
-    of = held([told(r, hardware=here) for r in runs()], runs())
+    of = reproduced([measured_by(r, hardware=here) for r in runs()], runs())
     assert of.verdict == AGREES
-    assert verdicts(of, "seconds") == verdicts(of, "ms") == {UNTOLD}
+    assert verdicts(of, "train_s") == verdicts(of, "frame_ms") == {UNDECIDED}
     named = "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads here"
-    assert named in of.rows[0].judged["seconds"].reason
-    busy = held([costing(r, load=r.cost.load + 1) for r in runs()], runs())
-    assert "the machine had other work: load 4.0 here, 3.0 there" in busy.rows[0].judged["seconds"].reason
-    slow = held([costing(r, train_s=2 * r.cost.train_s) for r in runs()], runs())
-    assert verdicts(slow, "seconds") == {DIFFERS}
+    assert named in reason(of, "train_s")
+    busy = reproduced([costing(r, load=r.cost.load + 1) for r in runs()], runs())
+    assert "the machine had other work: load 4.0 here, 3.0 there" in reason(busy, "train_s")
+    slow = reproduced([costing(r, train_s=2 * r.cost.train_s) for r in runs()], runs())
+    assert verdicts(slow, "train_s") == {DIFFERS}
     assert compared(slow)[-1] == "Seconds differ in 10"
     assert slow.verdict == AGREES  # in PSNR
 
 
 def test_what_is_not_in_both_is_named():
     """Catches a model that is missing here and is not missed, and folders that have nothing in common."""
-    of = held([r for r in runs() if r.model != "4dgs"], [r for r in runs() if r.model != "6dgs"])
+    of = reproduced([r for r in runs() if r.model != "4dgs"], [r for r in runs() if r.model != "6dgs"])
     assert of.only_theirs == ["4dgs on moving-matte", "4dgs on suzanne"]
     assert of.only_ours == ["6dgs on moving-matte", "6dgs on suzanne"]
-    none = held(runs(models=("3dgs",)), runs(models=("7dgs",)))
-    assert none.verdict == UNTOLD
+    none = reproduced(runs(models=("3dgs",)), runs(models=("7dgs",)))
+    assert none.verdict == UNDECIDED
     assert compared(none) == ["Cannot be compared: no model and scene is also in published"]
 
 
 def test_a_run_that_did_not_finish_is_said():
     """Catches a crash, and a failure here that is not said."""
     ours = [dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs()]
-    of = held(ours, runs())
-    assert of.verdict == UNTOLD
+    of = reproduced(ours, runs())
+    assert of.verdict == UNDECIDED
     assert compared(of)[0].endswith("24 of 24 runs")
     assert compared(of)[1] == "PSNR agrees in 8 of 10 models on scenes; largest difference 0.00 dB"
-    assert compared(of)[2] == "Cannot be told: no run finished here (in 2)"
+    assert compared(of)[2] == "Undecided: no run finished here (in 2)"
 
 
 @pytest.mark.parametrize(
@@ -236,7 +259,7 @@ def test_a_run_that_did_not_finish_is_said():
         (frontier(("3dgs",), seeds=1, lengths=(250, 1000)), "4 runs: 1 model on 2 scenes, seed 0, 250 to 1,000 iter"),
         ([dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs(seeds=1)],
          "10 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, 2 failed, "),
-        ([told(r, config={}) for r in runs(seeds=1)], "10 runs: 5 models on 2 scenes, seed 0, "),
+        ([measured_by(r, config={}) for r in runs(seeds=1)], "10 runs: 5 models on 2 scenes, seed 0, "),
         ([*runs(seeds=1), *(dataclasses.replace(r, experiment="b") for r in runs(seeds=1, models=("3dgs",)))],
          "12 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, "),
     ],
@@ -244,8 +267,8 @@ def test_a_run_that_did_not_finish_is_said():
 def test_what_was_trained(records, said):
     """Catches a number that is not that of the runs, and seconds of runs that did not finish."""
     seconds = sum(r.cost.train_s for r in records if r.cost)
-    assert trained(records).startswith(said)
-    assert trained(records).endswith(f", {duration(seconds)} of training in all")
+    assert trained(as_tables(records).runs).startswith(said)
+    assert trained(as_tables(records).runs).endswith(f", {duration(seconds)} of training in all")
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -260,19 +283,19 @@ def test_the_last_lines_are_six_and_short(seed):
     def folder() -> list[Record]:
         kept = [pool[i] for i in random.permutation(len(pool))[: random.integers(1, len(pool))]]
         changed = [lambda r: moved(r, random.normal()), lambda r: dataclasses.replace(r, **LOST), lambda r: r,
-                   lambda r: costing(r, num_gaussians=9), lambda r: told(r, data_hash="7"), lambda r: r]  # fmt: skip
+                   lambda r: costing(r, num_gaussians=9), lambda r: measured_by(r, data_hash="7")]  # fmt: skip
         return [changed[random.integers(len(changed))](r) for r in kept]
 
     ours, theirs = folder(), folder()
-    of = held(ours, theirs)
-    found = lines(of, ours, Path("results/mini/report.html"))
-    assert 3 <= len(found) <= 6
-    assert all(len(line) <= LONGEST and "\n" not in line for line in found)
-    assert found[0].startswith(f"{len(ours)} run")
+    of = reproduced(ours, theirs)
+    last = lines(of, as_tables(ours).runs, Path("results/mini/report.html"))
+    assert 3 <= len(last) <= 6
+    assert all(len(line) <= LONGEST and "\n" not in line for line in last)
+    assert last[0].startswith(f"{len({r.path for r in ours})} run")
     shared = {r.path for r in ours} & {r.path for r in theirs}
-    assert sum(len(row.shared) for row in of.rows) <= len(shared)
-    told_of = [len(of.of("psnr", verdict)) for verdict in (AGREES, DIFFERS, UNTOLD)]
-    assert sum(told_of) == len(of.rows)
+    assert len(of.seeds) <= len(shared)
+    assert sum(len(of.of("psnr_db", verdict)) for verdict in (AGREES, DIFFERS, UNDECIDED)) == len(of.of("psnr_db"))
+    assert len(section(of).table) == len(of.of("psnr_db"))
     assert sum(map(len, of.otherwise.values())) <= len(of.only_ours)
 
 
@@ -284,7 +307,7 @@ def write(records: list[Record], folder: Path) -> Path:
 
 def test_the_command(tmp_path, capsys):
     """Catches an exit status, a last line, a JSON and a page that do not say what the comparison came to."""
-    ours, theirs = write(runs(seeds=1), tmp_path / "mine"), write(runs(), tmp_path / "published")
+    ours, theirs = write(runs(seeds=1), tmp_path / "ours"), write(runs(), tmp_path / "published")
     before = {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()}
     assert main([str(ours), "--against", str(theirs), "--json", str(tmp_path / "a.json")]) == 0
     out = capsys.readouterr().out
@@ -294,28 +317,26 @@ def test_the_command(tmp_path, capsys):
     assert last[1].endswith(": 10 of 10 runs")
     assert last[2] == "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB"
     assert last[3] == f"Report: {ours / 'report.html'}"
-    assert "7dgs seed 2" in out
-    told = json.loads((tmp_path / "a.json").read_text())
-    assert (told["verdict"], told["lines"][1]) == (AGREES, last[2])
-    row = next(r for r in told["rows"] if (r["model"], r["scene"]) == ("7dgs", "suzanne"))
-    assert row["runs"][2]["ours"] is None
-    assert row["runs"][0]["ours"] == row["runs"][0]["theirs"]
-    assert (row["judged"]["psnr"]["bit_equal"], row["judged"]["psnr"]["difference"]) == (True, 0.0)
+    written = json.loads((tmp_path / "a.json").read_text())
+    assert (written["verdict"], written["lines"][1]) == (AGREES, last[2])
+    assert [len(written["runs"][side]) for side in ("ours", "theirs")] == [10, 30]
+    assert all(run in written["runs"]["theirs"] for run in written["runs"]["ours"])
+    row = next(r for r in written["rows"] if (r["model"], r["scene"], r["quantity"]) == ("7dgs", "suzanne", "psnr_db"))
+    assert (row["bit_equal"], row["difference"], row["low"]) == (True, 0.0, None)
     page = (ours / "report.html").read_text()
     assert f"Against {theirs}" in page
-    assert "PSNR agrees in 10, differs in 0, cannot be told in 0 of 10 rows here." in page
     assert {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()} == before
     write([moved(r, 2.0) for r in runs(seeds=1)], ours)
     assert main([str(ours), "--against", str(theirs), "--json", str(tmp_path / "a.json")]) == 1
-    told = json.loads((tmp_path / "a.json").read_text())
-    assert all(r["judged"]["psnr"]["low"] < r["judged"]["psnr"]["difference"] for r in told["rows"])
+    rows = [row for row in json.loads((tmp_path / "a.json").read_text())["rows"] if row["quantity"] == "psnr_db"]
+    assert all(row["low"] < row["difference"] < row["high"] for row in rows)
     assert main([str(ours), "--against", str(tmp_path / "nowhere")]) == 2
     assert "expected a folder of results" in capsys.readouterr().err
 
 
 def test_text_from_a_record_cannot_break_the_comparison(tmp_path, capsys):
     """Catches a data set's name or a machine's that colours the terminal or writes the line anew."""
-    bad = [told(r, device="\x1b[31m\nowned") for r in runs(seeds=1)]
-    folder = write([dataclasses.replace(r, dataset="x\x1b\ny") for r in bad], tmp_path / "mine")
+    bad = [measured_by(r, device="\x1b[31m\nowned") for r in runs(seeds=1)]
+    folder = write([dataclasses.replace(r, dataset="x\x1b\ny") for r in bad], tmp_path / "ours")
     main([str(folder), "--against", str(folder)])
     assert "\x1b" not in capsys.readouterr().out
