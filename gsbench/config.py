@@ -107,24 +107,6 @@ class DensifyConfig:
     noise: float = key(5e5, "of mcmc: factor of noise on means", low=0, absent=5e5)
 
 
-@dataclass
-class PenaltyConfig:
-    """Set one loss term."""
-
-    weight: float = key(0.0, "factor of the term", low=0, absent=0)
-    start: int = key(0, "first step", low=0, absent=0)
-    stop: int | None = key(None, "step after the last", low=0)
-
-
-@dataclass
-class PenaltiesConfig:
-    """Add terms to every view's loss."""
-
-    opacity: PenaltyConfig = group(PenaltyConfig, "mean opacity")
-    size: PenaltyConfig = group(PenaltyConfig, "mean scale in space, in parts of the scene's extent")
-    strain: PenaltyConfig = group(PenaltyConfig, "how fast neighbours move apart, for their distance")
-
-
 @extended("train")
 @dataclass
 class TrainConfig:
@@ -139,14 +121,8 @@ class TrainConfig:
     lambda_from: int = key(15_000, "step from which lambda_t and lambda_d learn", low=0)
     densify: DensifyConfig = group(DensifyConfig)
     cooldown_from: int | None = key(None, "step from which rates fall to a tenth", low=0)
-    average_from: int | None = key(None, "first step of an average that replaces the end if better on val", low=0)
     coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until 3,000")
-    penalties: PenaltiesConfig = group(PenaltiesConfig)
     curve_points: int = key(20, "measurements on val", low=1, high=10_000)  # a page can draw so many
-    lengths: int | None = key(None, "4: also train 1/2, 1/4, 1/8 of it; keep the best on val",
-                              low=2, high=8)  # fmt: skip
-    patience: float | None = key(None, "share of iterations without a better val PSNR that ends a run",
-                                 low=0.01, high=1)  # fmt: skip
     checkpoint_minutes: float = key(2.0, "time between two checkpoints", unit="minutes", low=0, role="place")
 
 

@@ -156,10 +156,11 @@ def joins(group: str) -> Callable[[type[_T]], type[_T]]:
 
 
 def extended(group: str) -> Callable[[type[_T]], type[_T]]:
-    """Add to the dataclass of a group the keys of all dataclasses that join it, after its own."""
+    """Add to the dataclass of a group the keys of all that join it, after its own and by the names of their modules."""
 
     def extend(kind: type[_T]) -> type[_T]:
+        joining = sorted(_joining.get(group, []), key=lambda joined: joined.__module__, reverse=True)
         names = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__doc__": kind.__doc__}
-        return dataclass(type(kind.__name__, (*reversed(_joining.get(group, [])), kind), names))
+        return dataclass(type(kind.__name__, (*joining, kind), names))
 
     return extend

@@ -35,11 +35,12 @@ COMPARE = 0.7
 
 @dataclass(frozen=True)
 class ActiveComponents:
-    """Hold the SH degree at a step, and whether AGR (a network), lambda_t and lambda_d are trained."""
+    """Which parts of a model act and learn at a step."""
 
     sh_degree: int
     refine: bool  # AGR changes the Gaussians and learns
     tunes_lambda: bool  # lambda_t and lambda_d learn
+    warms_up: bool = False  # the model's first stage, in which it may be static (`GaussianModel.warm_up`)
 
 
 class Schedule:
@@ -49,15 +50,17 @@ class Schedule:
     length, they are multiplied by iterations / recipe_iterations.
     """
 
-    def __init__(self, config: TrainConfig, sh_degree: int, agr: bool) -> None:
+    def __init__(self, config: TrainConfig, sh_degree: int, agr: bool, warm_up: int = 0) -> None:
         """Convert the step numbers in the settings, given for `recipe_iterations` iterations, to steps of this run.
 
         Args:
             config: the settings of the training.
             sh_degree: the final SH degree of the model.
             agr: whether the model has AGR, the neural refinement.
+            warm_up: the step at which the warm-up of the model ends; 0: it has none.
         """
         self.config = config
+        self.warm_up = self.scaled(warm_up) if warm_up else 0
         self.sh_degree = sh_degree
         self.agr = agr
         densify = config.densify
@@ -65,7 +68,6 @@ class Schedule:
         self.densify_stop = self.scaled(densify.stop)
         window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
         self.densify_every = max(densify.every, math.ceil(window / rounds))
-        self.average_start = None if config.average_from is None else self.scaled(config.average_from)
         every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
         # The numbers of finished steps after which opacities are reset, none close to the end of densification.
         self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
@@ -75,12 +77,18 @@ class Schedule:
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def active(self, step: int) -> ActiveComponents:
-        """Return the SH degree at a step, and whether AGR (a network), lambda_t and lambda_d are trained."""
+        """Return which parts of the model act and learn at a step."""
         return ActiveComponents(
             sh_degree=min(self.sh_degree, step // self.scaled(self.config.sh_every)),
             refine=self.agr and step >= self.scaled(self.config.refine_from),
             tunes_lambda=step >= self.scaled(self.config.lambda_from),
+            warms_up=step < self.warm_up,
         )
+
+    def is_complete(self, step: int) -> bool:
+        """Return whether all parts of the model that act at the last step act at this one."""
+        now, last = self.active(step), self.active(self.config.iterations - 1)
+        return (now.sh_degree, now.refine, now.warms_up) == (last.sh_degree, last.refine, last.warms_up)
 
     def densifies(self, step: int) -> bool:
         """Return whether Gaussians are cloned, split and pruned after a step, counted from 0."""

@@ -21,7 +21,7 @@ from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.run.checks import BACKGROUNDS, LEAST_GAUSSIANS, check_config
 from gsbench.scenes import RESIZES
-from gsbench.train.densify import KINDS
+from gsbench.train.density.control import RULES
 from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
@@ -79,7 +79,7 @@ def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
 def test_facts_are_those_of_the_code() -> None:
     """Catches a choice that the code does not have, and one that is refused though it has it."""
     choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "optim": OPTIMIZERS, "effects.gate": GATES,
-               "train.densify.kind": KINDS, "model.gate": GATES}  # fmt: skip
+               "train.densify.kind": RULES, "model.gate": GATES}  # fmt: skip
     for name, known in choices.items():
         assert set(KEYS[name].choices) == set(known), name
     assert KEYS["train.curve_points"].high == MAX_POINTS

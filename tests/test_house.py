@@ -44,8 +44,6 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/scenes": 27,
     "gsbench/sweep": 39,
     "gsbench/train": 29,
-    "gsbench/train/densify": 5,
-    "gsbench/train/penalties": 6,
     "gsbench/view": 28,
     "tests": 100,
     "tests/effects": 37,

@@ -251,6 +251,7 @@ class Record:
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
     length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`
     exact: list[str] = field(default_factory=list)  # views: gsbench.measure.exact_views
+    parts: dict[str, Any] = field(default_factory=dict)  # what training hooks add: gsbench.train.hooks.Hook.results
 
     @property
     def path(self) -> Path:

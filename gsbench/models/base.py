@@ -6,6 +6,7 @@ neural refinement).
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -43,6 +44,7 @@ class GaussianModel(nn.Module, ABC):
     geometry: ClassVar[tuple[str, ...]]  # the raw parameters of the covariance: AGR changes them
     lengths: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters of both kinds that are in world units
     initial_opacity: ClassVar[float] = 0.1
+    warm_up: int = 0  # the step, of 30,000, until which `active.warms_up`; a model with a static first stage sets it
 
     def __init__(
         self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
@@ -102,6 +104,13 @@ class GaussianModel(nn.Module, ABC):
             raw: the raw parameters of the parents, of which each has two copies, one after the other.
             generator: the source of all random numbers.
         """
+
+    def penalties(self) -> Sequence[tuple[float, Callable[[Query, int], Tensor]]]:
+        """Return terms of the loss of every view: a weight, and a function of the view and its index in the batch.
+
+        Each function returns a tensor []. Threads call it for several views at the same time.
+        """
+        return ()
 
     def scales(self) -> Tensor:
         """Return the largest spatial standard deviation of each Gaussian, [N], world units, without a gradient."""
@@ -314,7 +323,10 @@ class GaussianModel(nn.Module, ABC):
             self.refinement.requires_grad_(active.refine)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters of the model by the name of their group; each group has its own learning rate."""
+        """Return the parameters of the model by the name of their group, each with a learning rate in `model.lr`.
+
+        A model with a network of its own adds a group: `super().groups() | {"field": list(self.field.parameters())}`.
+        """
         groups = {name: [parameter] for name, parameter in self.splats.items()}
         if self.refinement is not None:
             groups["refinement"] = list(self.refinement.parameters())

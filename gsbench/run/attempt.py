@@ -23,6 +23,8 @@ from gsbench.run.setup import build, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.placement import gaussians_to_standard
+from gsbench.train.gating import Gating
+from gsbench.train.hooks.choices import Choices, lengths_of
 from gsbench.train.loop import Trainer
 
 
@@ -77,7 +79,7 @@ class Attempt:
             self.resolved = resolve(this, scene)
             self.model = model = build(self.resolved.config)
         screen, device = self.resolved.screen, this.config.device
-        if self.resolved.compares or this.config.train.lengths is not None:
+        if self.resolved.compares or lengths_of(this.config) is not None:
             reset_peak_memory(device)
             choose = best_of if self.resolved.compares else best_length
             trainer = choose(this, scene, self.start, self.resolved)
@@ -102,20 +104,23 @@ class Attempt:
         found = measuring.measure(trainer, self.resolved.config, on_demand is not None)
         self._images = found.images
         record = self.describe("ok", None)
+        results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
+        known = {name: value for name, value in results.items() if hasattr(record, name)}
+        parts = {name: value for name, value in results.items() if name not in known}
         return replace(
             record, protocol=record.protocol | found.frames, on_demand=on_demand, metrics=found.metrics,
             missing=found.missing, per_view=found.per_view, regions=found.regions,
-            cost=found.cost, curve=trainer.curve.points, stop=trainer.early_stop.stop,
-            averaged=trainer.average.kept, length_choice=trainer.length_choice,
+            cost=found.cost, curve=trainer.curve.points, **known, parts=parts,
             exact=sorted(trainer.exact.union(*(view.exact for view in found.per_view))),
         )  # fmt: skip
 
     def _on_demand(self, trainer: Trainer) -> OnDemand | None:
         """Return the decisions on removing time, direction or AGR (a network); None if the settings ask for none."""
-        screen, gating = self.resolved.screen, trainer.gating
+        screen, gating = self.resolved.screen, trainer.hook(Gating)
         if screen is None and self.resolved.config.effects.gate == "off":
             return None
-        return OnDemand(screen, gating.gates, gating.notes, gating.direction, trainer.comparison)
+        return OnDemand(screen, gating.gates, gating.notes, gating.direction,
+                        trainer.hook(Choices).chosen.comparison)  # fmt: skip
 
     def draw(self) -> None:
         """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.

@@ -18,13 +18,12 @@ from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
-from gsbench.models.gated import as_gated
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Scene, View
 from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
+from gsbench.train.hooks import hook_types
 from gsbench.train.losses import WINDOW
-from gsbench.train.penalties import check_penalties
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
@@ -47,7 +46,8 @@ def check_values(config: Config) -> None:
     for dotted, value in flat(dataclasses.asdict(config)):
         facts(dotted).check(dotted, value)
     _check_steps(config)
-    check_penalties(config.train.penalties)
+    for hook in hook_types():
+        hook.check(config)
     _check_coarse(config.train.coarse or [])
     for name, rate in config.model.lr.items():
         _check_rate(f"model.lr.{name}", rate)
@@ -114,15 +114,11 @@ def check_keys(value: Any, kind: Any, place: str) -> None:
 
 
 def _check_steps(config: Config) -> None:
-    """Raise InputError if the end of a training is to begin after its last step, or its shortest length has no step."""
-    train = config.train
-    if train.lengths is not None and not train.iterations >> (train.lengths - 1):
-        raise InputError(f"train.lengths={train.lengths}: expected at least {1 << (train.lengths - 1)} iterations to "
-                         f"halve {train.lengths - 1} times, got train.iterations={train.iterations}")  # fmt: skip
-    for key, step in (("cooldown_from", train.cooldown_from), ("average_from", train.average_from)):
-        if step is not None and step >= train.recipe_iterations:
-            raise InputError(f"train.{key}: expected a step below train.recipe_iterations={train.recipe_iterations}, "
-                             f"the length for which steps are given, got {step}")  # fmt: skip
+    """Raise InputError if learning rates are to fall after the last step."""
+    step, length = config.train.cooldown_from, config.train.recipe_iterations
+    if step is not None and step >= length:
+        raise InputError(f"train.cooldown_from: expected a step below train.recipe_iterations={length}, the length for "
+                         f"which steps are given, got {step}")  # fmt: skip
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
@@ -226,17 +222,11 @@ def data_root(root: str) -> Path:
         raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
 
 
-def check_gates(model: GaussianModel, config: Config) -> None:
-    """Raise InputError if `effects.gate` asks to remove time, direction or AGR (a network) and the model cannot."""
-    if config.effects.gate != "off":
-        as_gated(model)
-
-
 def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     """Raise InputError if the scene cannot train the model.
 
     Reasons are a model with time for a scene without time, cameras that are all at one place, images that are too
-    small, and settings that choose on val (`train.patience`, `train.lengths`) without val.
+    small, and training hooks that need views of val.
     """
     if ("time" in model.observes or config.agr) and not scene.has_time:
         what = "agr=true" if config.agr else config.model.name
@@ -251,39 +241,8 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
     if side // factor < WINDOW:
         key = f"train.coarse, after the factor {factor}" if factor > 1 else f"scene.downscale={config.scene.downscale}"
         raise InputError(f"{key}: expected images of at least {WINDOW} pixels, the loss's window, got {side // factor}")
-    _check_choices_on_val(scene, config)
-
-
-def _check_choices_on_val(scene: Scene, config: Config) -> None:
-    """Raise InputError if a setting chooses an iteration or a length on val, and cannot.
-
-    Reasons are a scene without val, results on the views by which is chosen, and settings that exclude each other.
-    """
-    train = config.train
-    for key, value, what in (("patience", train.patience, "iteration"), ("lengths", train.lengths, "length")):
-        if value is None:
-            continue
-        if not scene.val:
-            raise InputError(f"train.{key}: expected views of val to choose the {what}, {scene.name} has none: "
-                             f"scene.val_every=8 takes every eighth training view")  # fmt: skip
-        if config.scene.eval_split == "val":
-            raise InputError(f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
-                             f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
-    if train.lengths is not None and config.effects.compare:
-        raise InputError("train.lengths: expected effects.compare=false, which compares models of one length: leave "
-                         "one of the two out")  # fmt: skip
-    if train.patience is None:
-        return
-    if config.effects.compare:
-        raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not end "
-                         "before they are compared: leave one of the two out")  # fmt: skip
-    if train.lengths is not None:
-        raise InputError("train.patience: expected train.lengths=null, which chooses among whole trainings: leave one "
-                         "of the two out")  # fmt: skip
-    if train.average_from is not None:
-        raise InputError(f"train.patience: expected train.average_from=null, got {train.average_from}: a "
-                         f"training ends with its best iteration on val, or with averages (+recipe=long): leave one "
-                         f"of the two out")  # fmt: skip
+    for hook in hook_types():
+        hook.check_scene(scene, config)
 
 
 def evaluated_views(scene: Scene, split: str) -> list[View]:

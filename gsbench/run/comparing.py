@@ -17,7 +17,8 @@ from gsbench.run.setup import build, build_with_placeholders
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import Schedule
-from gsbench.train.loop import Trainer, comparison_of
+from gsbench.train.hooks.choices import Choices, choices_in
+from gsbench.train.loop import Trainer
 from gsbench.train.optim import check_rates
 
 
@@ -88,8 +89,8 @@ def best_of(this: Run, scene: Scene, start: TrainedGaussians | None, resolved: R
 
 
 def _known(state: dict[str, Any]) -> str | None:
-    found = comparison_of(state)
-    return None if found is None else found.chosen
+    comparison = choices_in(state).comparison
+    return None if comparison is None else comparison.chosen
 
 
 def _compared(parts: Candidates, resolved: Resolved) -> Trainer:
@@ -103,12 +104,13 @@ def _compared(parts: Candidates, resolved: Resolved) -> Trainer:
     comparison = ModelComparison(chosen.steps, chosen.found.name, [one.found for one in results])
     print(f"{parts.this.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
     trainer = parts.trained(chosen, results, resolved)
-    trainer.comparison = comparison
+    trainer.hook(Choices).chosen.comparison = comparison
     return trainer
 
 
 def reporter(this: Run, trainer: Trainer) -> progress.Reporter:
     """Report the progress of a run's last training; the steps of other candidates count as done."""
-    others = len(trainer.comparison.candidates) - 1 if trainer.comparison else 0
+    comparison = trainer.hook(Choices).chosen.comparison
+    others = len(comparison.candidates) - 1 if comparison else 0
     done = others * trainer.schedule.compares_after
     return progress.Reporter(this.folder, this.overrides, done + trainer.config.train.iterations, done)

@@ -16,7 +16,7 @@ from gsbench.run.checks import evaluated_views, lpips_weights
 from gsbench.run.identity import Run
 from gsbench.scenes import Scene
 from gsbench.train import checkpoint
-from gsbench.train.loop import length_choice_of
+from gsbench.train.hooks.choices import choices_in
 
 STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later attempt that did not finish
 
@@ -96,7 +96,7 @@ def _is_trained(this: Run, scene: Scene) -> bool:
         return False
     if state is None:
         return False
-    choice = length_choice_of(state)
+    choice = choices_in(state).length
     return state.get("step") == (this.config.train.iterations if choice is None else choice.kept)
 
 

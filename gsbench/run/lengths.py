@@ -16,7 +16,8 @@ from gsbench.run.identity import Run
 from gsbench.run.resolve import Resolved
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
-from gsbench.train.loop import Trainer, length_choice_of
+from gsbench.train.hooks.choices import Choices, choices_in, lengths_of
+from gsbench.train.loop import Trainer
 
 
 def lengths(config: Config) -> dict[str, Config]:
@@ -24,10 +25,10 @@ def lengths(config: Config) -> dict[str, Config]:
 
     Each length is twice the one before, and the last is `train.iterations`.
     """
-    train = config.train
-    assert train.lengths is not None
-    halvings = reversed(range(train.lengths))
-    trains = [replace(train, iterations=train.iterations >> k, lengths=None) for k in halvings]
+    train, count = config.train, lengths_of(config)
+    assert count is not None
+    alone: dict[str, Any] = {"lengths": None}
+    trains = [replace(train, iterations=train.iterations >> k, **alone) for k in reversed(range(count))]
     return {name_of(one.iterations): replace(config, train=one) for one in trains}
 
 
@@ -59,8 +60,8 @@ def best_length(this: Run, scene: Scene, start: TrainedGaussians | None, resolve
 
 
 def _known(state: dict[str, Any]) -> str | None:
-    found = length_choice_of(state)
-    return None if found is None else name_of(found.kept)
+    length = choices_in(state).length
+    return None if length is None else name_of(length.kept)
 
 
 def _best(parts: Candidates, resolved: Resolved) -> Trainer:
@@ -76,5 +77,5 @@ def _best(parts: Candidates, resolved: Resolved) -> Trainer:
     choice = LengthChoice(chosen.steps, [one.found for one in results])
     print(f"{parts.this.name}: {messages.of_lengths(choice)}", file=sys.stderr)
     trainer = parts.trained(chosen, results, resolved)
-    trainer.length_choice = choice
+    trainer.hook(Choices).chosen.length = choice
     return trainer

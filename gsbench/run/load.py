@@ -109,7 +109,7 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         raise
     except Exception as error:  # parts of an untrusted file may have any type
         raise InputError(f"{path}: expected a training's state, it lacks {one_line(error)!s:.200}") from None
-    schedule = Schedule(config.train, config.model.sh_degree, config.agr)
+    schedule = Schedule(config.train, config.model.sh_degree, config.agr, model.warm_up)
     model.set_active(schedule.active(max(0, step - 1)))
     return LoadedRun(model.requires_grad_(False), config, scene, step, Path(folder))
 

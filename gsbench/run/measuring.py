@@ -19,6 +19,7 @@ from gsbench.models.cuda_graph import GraphedFrames
 from gsbench.run.checks import lpips_weights
 from gsbench.scenes import View
 from gsbench.stability.float32_error import psnr_float32
+from gsbench.train.hooks.best import Best
 from gsbench.train.loop import Trainer
 
 Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H, W, 3] each
@@ -124,7 +125,8 @@ def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[
     the highest PSNR on the evaluated split during training is added too.
     """
     metrics, missing = dict(quality.metrics), dict(quality.missing)
-    metrics["psnr_best_on_val"] = trainer.best.eval_at_best_val
+    best = trainer.hook(Best).scores
+    metrics["psnr_best_on_val"] = best.eval_at_best_val
     if config.scene.eval_split == "val":
         metrics["psnr_best_on_val"] = None
         missing["psnr_best_on_val"] = "measured on val, so no other split is left to choose an iteration by"
@@ -132,5 +134,5 @@ def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[
         has_val = bool(trainer.scene.val)
         missing["psnr_best_on_val"] = "PSNR on val is not a number" if has_val else "the scene has no val split"
     if config.protocol.best_on_test:
-        metrics["psnr_best_on_test"] = trainer.best.eval
+        metrics["psnr_best_on_test"] = best.eval
     return metrics, missing

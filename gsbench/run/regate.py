@@ -15,6 +15,7 @@ from gsbench.run.load import own_root, typed_config
 from gsbench.run.run import write
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.gating import Gating
 
 
 def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
@@ -61,7 +62,7 @@ def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tu
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
                          f"{config.train.iterations}: run it again, it continues from there")  # fmt: skip
-    trainer.gate_at_end(by_halves=True)
+    trainer.hook(Gating).finish(by_halves=True)
     content = Checkpoint(training_hash(plain), found.data, trainer.state_dict(), plain, found.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)
     record = attempt.measure(trainer)

@@ -15,6 +15,7 @@ from gsbench.measure.record import TimeScreen
 from gsbench.measure.speed import Effort
 from gsbench.run.identity import Run
 from gsbench.scenes import Scene
+from gsbench.train.hooks.choices import lengths_of
 
 AUTO = "auto"
 CANDIDATES = ("moving", "static")  # in conf/model/auto.yaml
@@ -104,7 +105,7 @@ def plain(this: Run, config: Config) -> dict[str, Any]:
 
     The checkpoint of a run has those of the training that is kept, so that its schedule is that of its length.
     """
-    length = {"iterations": config.train.iterations, "lengths": config.train.lengths}
+    length = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
     found = this.plain | {"train": this.plain["train"] | length}
     if not is_auto(this.config):
         return found

@@ -9,9 +9,9 @@ from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.kernels.backends import resolve
 from gsbench.models import GaussianModel
-from gsbench.run.checks import BACKGROUNDS, check_gates, scene_folder
+from gsbench.run.checks import BACKGROUNDS, scene_folder
 from gsbench.scenes import Points, Scene
-from gsbench.train.penalties import check_observed
+from gsbench.train.hooks import hook_types
 from gsbench.train.seeding import generator
 
 
@@ -19,10 +19,9 @@ def build(config: Config) -> GaussianModel:
     """Build the model that the settings name, without Gaussians.
 
     Raises:
-        InputError: the model or an option is unknown, or `effects.gate` asks to remove time, direction or AGR (a
-            network) from Gaussians and the model does not support this, or a penalty needs a model with time.
+        InputError: the model or an option is unknown, or a training hook needs another model.
     """
-    own: dict[str, Any] = {
+    options: dict[str, Any] = {
         "module": config.model.module,
         "agr": config.agr,
         "agr_octaves": config.model.agr_octaves,
@@ -30,12 +29,12 @@ def build(config: Config) -> GaussianModel:
         "backend": resolve(config.raster.backend, torch.device(config.device).type),
     }
     for name in config.model.options:
-        if name in (*own, "name"):
+        if name in (*options, "name"):
             key = {"agr": "agr", "backend": "raster.backend"}.get(name, f"model.{name}")
             raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
-    model = models.build(config.model.name, **own, **config.model.options)
-    check_gates(model, config)
-    check_observed(model, config.train.penalties)
+    model = models.build(config.model.name, **options, **config.model.options)
+    for hook in hook_types():
+        hook.check_model(model, config)
     return model
 
 

@@ -92,6 +92,7 @@ class Points:
 
     means: Tensor  # [P, 3]
     colors: Tensor  # [P, 3] in [0, 1]
+    times: Tensor | None = None  # [P] in [0, 1], at which a model with time may start its Gaussians; None: not known
 
 
 @dataclass(frozen=True)

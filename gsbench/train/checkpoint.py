@@ -4,7 +4,7 @@ import hashlib
 import io
 import stat
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -15,26 +15,14 @@ from gsbench.errors import InputError, TooLargeError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import CHECKPOINT
 
-MAGIC = b"gsbench checkpoint 4\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
+MAGIC = b"gsbench checkpoint 5\n"  # then the SHA-256 of the rest in hex and a line feed, then what torch.save writes
 FILE_NAME = CHECKPOINT
 DIGEST = 64  # hex digits
+MOST_STEPS = 10**9  # no training has more
 # Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
-REPRODUCED = frozenset({"step", "model", "optimizer", "density", "minimum_scale", "gating", "average", "penalties",
-                        "best", "exact", "early_stop", "comparison", "length_choice"})  # fmt: skip
+REPRODUCED = frozenset({"step", "model", "optimizer", "density", "hooks", "exact"})
 # Keys of measured times, at any depth of the state. They differ between two trainings with one seed.
 TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
-
-
-# Keys of a training's state in checkpoints of older versions, with their present names; then prefixes of the names of
-# the optimizer's moments and of the model's parameters.
-RENAMED = {"floor": "minimum_scale"}
-RENAMED_IN_OPTIMIZER = {"modulation.": "lambda."}
-RENAMED_IN_MODEL = {
-    "log_modulation.": "log_lambda.",
-    "classes.levels": "effect_sets.orders",
-    "classes.spans": "effect_sets.intervals",
-    "classes.": "effect_sets.",
-}
 
 
 @dataclass(frozen=True)
@@ -107,8 +95,8 @@ def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | 
     """
     if not path.exists():
         return None
-    found = read(path, device)
-    return found.state if (found.training, found.data) == (training, data) else None
+    content = read(path, device)
+    return content.state if (content.training, content.data) == (training, data) else None
 
 
 def read(path: Path, device: str = "cpu") -> Checkpoint:
@@ -127,9 +115,9 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
             payload = file.read()
         if digest != hashlib.sha256(payload).hexdigest().encode() + b"\n":
             raise _fault(path, "a damaged one: its SHA-256 is not the one written with it")
-        content = torch.load(io.BytesIO(payload), map_location=device, weights_only=True)
-        check_plain(content, len(payload))
-        found = Checkpoint(**content)
+        plain = torch.load(io.BytesIO(payload), map_location=device, weights_only=True)
+        check_plain(plain, len(payload))
+        content = Checkpoint(**plain)
     except InputError:
         raise
     except (MemoryError, torch.OutOfMemoryError):
@@ -137,28 +125,11 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
                             f"use a machine with more") from None  # fmt: skip
     except Exception as error:  # a pickle whose bytes are hostile can make its reader raise anything
         raise _fault(path, one_line(error)[:200]) from None
-    for name, value in vars(found).items():
+    for name, value in vars(content).items():
         expected = str if name in ("training", "data") else dict
         if not isinstance(value, expected):
             raise _fault(path, f"'{name}' as {type(value).__name__}")
-    return replace(found, state=with_present_names(found.state))
-
-
-def with_present_names(state: dict[str, Any]) -> dict[str, Any]:
-    """Rename the keys of a training's state that an older version of gsbench wrote to the names in use now."""
-    state = {RENAMED.get(key, key): value for key, value in state.items()}
-    for part, names in (("model", RENAMED_IN_MODEL), ("optimizer", RENAMED_IN_OPTIMIZER)):
-        if isinstance(one := state.get(part), dict):
-            state[part] = {_present_key(key, names): value for key, value in one.items()}
-    return state
-
-
-def _present_key(key: Any, names: dict[str, str]) -> Any:
-    """Return the name in use now for a key of an old checkpoint; `names` maps old prefixes to new ones."""
-    for old, new in names.items():
-        if isinstance(key, str) and key.startswith(old):
-            return new + key.removeprefix(old)
-    return key
+    return content
 
 
 def check_plain(value: object, most: int) -> None:

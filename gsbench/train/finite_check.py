@@ -31,7 +31,7 @@ class FiniteCheck:
         self.skip = self._state[0]
 
     @torch.no_grad()
-    def see(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
+    def check(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
         """Check the loss and the gradients of a step, before the optimizer uses them.
 
         Args:
@@ -43,12 +43,12 @@ class FiniteCheck:
             DivergedError: a check failed, in this step or since the result was last read.
         """
         gradients = {name: [p.grad for p in group if p.grad is not None] for name, group in groups.items()}
-        if self.every == 1 and _are_finite([loss, *[g for given in gradients.values() for g in given]]):
+        if self.every == 1 and _are_finite([loss, *[g for group in gradients.values() for g in group]]):
             self.loss = float(loss)
             self._state[3] = loss
             return
         self._names = list(gradients)
-        bad = torch.stack([*(~_all_finite(given, loss) for given in gradients.values()), ~loss.isfinite()]).float()
+        bad = torch.stack([*(~_all_finite(group, loss) for group in gradients.values()), ~loss.isfinite()]).float()
         now = torch.stack([bad.amax(), loss.new_full((), step), bad.argmax().float(), loss])
         self._state.copy_(torch.where(self.skip > 0, self._state, now))
         if step % self.every == 0:

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from gsbench.config import Config
-from gsbench.effects.budget import Gated, gate_within
+from gsbench.effects.budget import gate_within
 from gsbench.effects.direction import share_with_direction, without_direction
 from gsbench.effects.sensitivity import MOST_VIEWS, probe
 from gsbench.effects.visible import seen_times, share_asleep
-from gsbench.errors import InputError
+from gsbench.errors import InputError, did_you_mean
 from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
@@ -25,9 +25,8 @@ from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import GaussianModel
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated
-from gsbench.scenes import Scene, View
-from gsbench.train.renderer import Renderer
-from gsbench.train.rows import Rows
+from gsbench.scenes import View
+from gsbench.train.hooks import Hook, Training
 
 GATES = ("off", "end", "both")
 # Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
@@ -44,7 +43,6 @@ LAST_RATE = 0.1
 HELD_OUT = 8  # every 8th training view is held out to check PSNR, if the scene has no val split
 FEW = 12  # with fewer training views than this, none is held out
 
-NO_GATES: dict[str, Any] = {"gates": [], "notes": []}  # the state of a training without gates
 Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters, and the effects of each Gaussian
 
 
@@ -60,27 +58,21 @@ def become(model: GaussianModel, shape: Shape) -> None:
     model.effect_sets = shape[1]
 
 
-class Gating:
+class Gating(Hook):
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
-    def __init__(self, rows: Rows, scene: Scene, renderer: Renderer, config: Config) -> None:
-        """Choose the views from which the errors of simplified Gaussians are predicted, and the views for PSNR.
+    name = "gating"
 
-        Args:
-            rows: the model, together with the per-Gaussian state of the training, which must change with it.
-            scene: the scene with its training and val views.
-            renderer: renders views with the settings of the training.
-            config: the config, which has the allowed loss of PSNR.
-        """
-        self.rows = rows
-        self.model = rows.model
-        self.renderer = renderer
-        self.config = config
+    def __init__(self, training: Training) -> None:
+        """Choose the views from which the errors of simplified Gaussians are predicted, and the views for PSNR."""
+        super().__init__(training)
+        self.model, self.config, self.renderer = training.model, training.config, training.renderer
         self.gates: list[Gate] = []
         self.notes: list[str] = []
         self.direction: Direction | None = None
+        scene = training.scene
         self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
-        if not scene.val or config.scene.eval_split == "val":
+        if not scene.val or self.config.scene.eval_split == "val":
             self.checked_on = "held-out training views"
             if len(scene.train) < FEW:
                 self.checked_on = "the training views"
@@ -91,58 +83,71 @@ class Gating:
                 self.checked = scene.train[::HELD_OUT]
                 self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
-    def in_training(self, step: int) -> bool:
-        """Make Gaussians independent of time, direction or AGR (a network) before a step of the training.
+    @classmethod
+    def check(cls, config: Config) -> None:
+        """Raise InputError if `effects.gate` is not known."""
+        if config.effects.gate not in GATES:
+            raise InputError(f"effects.gate '{config.effects.gate}' is not known. "
+                             f"{did_you_mean(config.effects.gate, GATES)}")  # fmt: skip
 
-        This is not done if the model has fewer than LEAST_IN_TRAINING Gaussians, or if PSNR on val would fall too much.
+    @classmethod
+    def check_model(cls, model: GaussianModel, config: Config) -> None:
+        """Raise InputError if Gaussians are to be simplified and the model cannot have this."""
+        if config.effects.gate != "off":
+            as_gated(model)
 
-        Returns:
-            Whether it was done.
+    def after_density(self, step: int) -> None:
+        """Simplify Gaussians once after densification, if `effects.gate=both`."""
+        if self.config.effects.gate == "both" and self.training.schedule.gates(step):
+            with self.training.stages("gate"):
+                self.in_training(step + 1)
+
+    def at_end(self) -> None:
+        """Simplify Gaussians after the training, unless `effects.gate=off`."""
+        if self.config.effects.gate != "off":
+            self.finish()
+
+    def finish(self, by_halves: bool = False) -> None:
+        """Simplify the Gaussians of a finished training, and measure PSNR and frame time before and after.
+
+        The measurement does not count as training time.
+
+        Args:
+            by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
+                no frame time, and nearly doubles the time of this function (docs/effects.md).
         """
+        training = self.training
+        self.model.set_active(training.schedule.active(training.step - 1))
+        ungated = shape_of(self.model)
+        with training.effort, training.stages("gate"):
+            self.simplify(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
+        self.compare(ungated, training.views)
+
+    def in_training(self, step: int) -> None:
+        """Simplify Gaussians before a step, unless the model has few or PSNR on val would fall too much."""
         if len(self.model) < LEAST_IN_TRAINING:
             self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
                               f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
-            return False
+            return
         most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
         # Static Gaussians do not learn unused parameters. Those that are independent of only time or direction would.
-        return self._gate(step, most, VIEWS_IN_TRAINING, by_halves=False)
+        self.simplify(step, most, VIEWS_IN_TRAINING, by_halves=False)
 
-    def slows_agr(self, step: int) -> float:
+    def rate_factors(self, step: int) -> dict[str, float]:
         """Return the factor of the learning rate of AGR, the neural refinement, at a step.
 
-        The factor is 1 until some Gaussians are made independent of time, direction or AGR in training. Then it falls
-        log-linearly to LAST_RATE at the end.
+        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
         """
         if not self.gates or self.gates[0].step is None:
-            return 1.0
+            return {}
         begun, iterations = self.gates[0].step, self.config.train.iterations
-        return float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))
-
-    def at_end(self, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (a network) after the training.
-
-        This is not done if PSNR would fall by more than `effects.budget_db` dB.
-
-        Args:
-            by_halves: whether a Gaussian may become independent of only one of time and direction.
-
-        Returns:
-            Whether it was done.
-        """
-        return self._gate(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
-
-    def now(self) -> Shape:
-        """Return the present parameters of the model's Gaussians and what each depends on, for `compare`."""
-        return shape_of(self.model)
+        return {"refinement": float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))}
 
     def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure how PSNR and frame time changed when time, direction or AGR were removed at the end of the training.
-
-        AGR is a network. The function also measures how PSNR and frame time would change if no Gaussian depended on
-        direction.
+        """Measure how PSNR and frame time changed at the end, and how they would change without any direction.
 
         Args:
-            ungated: the Gaussians before this removal, from `now`.
+            ungated: the Gaussians before the gate at the end, from `shape_of`.
             views: the views (test or val) on which results are measured.
         """
         if self.gates and self.gates[-1].step is None:
@@ -155,17 +160,17 @@ class Gating:
             loss, times = self._beside(self.model, frozen, views)
             self.direction = Direction(share_with_direction(self.model), loss, *times)
 
-    def _beside(self, one: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return by how many dB the PSNR of `other` is below that of `one`, and the models' median frame times, ms."""
+    def _beside(self, model: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
+        """Return by how many dB PSNR is lower with `other` than with `model`, and the median frame times, ms."""
         count = max(self.config.protocol.renders, len(views))
-        frames = [lambda i, model=model: self.renderer.image(model, views[i % len(views)]) for model in (one, other)]
+        frames = [lambda i, shown=shown: self.renderer.image(shown, views[i % len(views)]) for shown in (model, other)]
         times = time_in_turns(frames, count, synchroniser(self.config.device))
         psnr = self.renderer.psnr
-        return psnr(one, views) - psnr(other, views), [one.p50 for one in times]
+        return psnr(model, views) - psnr(other, views), [frame.p50 for frame in times]
 
     @torch.no_grad()
-    def _gate(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> bool:
-        """Make Gaussians independent of time, direction or AGR (a network); return whether this was done.
+    def simplify(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
+        """Simplify Gaussians if the loss of PSNR is allowed; otherwise note why not.
 
         Args:
             step: the step of the training; None at its end.
@@ -180,39 +185,33 @@ class Gating:
         hidden = None if intervals is None else intervals[:, 0].isinf()
         sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
                          antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
-        found = gate_within(
-            model, sensitivity, budget_db, lambda gated: self.renderer.psnr(gated, self.checked), intervals
+        gated = gate_within(
+            model, sensitivity, budget_db, lambda tried: self.renderer.psnr(tried, self.checked), intervals
         )
-        if found is None:
+        if gated is None:
             when, before = "at the end" if at_end else f"at step {step}", self.renderer.psnr(model, self.checked)
             self.notes.append(
                 f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}" if decides(before) else
                 f"{when} nothing was simplified: a PSNR of {before:.0f} dB on {self.checked_on} cannot show a loss"
             )  # fmt: skip
-            return False
-        self._adopt(found)
+            return
+        become(self.model, shape_of(gated.model))
+        self.training.rows.moved(gated.rows, gated.changed)
         seconds = time.perf_counter() - started
-        self.gates.append(replace(found.gate, step=step, checked_on=self.checked_on, seconds=seconds,
+        self.gates.append(replace(gated.gate, step=step, checked_on=self.checked_on, seconds=seconds,
                                   asleep=share_asleep(self.model, self.probed)))  # fmt: skip
-        return True
-
-    def _adopt(self, found: Gated) -> None:
-        become(self.model, shape_of(found.model))
-        self.rows.moved(found.rows, found.changed)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return when time, direction or AGR were removed from Gaussians, and how PSNR and frame time changed."""
+        """Return what was simplified, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the `state_dict` of a checkpoint; raises InputError if it is damaged."""
-        if not isinstance(state, dict):
-            raise InputError(f"checkpoint: expected 'gating' as a dict, got {type(state).__name__}")
+        """Restore a `state_dict`; raise InputError if it is damaged."""
         gates, notes = state["gates"], state["notes"]
         if not isinstance(gates, list) or not isinstance(notes, list) or not all(isinstance(x, str) for x in notes):
             raise InputError("checkpoint: expected lists of gates and notes")
         self.gates = [parse(Gate, gate, "checkpoint: gate") for gate in gates]
         self.notes = notes
-        direction = state.get("direction")
+        direction = state["direction"]
         self.direction = parse(Direction, direction, "checkpoint: direction") if direction is not None else None

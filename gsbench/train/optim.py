@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels 
 
 OPTIMIZERS = ("adam", "sparse_adam")
 BETAS, EPS = (0.9, 0.999), 1e-15
+NO_FACTORS: Mapping[str, float] = {}
 COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
 
 
@@ -73,7 +74,7 @@ class Optimizer:
         self,
         step: int,
         drawn: Tensor | None,  # [N] bool
-        slowed: float = 1.0,
+        factors: Mapping[str, float] = NO_FACTORS,
     ) -> None:
         """Update the parameters that have a gradient, then delete the gradients.
 
@@ -82,9 +83,9 @@ class Optimizer:
         Args:
             step: the number of the step, counted from 0; it determines the learning rates.
             drawn: which Gaussians are visible in the batch, [N] bool; only `sparse_adam` needs it.
-            slowed: the factor by which the learning rate of AGR, the neural refinement, is multiplied.
+            factors: factors of the learning rates, by group.
         """
-        rates = self.rates_at(step, slowed)
+        rates = self.rates_at(step, factors)
         is_native = self._is_native()
         by_kernel: list[tuple[nn.Parameter, float]] = []
         rest_has_gradients = False
@@ -107,9 +108,9 @@ class Optimizer:
             self.torch_adam.step()
             self.torch_adam.zero_grad(set_to_none=True)
 
-    def rates_at(self, step: int, slowed: float = 1.0) -> dict[str, float]:
-        """Return the learning rate of each group at a step; the rate of AGR (a network) is multiplied by `slowed`."""
-        return {name: rate_at(rate, step, self.train, self.extent) * (slowed if name == "refinement" else 1.0)
+    def rates_at(self, step: int, factors: Mapping[str, float] = NO_FACTORS) -> dict[str, float]:
+        """Return the learning rate of each group at a step, multiplied by the factors of some groups."""
+        return {name: rate_at(rate, step, self.train, self.extent) * factors.get(name, 1.0)
                 for name, rate in self.rates.items()}  # fmt: skip
 
     def _is_native(self) -> bool:
@@ -150,7 +151,7 @@ class Optimizer:
             update(parameter, parameter.grad, *moments, drawn, rate, list(BETAS), EPS, state["step"])
         parameter.grad = None
 
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
         """Reorder Adam's moments after Gaussians were pruned, cloned or split.
 
         Args:
@@ -183,11 +184,11 @@ class Optimizer:
             InputError: the moments do not belong to the parameters of this model.
         """
         self.moments.clear()
-        own = dict(self._keyed())
+        known = dict(self._keyed())
         for name, moments in state.items():
-            if name not in own:
-                raise InputError(f"checkpoint: expected moments of {', '.join(own)}, got some of {name!r:.80}")
-            parameter = own[name]
+            if name not in known:
+                raise InputError(f"checkpoint: expected moments of {', '.join(known)}, got some of {name!r:.80}")
+            parameter = known[name]
             self.moments[parameter] = {
                 "step": tensor(moments, "step", (), torch.float32),
                 "exp_avg": tensor(moments, "exp_avg", parameter.shape, parameter.dtype),

@@ -1,6 +1,7 @@
-"""Update all per-Gaussian state of a training (Adam's moments, counts, minimum scales) when Gaussians change.
+"""Add, remove and reorder the Gaussians of a training with all state that belongs to single Gaussians.
 
-Row i of every parameter tensor belongs to Gaussian i. Pruning, cloning and splitting change the rows.
+Row i of every parameter tensor belongs to Gaussian i. Pruning, cloning and splitting change the rows, so Adam's
+moments, counts of views and minimum scales must change with them.
 """
 
 from typing import Protocol
@@ -14,22 +15,14 @@ from gsbench.models.visible_times import visible_intervals
 START_BINS = 16  # number of intervals of the time range, by which rows are sorted
 
 
-class Follower(Protocol):
-    """An object with per-Gaussian state, such as the optimizer with its moments.
+class PerGaussian(Protocol):
+    """An object with per-Gaussian state."""
 
-    The state must be updated when Gaussians are added or removed.
-    """
-
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the per-Gaussian state after Gaussians were added or removed.
-
-        Args:
-            rows: for each Gaussian after the change, its index before the change, or that of its parent, [M].
-            fresh: which Gaussians are new, [M] bool; their state is reset.
-        """
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        """Reorder the state after Gaussians were added or removed, see `gsbench.train.hooks.Hook.reindex`."""
 
 
-class Moments(Follower, Protocol):
+class Moments(PerGaussian, Protocol):
     """An optimizer with moments for each Gaussian, which can be set to zero for a whole parameter."""
 
     def forget(self, parameter: Tensor) -> None:
@@ -37,26 +30,23 @@ class Moments(Follower, Protocol):
 
 
 class Rows:
-    """Add, remove and reorder the Gaussians (rows) of a model together with all per-Gaussian state of the training.
-
-    Density control and all other code of a training change Gaussians only through this class.
-    """
+    """The Gaussians (rows) of a model. All code of a training changes them only through this class."""
 
     def __init__(self, model: GaussianModel, moments: Moments) -> None:
         """Start with a model and the moments of its optimizer; `add` adds more per-Gaussian state."""
         self.model = model
         self._moments = moments
-        self._followers: list[Follower] = [moments]
+        self._followers: list[PerGaussian] = [moments]
 
     def __len__(self) -> int:
         return len(self.model)
 
-    def add(self, follower: Follower) -> None:
-        """Register an object with per-Gaussian state; it is updated whenever Gaussians are added or removed."""
+    def add(self, follower: PerGaussian) -> None:
+        """Register an object with per-Gaussian state."""
         self._followers.append(follower)
 
     def select(self, rows: Tensor, fresh: Tensor | None = None) -> None:
-        """Keep the Gaussians `rows` of the model in this order, and update all per-Gaussian state.
+        """Keep the Gaussians `rows` of the model in this order.
 
         Args:
             rows: the indices of Gaussians, [M]; an index that occurs several times copies a Gaussian.
@@ -65,13 +55,19 @@ class Rows:
         self.model.select(rows)
         self.moved(rows, fresh)
 
+    def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
+        """Update all per-Gaussian state after the model itself was changed as `select` does it."""
+        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh
+        for follower in self._followers:
+            follower.reindex(rows, fresh)
+
     def sort_by_time(self) -> None:
         """Sort the Gaussians by the time interval in which each can be visible, which makes the CPU kernels faster.
 
         The kernels process 16 rows at once, and skip 16 rows of which none is visible. On the scene trex after a
         quarter of the iterations, 36 % of the Gaussians of 4DGS are visible in a view. Sorting reduces the share of
-        groups of 16 that are processed from 96 % to 42 %. If some Gaussians were made independent of time, direction or
-        AGR (a network), this function does nothing, because Gaussians are then sorted by what they depend on.
+        groups of 16 that are processed from 96 % to 42 %. Gaussians that a gate has simplified stay as they are, sorted
+        by what they depend on.
         """
         intervals = None if self.model.effect_sets is not None else visible_intervals(self.model)
         if intervals is not None:
@@ -81,14 +77,3 @@ class Rows:
     def forget(self, name: str) -> None:
         """Set the optimizer's moments of the parameter `name` to zero, after its values were replaced."""
         self._moments.forget(self.model.splats[name])
-
-    def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
-        """Update the per-Gaussian state after Gaussians of the model were added, removed or reordered.
-
-        Args:
-            rows: for each Gaussian after the change, its index before the change, [M].
-            fresh: which Gaussians are new, [M] bool; by default none.
-        """
-        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh
-        for follower in self._followers:
-            follower.follow(rows, fresh)

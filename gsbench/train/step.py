@@ -18,9 +18,9 @@ from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.finite_check import DivergedError
+from gsbench.train.hooks import LossTerm
 from gsbench.train.losses import photometric
-from gsbench.train.penalties.base import Penalty
-from gsbench.train.repetition import Observed, Repetition, Stages
+from gsbench.train.step_replay import Observed, Stages, StepReplay
 
 Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to which they are taken
 
@@ -102,7 +102,7 @@ def _in_order(parts: Sequence[Sums]) -> Sums:
     return total
 
 
-class Seen(NamedTuple):
+class ViewResult(NamedTuple):
     """Hold the results of one view of a training step. The next step may overwrite the tensors."""
 
     loss: Tensor  # [] the view's part of the batch's loss
@@ -133,17 +133,17 @@ class Step:
         self.ssim_weight = ssim_weight
         self.antialias = antialias
         self.stages = stages
-        self.penalties: Sequence[tuple[float, Penalty]] = ()
-        self._repetition: Repetition[Seen] = Repetition()
+        self.terms: Sequence[LossTerm] = ()
+        self._replay: StepReplay[ViewResult] = StepReplay()
 
-    def __call__(self, views: Sequence[View], penalties: Sequence[tuple[float, Penalty]] = ()) -> list[Seen]:
+    def __call__(self, views: Sequence[View], terms: Sequence[LossTerm] = ()) -> list[ViewResult]:
         """Render `views` and store the gradient of the loss in the model's parameters.
 
-        The loss is the mean over views of the photometric loss plus weighted penalties.
+        The loss is the mean over views of the photometric loss plus weighted terms.
 
         Args:
             views: the views of the batch.
-            penalties: pairs (weight, penalty) that are added to the loss of each view.
+            terms: pairs (weight, term) that are added to the loss of each view.
 
         Returns:
             The loss and the gradients of the 2D means for each view.
@@ -153,23 +153,23 @@ class Step:
             InputError: the rasterizer refuses 3D Gaussians for another reason.
             TooLargeError: the memory does not suffice.
         """
-        self.penalties = penalties
+        self.terms = terms
         sources = [parameter for parameter in self.parameters if parameter.requires_grad]
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
         seed = self.background.new_full((), 1 / len(views))
-        seen = self._repetition(
+        results = self._replay(
             self._signature(views, sources, workers),
             views,
-            lambda i, observed, stages: self._see(i, observed, sources, sums[i], seed, stages),
+            lambda i, observed, stages: self._of_view(i, observed, sources, sums[i], seed, stages),
             lambda work: self._of_all(work, bounds),
         )
         with self.stages("backward"):
-            total = add_up([one.sums for one in seen])
+            total = add_up([result.sums for result in results])
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
-        return seen
+        return results
 
     def _signature(self, views: Sequence[View], sources: list[nn.Parameter], workers: int) -> Hashable:
         """Return all that the calls of a step depend on, except values of tensors; None if they must not be repeated.
@@ -179,29 +179,29 @@ class Step:
         model, sets = self.model, self.model.effect_sets
         by_cpu_kernels = self.background.is_cpu and model.backend.serves(self.background)
         work = sum([work_of(len(model), view.camera.width * view.camera.height) for view in views])
-        if self.penalties or not by_cpu_kernels or work > MOST_RECORDED:
+        if self.terms or not by_cpu_kernels or work > MOST_RECORDED:
             return None
         tensors = [*self.parameters, *([] if sets is None else [sets.orders, sets.intervals])]
-        places = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
+        addresses = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
         counts = None if sets is None else (sets.refined, sets.conditioned)
-        own = tuple([x for x in vars(model).values() if isinstance(x, int | float | str)])
-        return places, counts, own, model.active, tuple(map(id, sources)), workers, torch.get_num_threads()
+        options = tuple([x for x in vars(model).values() if isinstance(x, int | float | str)])
+        return addresses, counts, options, model.active, tuple(map(id, sources)), workers, torch.get_num_threads()
 
-    def _of_all(self, work: Callable[[int, Stages], Seen], bounds: Sequence[int]) -> list[Seen]:
+    def _of_all(self, work: Callable[[int, Stages], ViewResult], bounds: Sequence[int]) -> list[ViewResult]:
         """Call `work` for all views of a batch; thread i does so for the views bounds[i] to bounds[i + 1]."""
         workers = len(bounds) - 1
         if workers == 1:
             return [work(i, self.stages) for i in range(bounds[1])]
         with self.stages.side_by_side(workers) as clocks:
 
-            def run(worker: int) -> list[Seen]:
+            def run(worker: int) -> list[ViewResult]:
                 return [work(i, clocks[worker]) for i in range(bounds[worker], bounds[worker + 1])]
 
-            return [one for part in side_by_side(run, range(workers), workers) for one in part]
+            return [result for part in side_by_side(run, range(workers), workers) for result in part]
 
-    def _see(
+    def _of_view(
         self, index: int, view: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages
-    ) -> Seen:
+    ) -> ViewResult:
         """Render view number `index` of a batch and add the gradients of its loss to `sums`.
 
         `seed` is the gradient of the batch's loss by the loss of one view.
@@ -221,12 +221,12 @@ class Step:
                     raise DivergedError(str(error)) from None
             with stages("loss"):
                 loss = photometric(output.image, view.target[None], self.ssim_weight, self.model.backend)
-                for weight, penalty in self.penalties:
-                    loss = loss + weight * penalty(query, index)
+                for weight, term in self.terms:
+                    loss = loss + weight * term(query, index)
         with stages("backward"):
             means2d = output.info.means2d
             tape.backward(loss, seed, [*sources, means2d], sums)
             g_means2d = sums.pop(id(means2d), None)
             if g_means2d is None:
                 g_means2d = torch.zeros_like(means2d)
-            return Seen(loss.detach() * seed, output.info.drawn, g_means2d, sums)
+            return ViewResult(loss.detach() * seed, output.info.drawn, g_means2d, sums)

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +23,9 @@ from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train import gating
-from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become
+from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become, shape_of
 from gsbench.train.loop import Trainer
+from gsbench.train.optim import NO_FACTORS
 from gsbench.train.renderer import Renderer
 from gsbench.train.seeding import generator
 
@@ -47,7 +49,7 @@ def end(one: Trainer) -> dict[str, object]:
     states: list[dict[str, object]] = []
     one.run(lambda state: states.append(copy.deepcopy(state)), "test")
     last = states[-1]
-    return {key: last[key] for key in ("model", "optimizer", "density", "minimum_scale")}
+    return {key: last[key] for key in ("model", "optimizer", "density")}
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +64,7 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 3.0)
     whole = trainer("effects.gate=both")
     expected = end(whole)
-    assert whole.gating.gates[0].step == 60
+    assert whole.hook(Gating).gates[0].step == 60
     assert whole.model.effect_sets is not None
     first = trainer("effects.gate=both")
     states: list[dict[str, object]] = []
@@ -70,13 +72,13 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     second = trainer("effects.gate=both")
     second.load_state_dict(states[-1])
     assert second.model.effect_sets is not None
-    assert second.gating.gates == first.gating.gates
+    assert second.hook(Gating).gates == first.hook(Gating).gates
     assert_same_bits(end(second), expected)
 
 
 def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a gate that acts, or draws a random number, where none was asked for."""
-    monkeypatch.setattr(Gating, "_gate", lambda *_, **__: pytest.fail("a gate was asked"))
+    monkeypatch.setattr(Gating, "simplify", lambda *_, **__: pytest.fail("a gate was asked"))
     plain = trainer("effects.gate=off")
     end(plain)
     assert plain.model.effect_sets is None
@@ -87,8 +89,8 @@ def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch
     one = trainer("effects.gate=both")
     monkeypatch.setattr("gsbench.train.gating.LEAST_IN_TRAINING", len(one.model) * 100)
     end(one)
-    assert [gate.step for gate in one.gating.gates if gate.step is not None] == []
-    assert "at step 60 the model has" in one.gating.notes[0]
+    assert [gate.step for gate in one.hook(Gating).gates if gate.step is not None] == []
+    assert "at step 60 the model has" in one.hook(Gating).notes[0]
 
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +128,7 @@ def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: 
     """Catches models without AGR, which do not make up for it, gated as freely as those with it, and a training that
     looks at half freezes, which saves no time of a frame."""
     asked: list[tuple[int | None, float, bool]] = []
-    monkeypatch.setattr(Gating, "_gate", lambda _, step, db, __, by_halves: asked.append((step, db, by_halves)))
+    monkeypatch.setattr(Gating, "simplify", lambda _, step, db, __, by_halves: asked.append((step, db, by_halves)))
     end(trainer("effects.gate=both", model=model))
     assert asked == [(60, loss, False), (None, 0.05, False)]
 
@@ -136,8 +138,8 @@ def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
     """Catches a gated training whose AGR swings to the end, an ungated one that is slowed, and rates of others."""
     one, rates = trainer(*words), []
 
-    def note(step: int, slowed: float = 1.0) -> dict[str, float]:
-        rates.append(original(step, slowed))
+    def note(step: int, factors: Mapping[str, float] = NO_FACTORS) -> dict[str, float]:
+        rates.append(original(step, factors))
         return rates[-1]
 
     original, one.optimizer.rates_at = one.optimizer.rates_at, note
@@ -145,7 +147,7 @@ def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
     agr, others = [rate["refinement"] for rate in rates], [rate["opacities"] for rate in rates]
     assert agr[0] == agr[59] == pytest.approx(2e-4)
     assert others[0] == others[-1]
-    gated = bool(words) and one.gating.gates[0].step == 60
+    gated = bool(words) and one.hook(Gating).gates[0].step == 60
     assert gated == bool(words)
     assert agr[60] == pytest.approx(2e-4)
     assert agr[-1] == pytest.approx(2e-4 * LAST_RATE ** (39 / 40) if gated else 2e-4)
@@ -169,10 +171,10 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
     ):
         one.config.scene.eval_split = split
         of = Trainer(one.model, replace(square, val=val, train=train), [], one.config)
-        of.gating.at_end(by_halves=False)
+        of.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
         names = [[view.name for view in asked] for asked in (probed.pop(), checked.pop())]
         assert names == [[view.name for view in asked] for asked in expected]
-        assert len(of.gating.notes) == notes
+        assert len(of.hook(Gating).notes) == notes
 
 
 @pytest.mark.parametrize(
@@ -187,8 +189,9 @@ def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
     one = trainer("effects.gate=end")
     shown = iter([*scores, *[scores[-1]] * 20, scores[0]])
     monkeypatch.setattr(Renderer, "psnr", lambda *_: scores[0] if len(scores) < 2 else next(shown))
-    assert not one.gating.at_end(by_halves=False)
-    assert line in one.gating.notes[-1]
+    one.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
+    assert not one.hook(Gating).gates
+    assert line in one.hook(Gating).notes[-1]
 
 
 def fit(x: float) -> Gate:
@@ -199,17 +202,17 @@ def fit(x: float) -> Gate:
 def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     """Catches a loss with the wrong sign, or of the wrong model: of the gate at the end, and of freezing direction."""
     one = trainer()
-    ungated, one.gating.gates = one.gating.now(), [fit(0.1)]
+    ungated, one.hook(Gating).gates = shape_of(one.model), [fit(0.1)]
     before = one.psnr(one.views)
     faint = {name: x.clone() for name, x in ungated[0].items()} | {"opacities": ungated[0]["opacities"] - 1}
     become(one.model, (faint, None))
     after = one.psnr(one.views)
     assert abs(after - before) > 0.1
-    one.gating.compare(ungated, one.views)
-    assert one.gating.gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
+    one.hook(Gating).compare(ungated, one.views)
+    assert one.hook(Gating).gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
     frozen = without_direction(one.model, one.scene.train)
     assert frozen is not None
-    direction = one.gating.direction
+    direction = one.hook(Gating).direction
     assert direction is not None
     assert direction.loss_db == pytest.approx(after - one.renderer.psnr(frozen, one.views), abs=1e-9)
     assert direction.loss_db != 0

@@ -136,8 +136,8 @@ HOSTILE_STATES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "a tensor that claims 4 TB": lambda state: replaced(
         state, ("model", "splats.means"), lambda _: torch.zeros(1).expand(10**12, 3)
     ),
-    "gates as a tensor": lambda state: {**state, "gating": torch.zeros(3)},
-    "gates as a list": lambda state: {**state, "gating": [1]},
+    "gates as a tensor": lambda state: {**state, "hooks": state["hooks"] | {"gating": torch.zeros(3)}},
+    "gates as a list": lambda state: {**state, "hooks": state["hooks"] | {"gating": [1]}},
     "a container in itself": lambda state: endless(state),
     "text for a state": lambda state: {**state, "model": "splats.means"},
     "a key that is a tensor": lambda state: {**state, "density": {torch.zeros(1): 1}},
@@ -148,7 +148,7 @@ def endless(state: dict[str, Any]) -> dict[str, Any]:
     """A state with a list that holds itself."""
     own: list[Any] = []
     own.append(own)
-    return {**state, "gating": own}
+    return {**state, "hooks": own}
 
 
 @pytest.mark.parametrize("name", HOSTILE_STATES)

@@ -22,8 +22,7 @@ from gsbench.models.simplifications import simplifications_of
 from gsbench.models.sliced import reach, tensors_of
 from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
-from gsbench.train.penalties import MeanOpacity, MeanSize
-from gsbench.train.penalties.base import Penalty
+from gsbench.train.regularisers import MeanOpacity, MeanSize, Penalty
 from gsbench.view.slice_ply import has_harmonics, trained_of
 
 N = 12

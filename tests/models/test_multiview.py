@@ -15,9 +15,9 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.setup import build as build_for
 from gsbench.scenes.scene import Points, View
-from gsbench.train.densify.base import Scores
-from gsbench.train.densify.multiview import LEAST_IMPORTANCE, MultiviewDensification, drawn_once
-from gsbench.train.densify.scores import VIEWS, ErrorScore
+from gsbench.train.density.multiview import LEAST_IMPORTANCE, VIEWS, ErrorScore, MultiviewDensification, drawn_once
+from gsbench.train.density.rule import Scores
+from gsbench.train.hooks.minimum_sizes import MinimumScale
 from gsbench.train.loop import Trainer
 from gsbench.train.losses import photometric
 from gsbench.train.renderer import Renderer
@@ -106,8 +106,8 @@ def test_a_model_without_gaussians_is_scored() -> None:
 def test_ten_different_views_are_drawn_anew() -> None:
     """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
     score = ErrorScore(four_gaussians(), moving_square().train, Renderer(GREY, antialias=False), 0.2)
-    see, drawn = score._see, []
-    score._see = lambda view: drawn.append(view.name) or see(view)  # type: ignore[assignment,func-returns-value]
+    see, drawn = score._of_view, []
+    score._of_view = lambda view: drawn.append(view.name) or see(view)  # type: ignore[assignment,func-returns-value]
     for seed in (0, 1, 0):
         score(generator(seed))
     rounds = [sorted(drawn[i * VIEWS : (i + 1) * VIEWS]) for i in range(3)]
@@ -119,7 +119,7 @@ def test_ten_different_views_are_drawn_anew() -> None:
 class Moments:
     """The optimizer of a model that is not trained."""
 
-    def follow(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
+    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
         """Nothing to move."""
 
     def forget(self, parameter: torch.Tensor) -> None:
@@ -152,7 +152,7 @@ def copies(model: GaussianModel, means: torch.Tensor) -> list[int]:
 def test_only_important_gaussians_of_large_gradient_are_cloned(name: str) -> None:
     """Catches a rule that asks for one of the two, a threshold that is not above, and opacities left above 0.8."""
     density, means = of_eight(name, [3.0, 1.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.0] * 8)
-    density.gradient[:4], density.seen[:] = 5.0, 1.0
+    density.gradient[:4], density.times_visible[:] = 5.0, 1.0
     assert density.densify(generator(1), has_reset=False, most=100) == 0
     assert len(density.model) == len(density.unseen) == 10
     found = copies(density.model, means)
@@ -181,7 +181,7 @@ def test_children_are_drawn_as_their_parent() -> None:
     density, means = of_eight("3dgs", [0.0, 0.0, -8.0, 0.0, 0.0, 0.0, 0.0, -8.0], [0.0, 0.0, 1.0] + [0.0] * 5)
     with torch.no_grad():
         density.model.splats["scales"].fill_(math.log(0.1))  # large: split
-    density.gradient[2], density.seen[:] = 5.0, 1.0
+    density.gradient[2], density.times_visible[:] = 5.0, 1.0
     density.densify(generator(1), has_reset=False, most=100)  # three are faint, so one is drawn: a child
     assert copies(density.model, means) == [1, 1, 0, 1, 1, 1, 1, 1]
     assert len(density.model) == 8
@@ -225,7 +225,7 @@ def test_every_model_trains_by_it(name: str) -> None:
     fitted.run(lambda _: None, name, lambda: next(stops))
     model = fitted.model
     assert len(model) > before
-    assert len(model) == len(fitted.minimum_scale.least) == len(fitted.density.unseen)  # type: ignore[attr-defined]
+    assert len(model) == len(fitted.hook(MinimumScale).least) == len(fitted.density.rule.unseen)  # type: ignore[attr-defined]
     assert all(parameter.isfinite().all() for parameter in model.parameters())
 
 

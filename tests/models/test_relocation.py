@@ -10,7 +10,7 @@ from small import CAMERA, moved, started
 
 from gsbench.config import DensifyConfig
 from gsbench.models import GaussianModel, Query, build
-from gsbench.train.densify.mcmc import MCMCDensification, drawn, relocated
+from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
 from gsbench.train.seeding import generator
 
@@ -21,7 +21,7 @@ NAMES = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t"
 class Moments:
     """Moments that note which rows are fresh."""
 
-    def follow(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
+    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
         self.rows, self.fresh = rows, fresh
 
     def forget(self, parameter: torch.Tensor) -> None:

@@ -33,7 +33,7 @@ class Moments:
     def __init__(self) -> None:
         self.rows = torch.empty(0)
 
-    def follow(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
+    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
         assert not fresh.any()
         self.rows = rows
 

@@ -18,7 +18,7 @@ from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.finite_check import DivergedError
 from gsbench.train.loop import Trainer
 from gsbench.train.seeding import generator
-from gsbench.train.step import Seen
+from gsbench.train.step import ViewResult
 
 POISONED = 7
 
@@ -36,7 +36,7 @@ def poison(run: Trainer, parameter: str, after: int) -> None:
     """From so many steps on, the last entry of one Gaussian's gradient is NaN."""
     gradients, steps = run.gradients, [0]
 
-    def poisoned(batch: Sequence[View], *penalties: object) -> list[Seen]:
+    def poisoned(batch: Sequence[View], *penalties: object) -> list[ViewResult]:
         views = gradients(batch, *penalties)
         steps[0] += 1
         if steps[0] > after:

@@ -22,16 +22,16 @@ def test_the_parameter_is_named_at_its_step(bad: float) -> None:
     groups = {"means": [parameter([1.0, 2.0])], "refinement": [parameter([1.0]), parameter([0.0, bad])]}
     seen = FiniteCheck("cpu")
     with pytest.raises(DivergedError, match=r"step 3: the gradient of 'refinement' is not finite \(loss 0.5\)"):
-        seen.see(3, torch.tensor(0.5), groups)
+        seen.check(3, torch.tensor(0.5), groups)
     with pytest.raises(DivergedError, match="step 4: the loss is nan"):
-        FiniteCheck("cpu").see(4, torch.tensor(math.nan), {"means": [parameter([1.0])]})
+        FiniteCheck("cpu").check(4, torch.tensor(math.nan), {"means": [parameter([1.0])]})
 
 
 def test_finite_values_whose_sum_is_not_are_let_through() -> None:
     """Catches a check of the sum alone, and a parameter without a gradient taken for a fault."""
     unused = nn.Parameter(torch.zeros(1))
     seen = FiniteCheck("cpu")
-    seen.see(0, torch.tensor(0.25), {"means": [parameter([3e38, 3e38])], "unused": [unused]})
+    seen.check(0, torch.tensor(0.25), {"means": [parameter([3e38, 3e38])], "unused": [unused]})
     assert seen.loss == 0.25
 
 
@@ -48,7 +48,7 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
         for step in range(1, 20):
             fitted.grad = torch.full((3,), math.nan if step == 6 else 1.0)
             before.append(fitted.detach().clone())
-            seen.see(step, torch.tensor(float(step)), {"means": [fitted]})
+            seen.check(step, torch.tensor(float(step)), {"means": [fitted]})
             adam.step()
 
     with pytest.raises(DivergedError, match=r"step 6: the gradient of 'means' is not finite \(loss 6.0\)"):

@@ -8,8 +8,7 @@ import pytest
 from test_wiring import trainer
 from tiny_training import moving_square
 
-from gsbench.config import DensifyConfig
-from gsbench.train.densify import gaussian_limit
+from gsbench.train.density.control import gaussian_limit
 
 
 def views(number: int, side: int) -> list[Any]:
@@ -27,8 +26,8 @@ def views(number: int, side: int) -> list[Any]:
 )
 def test_the_limit_follows_from_the_training_pixels(number: int, side: int, initial: int, most: int) -> None:
     """Catches a limit of the views' number or of one view, one that many initial points exceed, and one without end."""
-    assert gaussian_limit(DensifyConfig(), views(number, side), initial) == most
-    assert gaussian_limit(DensifyConfig(max_gaussians=500), views(number, side), initial) == 500
+    assert gaussian_limit(None, views(number, side), initial) == most
+    assert gaussian_limit(500, views(number, side), initial) == 500
 
 
 def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -39,8 +38,8 @@ def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[s
     words = ("train.densify.grad_threshold=0", "train.densify.every=5", "effects.gate=off")
     fitted = trainer("3dgs", *words, scene=replace(square, points=points))
     pixels = sum(view.camera.width * view.camera.height for view in square.train)
-    assert fitted.limit == max(pixels // 64, 80)
+    assert fitted.density.limit == max(pixels // 64, 80)
     fitted.run(lambda _: None, "limit")
-    assert len(fitted.model) <= fitted.limit
+    assert len(fitted.model) <= fitted.density.limit
     said = capsys.readouterr().err
-    assert said.count(f"{fitted.limit} Gaussians are the most (default of train.densify.max_gaussians)") == 1
+    assert said.count(f"{fitted.density.limit} Gaussians are the most (default of train.densify.max_gaussians)") == 1

@@ -13,7 +13,7 @@ from gsbench.kernels.adam import adam, adam_all
 from gsbench.kernels.headers import MAX_ADAM
 from gsbench.models import GaussianModel, build
 from gsbench.scenes.points import random_points
-from gsbench.train.densify.gradient import GradientDensification
+from gsbench.train.density.gradient import GradientDensification
 from gsbench.train.optim import Optimizer, adam_reference, rate_at
 from gsbench.train.rows import Rows
 
@@ -77,7 +77,7 @@ def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
     before = copy.deepcopy({n: optimizer.moments[p]["exp_avg"] for n, p in model.splats.items()})
     rows = torch.tensor([5, 3, 3, 19])
     model.select(rows)
-    optimizer.follow(rows, fresh=torch.tensor([False, False, True, False]))
+    optimizer.reindex(rows, fresh=torch.tensor([False, False, True, False]))
     for name, parameter in model.splats.items():
         moments = optimizer.moments[parameter]["exp_avg"]
         assert moments.shape == parameter.shape
@@ -185,7 +185,7 @@ def test_counts_follow_the_rows_that_a_gate_kept() -> None:
     rows = torch.tensor([3, 2, 1])
     control.rows.select(rows)
     assert control.unseen.tolist() == [0, 3, 1]
-    assert control.gradient.tolist() == control.seen.tolist() == [0, 0, 0]
+    assert control.gradient.tolist() == control.times_visible.tolist() == [0, 0, 0]
 
 
 def test_large_gaussians_are_pruned_only_when_asked() -> None:

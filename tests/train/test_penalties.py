@@ -14,13 +14,17 @@ from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.freetime import FreeTimeModel
 from gsbench.run import setup
-from gsbench.scenes.scene import Points
+from gsbench.scenes.scene import Camera, Points, View
 from gsbench.schedule import ActiveComponents
-from gsbench.train.penalties import strain
-from gsbench.train.penalties.strain import LEAST_DISTANCE, Strain
+from gsbench.train import regularisers
+from gsbench.train.hooks.penalties import Penalties
+from gsbench.train.regularisers import LEAST_DISTANCE, Strain
 
 FRAMES = 7
 QUERY = Query.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
+VIEWMAT = torch.eye(4, dtype=torch.float64)
+VIEWMAT[2, 3] = 4.0
+VIEW = View("of QUERY", Camera(VIEWMAT, torch.eye(3, dtype=torch.float64), 16, 16), 0.5, torch.zeros(16, 16, 3))
 TIMED: dict[str, dict[str, Any]] = {
     "4dgs": {},
     "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
@@ -43,7 +47,7 @@ def moving(positions: torch.Tensor, velocities: torch.Tensor) -> FreeTimeModel:
 
 def prepared(model: GaussianModel, step: int = 0, seed: int = 0) -> Strain:
     penalty = Strain(model, seed, FRAMES)
-    penalty.prepare(step, QUERY)
+    penalty.prepare(step, VIEW)
     return penalty
 
 
@@ -62,7 +66,7 @@ def test_only_a_translation_has_no_strain() -> None:
 
 def test_two_points_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a missing factor: of the time step, the frames, the distance, the weight, or the number of pairs."""
-    monkeypatch.setattr(strain, "NEIGHBOURS", 1)
+    monkeypatch.setattr(regularisers, "NEIGHBOURS", 1)
     x = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [10, 0, 0], [10.5, 0, 0]], dtype=torch.float64)
     v = torch.tensor([[0.0, 0.2, 0], [0, -0.1, 0], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)
     model = moving(x, v)
@@ -100,8 +104,8 @@ def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
     """Catches a gradient that is lost on its way through a model, or that flows through weights or distances."""
     model = lively(name, agr)
     penalty, asked = prepared(model), []
-    real = penalty._seen
-    penalty._seen = lambda query: asked.append(query) or real(query)  # type: ignore[method-assign, func-returns-value]
+    real = penalty._visible_means
+    penalty._visible_means = lambda query: asked.append(query) or real(query)  # type: ignore[method-assign, func-returns-value]
     value = penalty(QUERY, 1)
     value.backward()
     neighbours, (now, later) = penalty.neighbours, asked
@@ -140,9 +144,9 @@ def test_what_is_culled_later_does_not_count() -> None:
     splats["motion"][:3] = 1.0  # at t0, the mean is half a unit from mu_p
     penalty = prepared(model)
     later = Query(QUERY.center, QUERY.time + 0.1 / FRAMES)
-    assert penalty._seen(QUERY)[1].min() > 0.5
-    assert penalty._seen(later)[1][:3].max() == 0
-    assert (penalty._seen(later)[0] - penalty._seen(QUERY)[0])[:3].abs().min() > 0.4
+    assert penalty._visible_means(QUERY)[1].min() > 0.5
+    assert penalty._visible_means(later)[1][:3].max() == 0
+    assert (penalty._visible_means(later)[0] - penalty._visible_means(QUERY)[0])[:3].abs().min() > 0.4
     value = penalty(QUERY, 0)
     value.backward()
     assert value == 0
@@ -161,23 +165,23 @@ def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
 def test_neighbours_are_searched_again() -> None:
     """Catches neighbours of rows that have moved to other indices, and ones that are never or always searched."""
     fitted = trainer("freetime", *WEIGHT)
-    (penalty,) = fitted.penalties.made.values()
+    (penalty,), view = fitted.hook(Penalties).active.values(), fitted.scene.train[0]
     assert isinstance(penalty, Strain)
-    penalty.prepare(5, Query.at(QUERY.center.float(), 0.5))
+    penalty.prepare(5, view)
     first = penalty.neighbours
     assert first is not None
     itself = torch.arange(len(first))[:, None]
     assert not (first == itself).any()
     distances = torch.cdist(fitted.model.splats["means"].double(), fitted.model.splats["means"].double()).detach()
     torch.testing.assert_close(distances.gather(1, first.long()), distances.sort().values[:, 1:9])
-    penalty.prepare(104, Query.at(QUERY.center.float(), 0.5))
+    penalty.prepare(104, view)
     assert penalty.neighbours is first
     fitted.rows.select(torch.arange(len(first)).flip(0))
-    penalty.prepare(104, Query.at(QUERY.center.float(), 0.5))
+    penalty.prepare(104, view)
     assert penalty.neighbours is not None
     assert torch.equal(penalty.neighbours.flip(0), len(first) - 1 - first)
     second = penalty.neighbours
-    penalty.prepare(204, Query.at(QUERY.center.float(), 0.5))
+    penalty.prepare(204, view)
     assert penalty.neighbours is not second
 
 
@@ -220,13 +224,13 @@ def test_neighbours_continue_from_a_checkpoint() -> None:
     stops = iter([True] * 24 + [False])
     part.run(lambda _: None, "part", lambda: next(stops))
     state = copy.deepcopy(part.state_dict())
-    assert state["penalties"]["strain"]["searched"] == 20
+    assert state["hooks"]["penalties"]["strain"]["searched"] == 20
     resumed = trainer("7dgs", *words)
     resumed.load_state_dict(state)
     resumed.run(lambda _: None, "resumed")
     for name, value in whole.model.pack().items():
         assert torch.equal(value, resumed.model.pack()[name]), name
-    state["penalties"]["strain"]["neighbours"][0, 0] = len(part.model)
+    state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(part.model)
     with pytest.raises(InputError, match="neighbours"):
         trainer("7dgs", *words).load_state_dict(state)
 

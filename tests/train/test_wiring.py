@@ -11,7 +11,6 @@ import pytest
 import torch
 from tiny_training import compose, moving_square
 
-from gsbench.config import PenaltiesConfig
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam_all
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
@@ -23,12 +22,16 @@ from gsbench.models.sliced import tensors_of
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
+from gsbench.train.density.blend_weights import blend_weights
+from gsbench.train.hooks.average import Average
+from gsbench.train.hooks.best import Best
+from gsbench.train.hooks.minimum_sizes import MinimumScale
+from gsbench.train.hooks.penalties import Penalties, PenaltiesConfig
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
-from gsbench.train.penalties import PENALTIES
+from gsbench.train.regularisers import PENALTIES
 from gsbench.train.seeding import generator
-from gsbench.train.step import Seen
-from gsbench.train.thinning import blend_weights
+from gsbench.train.step import ViewResult
 
 
 def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
@@ -49,10 +52,14 @@ def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
     fitted = trainer("3dgs", f"train.batch_size={batch}", scene=replace(square, train=square.train[:1] * 4))
     means = fitted.model.splats["means"]
     seen = []
-    fitted.optimizer.step = lambda *_, **__: seen.append(means.grad)  # type: ignore[method-assign]
+    fitted.optimizer.step = lambda *_: seen.append(means.grad)  # type: ignore[method-assign]
     fitted._descend()
     assert means.grad is not None
-    return means.grad.clone(), fitted.density.gradient / fitted.density.seen.clamp(min=1), fitted.finite_check.loss
+    return (
+        means.grad.clone(),
+        fitted.density.rule.gradient / fitted.density.rule.times_visible.clamp(min=1),
+        fitted.finite_check.loss,
+    )
 
 
 def test_a_batch_is_a_mean() -> None:
@@ -82,7 +89,7 @@ def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPa
 
 def test_density_gradients_are_of_one_view_in_half_images() -> None:
     """Catches a gradient that is not rescaled by the batch, or that is left in pixels."""
-    density = trainer("3dgs").density
+    density = trainer("3dgs").density.rule
     N = len(density.model)
     gradient = torch.tensor([3e-3, 4e-3]).expand(1, N, 2).clone()
     density.accumulate(torch.ones(1, N, dtype=torch.bool), gradient, width=20, height=20, views=4)
@@ -99,7 +106,11 @@ def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
         fitted._measure()
     assert [point.psnr_val for point in fitted.curve.points] == [20.0, 21.0, 20.5]
     assert isinstance(fitted.curve.last, Point)
-    assert (fitted.best.val, fitted.best.eval_at_best_val, fitted.best.eval) == (21.0, 14.0, None)
+    assert (fitted.hook(Best).scores.val, fitted.hook(Best).scores.eval_at_best_val, fitted.hook(Best).scores.eval) == (
+        21.0,
+        14.0,
+        None,
+    )
 
 
 def test_opacities_are_reset_when_the_schedule_says() -> None:
@@ -138,10 +149,10 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     drawn = torch.zeros(3, 1, N, dtype=torch.bool)
     for view in range(3):
         drawn[view, 0, view] = True  # each view sees the Gaussian of its number
-    seen = [Seen(torch.ones(()), one, torch.zeros(1, N, 2), {}) for one in drawn]
+    seen = [ViewResult(torch.ones(()), one, torch.zeros(1, N, 2), {}) for one in drawn]
     fitted.gradients = lambda *_: seen  # type: ignore[assignment]
     moved = []
-    fitted.optimizer.step = lambda _, drawn, **__: moved.append(drawn)  # type: ignore[method-assign]
+    fitted.optimizer.step = lambda _, drawn, __: moved.append(drawn)  # type: ignore[method-assign]
     for step in (0, 1):
         fitted.step = step
         fitted._descend()
@@ -153,7 +164,7 @@ def test_counts_are_kept_while_gaussians_are_densified() -> None:
     """Catches a last densification that does not know the views before it, and counting for none (2 % of a step)."""
     fitted = trainer("3dgs", "train.batch_size=1")
     stop, counted = fitted.schedule.densify_stop, []
-    fitted.density.accumulate = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
+    fitted.density.rule.accumulate = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
     for fitted.step in (stop - 2, stop - 1, stop, stop + 1):
         fitted._descend()
     assert counted == [stop - 2, stop - 1]
@@ -164,7 +175,7 @@ def test_large_gaussians_go_once_opacities_were_reset() -> None:
     """Catches pruning by size that is never asked for, or asked for from the start."""
     fitted = trainer()
     asked = []
-    fitted.density.densify = lambda _, has_reset, __: asked.append(has_reset)  # type: ignore[method-assign]
+    fitted.density.rule.densify = lambda _, has_reset, __: asked.append(has_reset)  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
     for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
@@ -177,7 +188,7 @@ def test_children_of_every_densification_are_drawn_anew() -> None:
     """Catches children that are scattered alike in every densification, and draws that are not those of the seed."""
     fitted = trainer("3dgs")
     drawn: list[float] = []
-    fitted.density.densify = lambda random, *_: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
+    fitted.density.rule.densify = lambda random, *_: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
         fitted._descend()
@@ -206,12 +217,12 @@ def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_long_in_time_is_split_along_its_path() -> None:
     """Catches 7DGS never splitting in time: a small Gaussian that asks for density and moves gets two times."""
     fitted = trainer("7dgs")
-    model, density = fitted.model, fitted.density
+    model, density = fitted.model, fitted.density.rule
     with torch.no_grad():
         model.splats["log_diagonal"][:, 4:] = math.log(1e-3)  # small: in space it would be cloned
         model.splats["motion"][0, 3] = 10.0
         model.splats["opacities"].fill_(2.0)
-    density.gradient[:2], density.seen[:2] = 1.0, 1.0
+    density.gradient[:2], density.times_visible[:2] = 1.0, 1.0
     times = model.splats["times"].detach()[:2].clone()
     N = len(model)
     density.densify(generator(0), has_reset=False, most=100)
@@ -290,9 +301,9 @@ def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
         fitted.step = step
         fitted._descend()
         held = fitted.model.splats["log_diagonal"].detach()[:, 4:].amin(1)
-        assert len(held) == len(fitted.minimum_scale.least)
+        assert len(held) == len(fitted.hook(MinimumScale).least)
         if step == 0:
-            torch.testing.assert_close(held, fitted.minimum_scale.least.log(), rtol=1e-2, atol=0)
+            torch.testing.assert_close(held, fitted.hook(MinimumScale).least.log(), rtol=1e-2, atol=0)
 
 
 def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
@@ -385,10 +396,10 @@ def test_the_lightest_gaussians_go_and_moments_follow() -> None:
     kept = weights.argsort(descending=True, stable=True)[: round(N / 2)].sort().values
     means = model.splats["means"].detach().clone()
     moments = fitted.optimizer.moments[model.splats["means"]]["exp_avg"].clone()
-    fitted._thin()
+    fitted.density.thin()
     assert torch.equal(model.splats["means"], means[kept])
     assert torch.equal(fitted.optimizer.moments[model.splats["means"]]["exp_avg"], moments[kept])
-    assert len(fitted.minimum_scale.least) == len(fitted.density.unseen) == len(kept)
+    assert len(fitted.hook(MinimumScale).least) == len(fitted.density.rule.unseen) == len(kept)
     at = max(fitted.schedule.scaled(15_600), fitted.schedule.densify_stop)
     assert [step for step in range(100) if fitted.schedule.thins(step)] == [at - 1]
 
@@ -412,7 +423,7 @@ def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
         found = []
         for one in (plain, penalised):
             views = one.scene.train[:2]
-            one.gradients(views, one.penalties.at(step, views))
+            one.gradients(views, one.hook(Penalties).loss_terms(step, views))
             found.append(one.model.splats["opacities"].grad)
         opacities = torch.sigmoid(plain.model.splats["opacities"].detach())
         expected = 3.0 * opacities * (1 - opacities) / len(opacities)
@@ -443,21 +454,6 @@ def test_every_penalty_has_its_settings() -> None:
     assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
 
 
-@pytest.mark.parametrize(("split", "views", "kept"), [("test", True, 50), ("val", True, 0), ("test", False, 0)])
-def test_parameters_are_averaged_where_val_may_choose(split: str, views: bool, kept: int) -> None:
-    """Catches results on the views by which they were chosen, and means that nothing chose."""
-    fitted = trainer("7dgs", "train.average_from=15000", f"scene.eval_split={split}", "train.patience=null")
-    if not views:
-        fitted.scene = replace(fitted.scene, val=[])
-    real, last = fitted.psnr, [10.0, 20.0]
-    fitted.psnr = lambda views: (  # type: ignore[method-assign]
-        last.pop(0) if fitted.step == 99 and last and views is fitted.scene.val else real(views)
-    )
-    fitted.run(lambda _: None, "square")
-    assert fitted.average.kept == kept
-    assert fitted.average.count == 0
-
-
 def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
     """Catches random numbers or sums of relocation and of averages that a checkpoint does not have."""
     densify = ("train.densify.kind=mcmc", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10")
@@ -469,13 +465,13 @@ def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
     stops = iter([True] * 54 + [False])
     part.run(lambda _: None, "part", lambda: next(stops))
     assert part.step == 55
-    assert part.average.count == 1  # of step 50: it started anew with the round before
+    assert part.hook(Average).count == 1  # of step 50: it started anew with the round before
     state = copy.deepcopy(part.state_dict())
     resumed = trainer("7dgs", *words)
     resumed.load_state_dict(state)
     resumed.run(lambda _: None, "resumed")
     assert len(whole.model) > before
-    assert whole.average.count == 0
-    assert whole.average.kept == resumed.average.kept
+    assert whole.hook(Average).count == 0
+    assert whole.hook(Average).kept == resumed.hook(Average).kept
     for name, value in whole.model.pack().items():
         assert torch.equal(value, resumed.model.pack()[name]), name

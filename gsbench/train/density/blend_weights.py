@@ -1,7 +1,6 @@
-"""Find the Gaussians that contribute most to the training images, so that the others can be removed.
+"""Compute by how much each Gaussian contributes to images: the sum of its blend weights.
 
-The contribution of a Gaussian is the sum of its blend weights over all pixels of all views. A blend weight is alpha
-times the transmittance in front of the Gaussian (3DGS, eq. 3).
+A blend weight is alpha times the transmittance in front of the Gaussian (3DGS, eq. 3).
 """
 
 from collections.abc import Sequence
@@ -35,9 +34,9 @@ class WeighedImage:
     def __init__(self, model: GaussianModel, view: View, background: Tensor, antialias: bool) -> None:
         """Render the view; `background` is its colour, [3]."""
         with torch.no_grad():
-            seen = model.slice(Query.of(view.camera, view.time))
-        self._colors = seen.colors.detach().requires_grad_()  # [N, 3]
-        gaussians = seen._replace(colors=self._colors)
+            gaussians = model.slice(Query.of(view.camera, view.time))
+        self._colors = gaussians.colors.detach().requires_grad_()  # [N, 3]
+        gaussians = gaussians._replace(colors=self._colors)
         with torch.enable_grad(), Tape() as self._tape:
             self._output = rasterize_slice(gaussians, view.camera, background, model.backend, antialias).image
         self.image = self._output.detach()[0]  # [H, W, 3]

@@ -6,7 +6,7 @@ Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 24
 import torch
 from torch import Tensor
 
-from gsbench.train.densify.base import Densification
+from gsbench.train.density.rule import DensificationRule
 
 GROWTH = 0.05  # share of Gaussians that a round adds, until there are `max_gaussians`
 MOST_COPIES = 51  # equal Gaussians that one Gaussian becomes in a round, at most
@@ -14,7 +14,7 @@ STILL_FROM = 0.2  # opacity from which the noise, below 4e-9 of that on a transp
 LARGEST_OPACITY = 1 - 1.2e-7  # the largest float32 below 1
 
 
-class MCMCDensification(Densification):
+class MCMCDensification(DensificationRule):
     """The relocation of 3DGS-MCMC (section 4). No Gaussian is cloned, split or pruned, and no opacity is reset.
 
     - A round takes place every 100 iterations or more, between `train.densify.start` and `stop`. A Gaussian is dead if
@@ -29,9 +29,6 @@ class MCMCDensification(Densification):
     """
 
     kind = "mcmc"
-
-    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
-        """Do nothing: relocation does not use gradients of 2D means."""
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
@@ -71,32 +68,19 @@ class MCMCDensification(Densification):
         self.rows.select(rows, fresh)
 
     @property
-    def adds_noise(self) -> bool:
-        """Whether noise is added: not after Gaussians were made independent of time, direction or AGR (a network)."""
+    def adds_noise(self) -> bool:  # type: ignore[override]
+        """Whether noise is added: not after a gate has simplified Gaussians."""
         return self.config.noise > 0 and self.model.effect_sets is None
 
     @torch.no_grad()
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
-        """Move the means of transparent Gaussians by noise; `rate` is the learning rate of means, world units."""
+        """Move the means of transparent Gaussians by noise."""
         opacities = self._opacities()
         noise = torch.randn(len(opacities), 3, 1, generator=generator).to(opacities)
         rows = (opacities < STILL_FROM).nonzero()[:, 0]
         spread = self.model.spread(rows)
         weight = torch.sigmoid(-100 * (opacities[rows] - 0.005)) * (self.config.noise * rate)
         self.model.splats["means"].data[rows] += weight[:, None] * (spread @ (spread.mT @ noise[rows]))[..., 0]
-
-    def reset_opacities(self) -> None:
-        """Do nothing: opacities are not reset."""
-
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Do nothing: the rule stores no numbers of single Gaussians."""
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return an empty dictionary: all random numbers come from the seed and the step."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Do nothing, because `state_dict` is empty."""
 
 
 def drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

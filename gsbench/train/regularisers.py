@@ -1,15 +1,11 @@
-"""Penalise neighbouring Gaussians that move apart: the strain of the motion, relative to their distance.
+"""Define the regularisers of `train.penalties`: mean opacity, mean size, and the strain of the motion.
 
-Let m_i(t) be the conditional mean of Gaussian i for the camera of a view, t0 the time of the view, and t1 = t0 + u / F
-for F frames and a random u. With a random set B of Gaussians and the k nearest neighbours N(i) of Gaussian i,
-
-    E = 1 / (|B| k) sum_{i in B} sum_{j in N(i)} w_ij |v_i - v_j|^2 / (|m_i(t0) - m_j(t0)|^2 + (1e-3 extent)^2)
-
-where v_i = (m_i(t1) - m_i(t0)) / (t1 - t0) is the mean velocity, and w_ij = sqrt(f_i f_j) with the opacity factors f in
-[0, 1] at t0. No gradient flows through w_ij and the denominator.
+To add one, derive a class from `Penalty`, and add it to PENALTIES and to `PenaltiesConfig` of
+gsbench/train/hooks/penalties.py.
 """
 
-from typing import Any
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
 
 import torch
 from scipy.spatial import cKDTree
@@ -17,8 +13,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
-from gsbench.train.checkpoint import tensor, whole_number
-from gsbench.train.penalties.base import Penalty
+from gsbench.scenes import View
+from gsbench.train.checkpoint import MOST_STEPS, tensor, whole_number
 from gsbench.train.seeding import generator
 
 NEIGHBOURS = 8
@@ -28,20 +24,82 @@ VISIBLE = 0.05  # neighbours have an opacity factor above this when they are sea
 LEAST_DISTANCE = 1e-3  # added to distances, in parts of the scene's extent
 LEAST_SHARE = 0.1  # least |u|: for a shorter time, rounding in float32 would exceed the differences of the means
 DRAWS = 2  # the purpose of the random numbers, see `generator`
-MOST = 10**9  # no training has more steps
+
+
+class Penalty(ABC):
+    """A term of the loss of every view.
+
+    Threads compute the penalties of different views at the same time, so only `prepare` and `reindex` change an object.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()  # what the model must observe, of "time", "direction"
+
+    def __init__(self, model: GaussianModel, seed: int, frames: int) -> None:
+        """Make the penalty of a training.
+
+        Args:
+            model: the model, with Gaussians.
+            seed: the seed of the run, from which all random numbers are drawn.
+            frames: the number of different times of the training views.
+        """
+        self.model = model
+        self.seed = seed
+        self.frames = frames
+
+    @abstractmethod
+    def __call__(self, query: Query, index: int) -> Tensor:
+        """Return the penalty for view number `index` of a batch, []."""
+
+    def prepare(self, step: int, first: View) -> None:
+        """Act once in a step before its views are rendered; `first` is the first view of the batch."""
+        return
+
+    def reindex(self) -> None:
+        """Act after Gaussians were added, removed or reordered."""
+        return
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state for the checkpoint."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the state; raise InputError if it belongs to another training."""
+        return
+
+
+class MeanOpacity(Penalty):
+    """The mean opacity of all Gaussians, a regulariser of 3DGS-MCMC."""
+
+    def __call__(self, query: Query, index: int) -> Tensor:
+        """Return the mean opacity, []; it is the same for every view."""
+        return torch.sigmoid(self.model.splats["opacities"]).mean()
+
+
+class MeanSize(Penalty):
+    """The mean scale in space over Gaussians and axes, divided by the radius of the scene (3DGS-MCMC)."""
+
+    def __call__(self, query: Query, index: int) -> Tensor:
+        """Return the mean scale, []; it is the same for every view."""
+        return self.model.spatial_scales().mean() / self.model.extent
 
 
 class Strain(Penalty):
-    """The mean squared strain rate between neighbouring Gaussians.
+    """The strain of the motion: how fast neighbouring Gaussians move apart, relative to their distance.
 
-    Neighbours are nearest at the time of one view, and are searched again every 100 steps and after Gaussians were
-    added, removed or reordered.
+    Let m_i(t) be the conditional mean of Gaussian i for the camera of a view, t0 the time of the view, and
+    t1 = t0 + u / F for F frames and a random u. With a random set B of Gaussians and the k nearest neighbours N(i),
+
+        E = 1 / (|B| k) sum_{i in B} sum_{j in N(i)} w_ij |v_i - v_j|^2 / (|m_i(t0) - m_j(t0)|^2 + (1e-3 extent)^2)
+
+    where v_i = (m_i(t1) - m_i(t0)) / (t1 - t0) is the mean velocity, and w_ij = sqrt(f_i f_j) with the opacity factors
+    f in [0, 1] at t0. No gradient flows through w_ij and the denominator. Neighbours are nearest at the time of one
+    view, and are searched again every 100 steps and after Gaussians were added, removed or reordered.
     """
 
     needs = ("time",)
 
     def __init__(self, model: GaussianModel, seed: int, frames: int) -> None:
-        """Make the penalty of a training; see `Penalty`."""
+        """Start without neighbours."""
         super().__init__(model, seed, frames)
         self.step = 0
         self.searched = 0  # the step of the last search
@@ -49,15 +107,15 @@ class Strain(Penalty):
         self.rows = torch.zeros(0, dtype=torch.int64)  # the Gaussians that have neighbours, [M]
 
     @torch.no_grad()
-    def prepare(self, step: int, query: Query) -> None:
-        """Search neighbours if there are none or if they are 100 steps old; `query` is that of the first view."""
+    def prepare(self, step: int, first: View) -> None:
+        """Search neighbours if there are none or if they are 100 steps old."""
         self.step = step
         if self.neighbours is None or step >= self.searched + EVERY:
             self.searched = step
-            self._use(self._nearest(query))
+            self._use(self._nearest(Query.of(first.camera, first.time)))
 
     def __call__(self, query: Query, index: int) -> Tensor:
-        """Return E for a view, []; see the module."""
+        """Return E for a view, []."""
         if not len(self.rows):
             return query.center.new_zeros(())
         assert self.neighbours is not None
@@ -70,8 +128,8 @@ class Strain(Penalty):
         sample = self.rows[torch.randperm(len(self.rows), generator=draws)[:SAMPLES].to(self.rows.device)]
         pairs = self.neighbours[sample].long().T.contiguous()  # [k, B]
 
-        means, visible = self._seen(query)
-        means_later, visible_later = self._seen(later)
+        means, visible = self._visible_means(query)
+        means_later, visible_later = self._visible_means(later)
         velocities = (means_later - means) / (later.time - query.time)
         # A Gaussian that is culled has no conditional mean, so its pairs do not count.
         visible = torch.where(visible_later > 0, visible, 0.0)
@@ -81,8 +139,8 @@ class Strain(Penalty):
         strains = weights / distances * _differences(velocities, sample, pairs).square().sum(0)  # [k, B]
         return strains.sum(0).sum() / pairs.numel()
 
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Forget the neighbours, because Gaussians were added, removed or reordered."""
+    def reindex(self) -> None:
+        """Forget the neighbours."""
         self.neighbours = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -93,7 +151,7 @@ class Strain(Penalty):
         """Restore the neighbours from a checkpoint; raises InputError if they belong to another training."""
         self.neighbours = None
         if state:
-            self.searched = whole_number("strain", state.get("searched"), MOST)
+            self.searched = whole_number("strain", state.get("searched"), MOST_STEPS)
             neighbours = tensor(state, "neighbours", (len(self.model), NEIGHBOURS), torch.int32)
             if not ((neighbours >= -1) & (neighbours < len(self.model))).all():
                 raise InputError("checkpoint: expected neighbours from -1 to the number of Gaussians, got others")
@@ -105,19 +163,19 @@ class Strain(Penalty):
 
     def _nearest(self, query: Query) -> Tensor:
         """Return the nearest visible neighbours of each visible Gaussian for a camera and a time, [N, k] int32."""
-        means, visible = self._seen(query)
+        means, visible = self._visible_means(query)
         rows = ((visible > VISIBLE) & means.isfinite().all(-1)).nonzero()[:, 0]
         neighbours = torch.full((len(means), NEIGHBOURS), -1, dtype=torch.int32, device=means.device)
         if len(rows) <= NEIGHBOURS:
             return neighbours
         positions = means[rows].double().cpu().numpy()
-        found = torch.from_numpy(cKDTree(positions).query(positions, k=NEIGHBOURS + 1)[1])
-        itself = found == torch.arange(len(rows))[:, None]
+        nearest = torch.from_numpy(cKDTree(positions).query(positions, k=NEIGHBOURS + 1)[1])
+        itself = nearest == torch.arange(len(rows))[:, None]
         itself[~itself.any(-1), -1] = True  # more than k others are in the same place
-        neighbours[rows] = rows[found[~itself].unflatten(0, (-1, NEIGHBOURS)).to(rows.device)].int()
+        neighbours[rows] = rows[nearest[~itself].unflatten(0, (-1, NEIGHBOURS)).to(rows.device)].int()
         return neighbours
 
-    def _seen(self, query: Query) -> tuple[Tensor, Tensor]:
+    def _visible_means(self, query: Query) -> tuple[Tensor, Tensor]:
         """Return the conditional means [N, 3] and, without gradients, the opacity factors in [0, 1], [N]."""
         raw = self.model.refined(query)
         geometry = self.model.slice_geometry(raw, query)
@@ -135,5 +193,8 @@ def _differences(
     On a CPU, the gradient of `gather` adds equal indices in a fixed order, and is faster than that of `embedding`.
     """
     columns = vectors.T.contiguous()
-    own, others = (columns.gather(1, rows.flatten().expand(3, -1)) for rows in (sample, pairs))
-    return own[:, None] - others.unflatten(1, pairs.shape)
+    ends, starts = (columns.gather(1, rows.flatten().expand(3, -1)) for rows in (sample, pairs))
+    return ends[:, None] - starts.unflatten(1, pairs.shape)
+
+
+PENALTIES: dict[str, type[Penalty]] = {"opacity": MeanOpacity, "size": MeanSize, "strain": Strain}

@@ -1,8 +1,4 @@
-"""Define the interface of a densification rule, which adds and removes Gaussians during a training.
-
-A rule accumulates the gradients of 2D means after each view (`accumulate`), and adds and removes Gaussians every few
-steps (`densify`). It works with all models, because it calls the model's own method to split Gaussians.
-"""
+"""Define the interface of a densification rule, which adds and removes Gaussians during a training."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -26,10 +22,11 @@ class Scores(NamedTuple):
 Score = Callable[[torch.Generator], Scores]
 
 
-class Densification(ABC):
-    """The base class of densification rules, which add and remove Gaussians during a training."""
+class DensificationRule(ABC):
+    """The base class of rules; a rule works with all models, since a model itself splits Gaussians."""
 
     kind: ClassVar[str]  # its name in train.densify.kind
+    adds_noise = False  # whether the training calls `add_noise` after every step
 
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
@@ -53,25 +50,6 @@ class Densification(ABC):
         rows.add(self)
 
     @abstractmethod
-    def accumulate(
-        self,
-        drawn: Tensor,  # [C, N] bool
-        g_means2d: Tensor,  # [C, N, 2] per pixel
-        width: int,
-        height: int,
-        views: int,
-    ) -> None:
-        """Accumulate the gradients of the 2D means in one view of a batch.
-
-        Args:
-            drawn: which Gaussians were not culled.
-            g_means2d: the gradient of the loss, a mean over the batch, with respect to the 2D means.
-            width: the width of the image, pixels.
-            height: the height of the image, pixels.
-            views: the number of views in the batch.
-        """
-
-    @abstractmethod
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Do one round of densification: add and remove Gaussians.
 
@@ -84,37 +62,41 @@ class Densification(ABC):
             The number of Gaussians that were not added, because the model would have more than allowed.
         """
 
-    @property
-    def adds_noise(self) -> bool:
-        """Whether the training calls `add_noise` after every step; by default it does not."""
-        return False
-
-    def add_noise(self, rate: float, generator: torch.Generator) -> None:
-        """Move means by noise after a step, if the rule's `adds_noise` is true; by default do nothing.
+    def accumulate(
+        self,
+        drawn: Tensor,  # [C, N] bool
+        g_means2d: Tensor,  # [C, N, 2] per pixel
+        width: int,
+        height: int,
+        views: int,
+    ) -> None:
+        """Accumulate the gradients of the 2D means in one view of a batch; by default they are not used.
 
         Args:
-            rate: the learning rate of the means in this step, world units.
-            generator: the source of all random numbers of this step.
+            drawn: which Gaussians were not culled.
+            g_means2d: the gradient of the loss, a mean over the batch, with respect to the 2D means.
+            width: the width of the image, pixels.
+            height: the height of the image, pixels.
+            views: the number of views in the batch.
         """
         return
 
-    @abstractmethod
+    def add_noise(self, rate: float, generator: torch.Generator) -> None:
+        """Move means by noise after a step, where `adds_noise`; `rate` is the learning rate of means, world units."""
+        return
+
     def reset_opacities(self) -> None:
         """Lower all opacities, if the rule does this; the training calls this method at fixed intervals."""
+        return
 
-    @abstractmethod
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the accumulated gradients and counts after Gaussians were added or removed.
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        """Reorder per-Gaussian state after Gaussians were added or removed, see `gsbench.train.hooks.Hook.reindex`."""
+        return
 
-        Args:
-            rows: for each Gaussian after the change, its index before the change, [M].
-            fresh: which Gaussians are new, [M] bool.
-        """
-
-    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return the gradients and counts that the rule has accumulated, for the checkpoint."""
+        """Return what the rule has accumulated, for the checkpoint."""
+        return {}
 
-    @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the accumulated gradients from a checkpoint; raises InputError if the number of Gaussians differs."""
+        """Restore a `state_dict`; raise InputError if the number of Gaussians differs."""
+        return

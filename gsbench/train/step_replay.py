@@ -1,7 +1,7 @@
-"""Record how a training step renders and differentiates its views, and repeat this in the steps that follow.
+"""Record how a training step renders and differentiates its views, and replay this in the steps that follow.
 
 Consecutive steps differ only in the values of tensors, such as the camera, until densification changes the number of
-Gaussians, or the schedule changes what is trained. `gsbench.kernels.recording` says why a repetition is faster.
+Gaussians, or the schedule changes what is trained. `gsbench.kernels.recording` says why a replay is faster.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class _Recorded(Generic[Result]):
         return self.result
 
 
-class Repetition(Generic[Result]):
+class StepReplay(Generic[Result]):
     """Does the work of a step on each view of a batch: at first as written, later by repeating a recording."""
 
     def __init__(self) -> None:

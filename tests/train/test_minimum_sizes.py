@@ -1,15 +1,20 @@
-"""The least size of a Gaussian: seen by no camera, and held."""
+"""The minimum scale of a Gaussian, which no camera resolves, and its minimum lifetime, half the gap between times."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from test_wiring import trainer
+from tiny_training import moving_square
 
 from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import render
 from gsbench.scenes import Camera
 from gsbench.scenes.points import random_points
-from gsbench.train.densify.minimum_scale import LEAST_PIXELS, MinimumScale
+from gsbench.train.hooks.minimum_sizes import LEAST_PIXELS, MinimumLifetime, MinimumScale
 
 OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
 
@@ -18,6 +23,14 @@ def camera(distance: float, focal: float = 50.0) -> Camera:
     viewmat = torch.eye(4)
     viewmat[2, 3] = distance
     return Camera(viewmat, torch.tensor([[focal, 0, 24], [0, focal, 24], [0, 0, 1]]), 48, 48)
+
+
+def training_of(model: GaussianModel, views: list[Any]) -> Any:
+    return SimpleNamespace(model=model, scene=SimpleNamespace(train=views))
+
+
+def scale_of(model: GaussianModel, cameras: list[Camera]) -> MinimumScale:
+    return MinimumScale(training_of(model, [SimpleNamespace(camera=camera) for camera in cameras]))
 
 
 def flat(name: str) -> GaussianModel:
@@ -34,7 +47,7 @@ def test_the_floor_is_a_part_of_a_pixel_at_the_nearest_camera() -> None:
     """Catches the farthest camera, a mean over cameras, or a focal length that is left out."""
     model = flat("3dgs")
     model.splats["means"].data.zero_()
-    minimum_scale = MinimumScale(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
+    minimum_scale = scale_of(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
     torch.testing.assert_close(minimum_scale.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
 
 
@@ -45,7 +58,7 @@ def test_the_floor_is_of_the_finer_axis_of_the_pixels() -> None:
     for axis in (0, 1):
         K = wide.K.clone()
         K[axis, axis] = 80.0
-        least = MinimumScale(model, [Camera(wide.viewmat, K, 48, 48)]).least
+        least = scale_of(model, [Camera(wide.viewmat, K, 48, 48)]).least
         torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * 2.0 / 80))
 
 
@@ -57,8 +70,9 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     before = render(model, eye, 0.5, background)
     others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
     durations = model.splats["scales"].detach()[:, 3:].clone() if name == "4dgs" else None
-    minimum_scale = MinimumScale(model, [eye])
-    minimum_scale.hold()
+    minimum_scale = scale_of(model, [eye])
+    with torch.no_grad():
+        minimum_scale.after_update(0)
     after = render(model, eye, 0.5, background)
     assert 0 < (after - before).abs().max() < 1 / 255
     factors = model.slice(Query.at(eye.center, 0.5)).factors
@@ -74,8 +88,36 @@ def test_only_sizes_in_space_are_held(name: str) -> None:
     space = model.rows["p"] if name in ("6dgs", "7dgs") else [0, 1, 2]
     sizes = model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data
     sizes.fill_(math.log(1e-7))
-    minimum_scale = MinimumScale(model, [camera(4.0)])
-    minimum_scale.hold()
+    minimum_scale = scale_of(model, [camera(4.0)])
+    with torch.no_grad():
+        minimum_scale.after_update(0)
     for column in range(sizes.shape[1]):
         expected = minimum_scale.least if column in space else torch.full((200,), 1e-7)
         torch.testing.assert_close(sizes[:, column].exp(), expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("times", "least"),
+    [
+        ((0.0, 0.1, 0.2, 0.0, 0.1, 0.2), 0.05),  # two cameras that see the same times
+        ((0.7, 0.0, 0.1, 0.2), 0.05),  # a pause between the recordings
+        ((0.5, 0.5), None),
+        ((None, None), None),
+    ],
+)
+def test_it_is_half_the_gap_between_the_times_of_training(times: tuple[Any, ...], least: float | None) -> None:
+    """Catches the gap between views of the same time, the mean or longest gap, and a static scene or model with one."""
+    views = [SimpleNamespace(time=time) for time in times]
+    assert MinimumLifetime(training_of(build("4dgs"), views)).least == (least and pytest.approx(least))
+    for name in ("3dgs", "dbs_static", "ubs_static"):
+        assert MinimumLifetime(training_of(build(name), views)).least is None
+
+
+def test_every_step_of_a_training_holds_it() -> None:
+    """Catches a training that never calls it, or computes the gap from views of val or test."""
+    square = moving_square()
+    scene = replace(square, train=[replace(v, time=t) for v, t in zip(square.train, (0.0, 1.0) * 50, strict=False)])
+    fitted = trainer("freetime", "effects.gate=off", scene=scene)
+    fitted.model.splats["durations"].data.fill_(-9.0)
+    fitted._descend()
+    assert fitted.model.splats["durations"].detach().exp().min() == pytest.approx(0.5)

@@ -6,11 +6,11 @@ from torch import Tensor
 from gsbench.config import DensifyConfig
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
-from gsbench.train.densify.base import Densification, Score
+from gsbench.train.density.rule import DensificationRule, Score
 from gsbench.train.rows import Rows
 
 
-class GradientDensification(Densification):
+class GradientDensification(DensificationRule):
     """The adaptive density control of 3DGS (section 5.2), with the splits in time of 7DGS (section 4.4).
 
     By default, in a run of 30,000 iterations:
@@ -29,7 +29,7 @@ class GradientDensification(Densification):
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
     ) -> None:
-        """Start the density control with gradient sums of zero; see `Densification` for the arguments."""
+        """Start with gradient sums of zero."""
         super().__init__(rows, config, min_opacity, views, score)
         self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
@@ -39,7 +39,7 @@ class GradientDensification(Densification):
         """Set the accumulated gradients of the 2D means, and the counts of views, to zero."""
         like = self.model.splats["opacities"].detach()
         self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
-        self.seen = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
+        self.times_visible = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
     def accumulate(
@@ -53,33 +53,19 @@ class GradientDensification(Densification):
         """Add the norms of the gradients of the 2D means in one view, in units of half the image (NDC)."""
         x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
-        self.seen += drawn.sum(0)
+        self.times_visible += drawn.sum(0)
         # [N] views since the Gaussian was last visible
         self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
-        """Clone and split Gaussians with a large gradient, then prune.
-
-        Args:
-            generator: the source of random numbers for the children of split Gaussians.
-            has_reset: whether opacities were reset before; only then are large Gaussians pruned.
-            most: the number of Gaussians that the model may have after this round.
-
-        Returns:
-            The number of Gaussians with a large gradient that were not cloned or split, because of `most`.
-        """
+        """Clone and split Gaussians with a large gradient, then prune; large ones only if `has_reset`."""
         _, refused = self._add(generator, most)
         self.rows.select((~(self._unseen() | self._faint_or_large(has_reset))).nonzero()[:, 0])
         return refused
 
     def _add(self, generator: torch.Generator, most: int, allowed: Tensor | None = None) -> tuple[Tensor, int]:
-        """Clone and split Gaussians with a large gradient.
-
-        Args:
-            generator: the source of random numbers for the children of split Gaussians.
-            most: the number of Gaussians that the model may have after this round.
-            allowed: which Gaussians may be cloned or split, [N] bool; None: all.
+        """Clone and split Gaussians with a large gradient that are `allowed` [N] bool; None: all.
 
         Returns:
             The index before the change of each Gaussian or of its parent, [M], and the number of Gaussians that were
@@ -109,18 +95,17 @@ class GradientDensification(Densification):
     def _faint_or_large(self, has_reset: bool) -> Tensor:
         """Return which Gaussians are too transparent or, after the first reset of opacities, too large, [N] bool."""
         model = self.model
-        found = torch.sigmoid(model.splats["opacities"]) < self.min_opacity
+        unfit = torch.sigmoid(model.splats["opacities"]) < self.min_opacity
         if has_reset:
-            found |= model.scales() > self.config.prune_above * model.extent
-        return found
+            unfit |= model.scales() > self.config.prune_above * model.extent
+        return unfit
 
     def _wanted(self, most: int, allowed: Tensor | None) -> tuple[Tensor, int]:
         """Return which Gaussians to clone or split, [N] bool, and how many more were left out because of `most`.
 
-        Only Gaussians in `allowed`, [N] bool, are chosen. If the model would have more Gaussians than `most`,
-        those with the largest gradients are chosen.
+        Those with the largest gradients are chosen.
         """
-        gradient = self.gradient / self.seen.clamp(min=1)
+        gradient = self.gradient / self.times_visible.clamp(min=1)
         wanted = gradient > self.config.grad_threshold
         if allowed is not None:
             wanted &= allowed
@@ -136,19 +121,19 @@ class GradientDensification(Densification):
         self.model.reset_opacities(2 * self.min_opacity)
         self.rows.forget("opacities")
 
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Set the sums of gradients to zero after Gaussians were added or removed, and reorder the counts of views."""
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        """Set the sums of gradients to zero, and reorder the counts of views."""
         self.unseen = self.unseen[rows]
         self.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the sums of gradients and the counts of views of each Gaussian, for the checkpoint."""
-        return {"gradient": self.gradient, "seen": self.seen, "unseen": self.unseen}
+        return {"gradient": self.gradient, "times_visible": self.times_visible, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the sums of gradients from a checkpoint; raises InputError if the number of Gaussians differs."""
         opacities = self.model.splats["opacities"]
-        self.gradient, self.seen = (
-            tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "seen")
+        self.gradient, self.times_visible = (
+            tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "times_visible")
         )
         self.unseen = tensor(state, "unseen", opacities.shape, torch.int32)

@@ -1,0 +1,110 @@
+"""Control the number of Gaussians in a training by the rule `train.densify.kind`, up to a limit."""
+
+import sys
+from collections.abc import Sequence
+
+from tqdm import tqdm
+
+from gsbench.config import Config
+from gsbench.errors import InputError, did_you_mean
+from gsbench.scenes import Scene, View
+from gsbench.schedule import Schedule
+from gsbench.train.density.blend_weights import blend_weights, heaviest
+from gsbench.train.density.gradient import GradientDensification
+from gsbench.train.density.mcmc import MCMCDensification
+from gsbench.train.density.multiview import ErrorScore, MultiviewDensification
+from gsbench.train.density.rule import DensificationRule
+from gsbench.train.optim import Optimizer
+from gsbench.train.renderer import Renderer
+from gsbench.train.rows import Rows
+from gsbench.train.seeding import generator
+from gsbench.train.step import ViewResult
+
+# The most Gaussians that a training may have, if `train.densify.max_gaussians` does not say it: one for so many pixels
+# of the training views, but at least so many times the initial number. With more, long trainings of small scenes take
+# up to five times as long for the same PSNR on val (docs/tuning.md). The images have 2.3 numbers for each of the 84
+# parameters of a Gaussian of 7DGS.
+PIXELS_PER_GAUSSIAN = 64
+LEAST_GROWTH = 4
+# The largest model of the 7DGS paper has 1.41 million Gaussians, the largest here 0.55 million. With gradient and
+# moments, 2 million Gaussians of 7DGS need 2.7 GB.
+MOST_GAUSSIANS = 2_000_000
+
+RULES: dict[str, type[DensificationRule]] = {
+    rule.kind: rule for rule in (GradientDensification, MCMCDensification, MultiviewDensification)
+}
+
+
+def check_kind(kind: str) -> None:
+    """Raise InputError if `kind` is not the name of a densification rule."""
+    if kind not in RULES:
+        raise InputError(f"train.densify.kind '{kind}' is not known. {did_you_mean(kind, RULES)}")
+
+
+class DensityControl:
+    """Call the densification rule of a training when the schedule says so, and thin the Gaussians once after it."""
+
+    def __init__(self, rows: Rows, scene: Scene, config: Config, schedule: Schedule, renderer: Renderer) -> None:
+        """Make the rule that `train.densify.kind` names, for the initial Gaussians."""
+        train = config.train
+        check_kind(train.densify.kind)
+        score = ErrorScore(rows.model, scene.train, renderer, train.ssim_weight)
+        self.rule = RULES[train.densify.kind](rows, train.densify, config.model.min_opacity, len(scene.train), score)
+        self.rows = rows
+        self.scene = scene
+        self.config = config
+        self.schedule = schedule
+        self.renderer = renderer
+        self.limit = gaussian_limit(train.densify.max_gaussians, scene.train, len(rows))
+        self._is_full = False  # whether the limit was reached
+
+    def accumulate(self, step: int, views: Sequence[View], results: Sequence[ViewResult]) -> None:
+        """Accumulate the gradients of a step, while Gaussians are densified."""
+        if step < self.schedule.densify_stop:
+            for view, result in zip(views, results, strict=True):
+                width, height = view.camera.width, view.camera.height
+                self.rule.accumulate(result.drawn, result.g_means2d, width, height, len(views))
+
+    def after_update(self, step: int, optimizer: Optimizer) -> None:
+        """Add noise, densify, thin and sort the Gaussians as the schedule says."""
+        schedule, seed = self.schedule, self.config.seed
+        if self.rule.adds_noise:
+            rate = optimizer.rates_at(step)["means"]
+            self.rule.add_noise(rate, generator(seed, step, 1))  # 1: not the numbers of `densify`
+        if schedule.densifies(step):
+            most = schedule.most_gaussians(step, self.limit)
+            refused = self.rule.densify(generator(seed, step), schedule.has_reset(step), most)
+            if refused and schedule.resolution(step) == 1:
+                self._report_full(step, refused, most)
+        if schedule.thins(step):
+            self.thin()
+        if schedule.densifies(step) or schedule.thins(step):
+            self.rows.sort_by_time()
+
+    def thin(self) -> None:
+        """Keep the share `train.densify.thin_to` of the Gaussians: those with the largest sums of blend weights."""
+        share = self.config.train.densify.thin_to
+        assert share is not None
+        self.rows.select(heaviest(blend_weights(self.rows.model, self.scene.train, self.renderer.antialias), share))
+
+    def _report_full(self, step: int, refused: int, most: int) -> None:
+        """Print once that the largest number of Gaussians is reached; `refused` Gaussians were not added."""
+        if not self._is_full:
+            self._is_full = True
+            which = "default of " if self.config.train.densify.max_gaussians is None else ""
+            tqdm.write(f"step {step + 1}: {most} Gaussians are the most ({which}train.densify.max_gaussians): "
+                       f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
+
+
+def gaussian_limit(limit: int | None, views: Sequence[View], initial: int) -> int:
+    """Return the largest number of Gaussians at full resolution: `limit`, or one that follows from the pixels.
+
+    Args:
+        limit: `train.densify.max_gaussians`.
+        views: the training views.
+        initial: the number of Gaussians at the start.
+    """
+    if limit is not None:
+        return limit
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    return min(max(pixels // PIXELS_PER_GAUSSIAN, LEAST_GROWTH * initial), MOST_GAUSSIANS)

@@ -1,0 +1,158 @@
+"""Define training hooks: options that act at fixed points of a training step, such as early stopping and penalties.
+
+A module of this folder holds an option whole: its checks, its state in a checkpoint and its part of the record. The
+trainer calls all hooks at each point, in the order of the names of their modules, and knows none of them by name. Keys
+are read without torch (gsbench/config.py), so a module imports torch, and what needs it, in functions or for types.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from gsbench.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gsbench.config import Config
+    from gsbench.measure.curve import Curve
+    from gsbench.measure.speed import Effort, StageClock
+    from gsbench.models import GaussianModel, Query
+    from gsbench.scenes import Scene, View
+    from gsbench.schedule import Schedule
+    from gsbench.train.renderer import Renderer
+    from gsbench.train.rows import Rows
+
+LossTerm = tuple[float, "Callable[[Query, int], Tensor]"]  # weight, and the term [] of a view of the batch by its index
+ELSEWHERE = ("gsbench.train.gating",)  # modules of hooks outside of this folder, which act last
+
+
+class Training(Protocol):
+    """What a hook may use of its training: gsbench.train.loop.Trainer."""
+
+    model: GaussianModel
+    scene: Scene
+    views: list[View]  # on which results are measured
+    config: Config
+    schedule: Schedule
+    renderer: Renderer
+    rows: Rows  # changes Gaussians together with all state that belongs to them
+    stages: StageClock
+    effort: Effort
+    curve: Curve
+    step: int  # the present step, counted from 0; between steps the number of finished steps
+
+    def report(self, text: str) -> None:
+        """Print a line above the progress bar."""
+
+    def psnr(self, views: list[View]) -> float:
+        """Return the mean PSNR of the model over views, dB."""
+
+    def state_of_gaussians(self) -> dict[str, Any]:
+        """Return the part of the state that an earlier iteration's Gaussians have, without measurements."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the whole state of the training."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a `state_dict`; raise InputError if it is not one of this training."""
+
+
+class Hook:
+    """The base class of training hooks, whose methods do nothing."""
+
+    name: ClassVar[str]  # its key in a checkpoint
+    measures: ClassVar[bool] = False  # whether its state stays when Gaussians of an earlier iteration are restored
+
+    def __init__(self, training: Training) -> None:
+        """Start at step 0 of a training, whose model has its initial Gaussians."""
+        self.training = training
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        """Raise InputError if a setting is invalid, before any file is read."""
+
+    @classmethod
+    def check_model(cls, model: GaussianModel, config: Config) -> None:
+        """Raise InputError if the settings ask for what the model, which has no Gaussians yet, cannot do."""
+
+    @classmethod
+    def check_scene(cls, scene: Scene, config: Config) -> None:
+        """Raise InputError if the settings ask for what the scene cannot give."""
+
+    def loss_terms(self, step: int, views: Sequence[View]) -> Sequence[LossTerm]:
+        """Return terms that are added to the loss of each view of a step; threads call them at the same time."""
+        return ()
+
+    def rate_factors(self, step: int) -> dict[str, float]:
+        """Return factors of the learning rates of a step, by parameter group."""
+        return {}
+
+    def after_update(self, step: int) -> None:
+        """Act after the optimizer has updated the parameters; gradients are off here and in all that follows."""
+
+    def after_density(self, step: int) -> None:
+        """Act after density control has added and removed Gaussians."""
+
+    def after_step(self, step: int) -> None:
+        """Act at the end of a step."""
+
+    def after_measuring(self, finished: int, psnr: float) -> float:
+        """Act after PSNR on val was measured, and return it; a hook that changes the model returns the new PSNR.
+
+        Args:
+            finished: the number of finished steps.
+            psnr: PSNR on val, dB; NaN if the scene has no val.
+        """
+        return psnr
+
+    def stops(self, finished: int) -> bool:
+        """Return whether the training ends after so many steps, the last of which was measured."""
+        return False
+
+    def at_end(self) -> None:
+        """Act after the last step, before the final checkpoint."""
+
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        """Reorder per-Gaussian state after Gaussians were added, removed or sorted.
+
+        Args:
+            rows: for each Gaussian after the change, its index before the change, or that of its parent, [M].
+            fresh: which Gaussians are new, [M] bool.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state for a checkpoint: containers, numbers, text and tensors."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a `state_dict`; raise InputError if it is not valid, since a checkpoint is untrusted input."""
+
+    def results(self) -> dict[str, Any]:
+        """Return what the hook adds to the record of the run: fields of `Record`, others join `Record.parts`."""
+        return {}
+
+
+def check_choice_on_val(key: str, what: str, scene: Scene, config: Config) -> None:
+    """Raise InputError if a `what`, such as an iteration, cannot be chosen on val as `train.key` asks."""
+    if not scene.val:
+        raise InputError(f"train.{key}: expected views of val to choose the {what}, {scene.name} has none: "
+                         f"scene.val_every=8 takes every eighth training view")  # fmt: skip
+    if config.scene.eval_split == "val":
+        raise InputError(f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
+                         f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
+
+
+def hook_types() -> list[type[Hook]]:
+    """Return the classes of all hooks, in the order in which they act."""
+    names = sorted(f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__))
+    return [hook for name in (*names, *ELSEWHERE) for hook in _hooks_in(name)]
+
+
+def _hooks_in(module: str) -> Iterator[type[Hook]]:
+    for value in vars(importlib.import_module(module)).values():
+        if isinstance(value, type) and issubclass(value, Hook) and value.__module__ == module:
+            yield value

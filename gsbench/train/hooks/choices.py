@@ -1,0 +1,101 @@
+"""Keep in the checkpoint how a training was chosen on val: among lengths (`train.lengths`) or among models."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from gsbench.config_key import joins, key
+from gsbench.errors import InputError
+from gsbench.train.hooks import Hook, Training, check_choice_on_val
+
+if TYPE_CHECKING:
+    from gsbench.config import Config
+    from gsbench.measure.record import LengthChoice, ModelComparison
+    from gsbench.scenes import Scene
+
+
+@joins("train")
+@dataclass
+class LengthsKey:
+    """The key of this hook."""
+
+    lengths: int | None = key(None, "4: also train 1/2, 1/4, 1/8 of it; keep the best on val", low=2, high=8)
+
+
+@dataclass
+class ChosenOnVal:
+    """The comparisons that led to a training; gsbench.run.lengths and gsbench.run.comparing make them."""
+
+    length: LengthChoice | None = None  # by which `train.lengths` chose this training
+    comparison: ModelComparison | None = None  # by which model=auto chose the model (`effects.compare`)
+
+
+class Choices(Hook):
+    """Keep the choices on val of a training."""
+
+    name = "choices"
+    measures = True
+
+    def __init__(self, training: Training) -> None:
+        """Start without a choice."""
+        super().__init__(training)
+        self.chosen = ChosenOnVal()
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        """Raise InputError if the shortest length has no step, or if models are compared too."""
+        lengths, iterations = lengths_of(config), config.train.iterations
+        if lengths is None:
+            return
+        parts = 1 << (lengths - 1)
+        if iterations < parts:
+            raise InputError(f"train.lengths={lengths}: expected at least {parts} iterations to "
+                             f"halve {lengths - 1} times, got train.iterations={iterations}")  # fmt: skip
+        if config.effects.compare:
+            raise InputError("train.lengths: expected effects.compare=false, which compares models of one length: "
+                             "leave one of the two out")  # fmt: skip
+
+    @classmethod
+    def check_scene(cls, scene: Scene, config: Config) -> None:
+        """Raise InputError if no length can be chosen on val."""
+        if lengths_of(config) is not None:
+            check_choice_on_val("lengths", "length", scene, config)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return both choices."""
+        return asdict(self.chosen)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore both choices."""
+        self.chosen = _parsed(state)
+
+    def results(self) -> dict[str, Any]:
+        """Return the choice among lengths; that among models is a part of `Record.on_demand`."""
+        return {"length_choice": self.chosen.length}
+
+
+def choices_in(state: dict[str, Any]) -> ChosenOnVal:
+    """Return the choices in a training's state, which may come from an untrusted checkpoint.
+
+    Raises:
+        InputError: the state does not hold choices as expected.
+    """
+    hooks = state.get("hooks")
+    return _parsed(hooks.get(Choices.name) if isinstance(hooks, dict) else None)
+
+
+def _parsed(state: object) -> ChosenOnVal:
+    from gsbench.measure.record import LengthChoice, ModelComparison
+    from gsbench.measure.schema import parse
+
+    kinds = {"length": LengthChoice, "comparison": ModelComparison}
+    if not isinstance(state, dict) or state.keys() != kinds.keys():
+        raise InputError("checkpoint: expected the choices on val, got none: start over with resume=false")
+    return ChosenOnVal(**{name: state[name] and parse(kind, state[name], f"checkpoint: {name}")
+                          for name, kind in kinds.items()})  # fmt: skip
+
+
+def lengths_of(config: Config) -> int | None:
+    """Return `train.lengths`."""
+    return cast(LengthsKey, config.train).lengths

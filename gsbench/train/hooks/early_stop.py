@@ -1,0 +1,134 @@
+"""Stop a training whose PSNR on val no longer rises, and end it with its best iteration on val (`train.patience`)."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from gsbench.config_key import joins, key
+from gsbench.errors import InputError
+from gsbench.measure.exact_views import rank
+from gsbench.train.hooks import Hook, Training, check_choice_on_val
+
+if TYPE_CHECKING:
+    from gsbench.config import Config
+    from gsbench.measure.record import Stop
+    from gsbench.scenes import Scene
+
+
+@joins("train")
+@dataclass
+class PatienceKey:
+    """The key of this hook."""
+
+    patience: float | None = key(
+        None, "share of iterations without a better val PSNR that ends a run", low=0.01, high=1
+    )
+
+
+class EarlyStop(Hook):
+    """Stop at the first measurement at which `train.patience` of all iterations have had no better PSNR on val.
+
+    These iterations are counted from the end of densification at the earliest. Of iterations with equal PSNR, the last
+    is kept. Iterations before the final SH degree, before AGR or in a warm-up are not kept, because the state would be
+    shown with parts that it was not trained with.
+    """
+
+    name = "early_stop"
+    measures = True
+
+    def __init__(self, training: Training) -> None:
+        """Start without a kept state."""
+        super().__init__(training)
+        patience = _patience(training.config)
+        self.wait = None if patience is None else max(1, round(patience * training.config.train.iterations))
+        self.stop: Stop | None = None  # of a training that has ended
+        self._best: tuple[int, float] | None = None  # iteration and PSNR on val, dB
+        self._kept: dict[str, Any] | None = None  # the state at that iteration; None if it is the last one
+        self._last = 0  # the last measured iteration
+
+    @classmethod
+    def check(cls, config: Config) -> None:
+        """Raise InputError if another setting chooses how the training ends."""
+        others = {
+            "lengths": "which chooses among whole trainings",
+            "average_from": "whose average ends a training (+recipe=long)",
+        }
+        if _patience(config) is None:
+            return
+        if config.effects.compare:
+            raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not "
+                             "end before they are compared: leave one of the two out")  # fmt: skip
+        for other, why in others.items():
+            if (value := getattr(config.train, other)) is not None:
+                raise InputError(f"train.patience: expected train.{other}=null, {why}, got {value}: leave one of the "
+                                 f"two out")  # fmt: skip
+
+    @classmethod
+    def check_scene(cls, scene: Scene, config: Config) -> None:
+        """Raise InputError if no iteration can be chosen on val."""
+        if _patience(config) is not None:
+            check_choice_on_val("patience", "iteration", scene, config)
+
+    def after_measuring(self, finished: int, psnr: float) -> float:
+        """Keep the state of the training if PSNR on val is the best so far."""
+        training, self._last = self.training, finished
+        iterations = training.config.train.iterations
+        if self.wait is None or not training.schedule.is_complete(finished - 1):
+            return psnr
+        if self._best is None or rank(psnr) >= rank(self._best[1]):
+            self._best = finished, psnr
+            self._kept = None if finished == iterations else copy.deepcopy(training.state_of_gaussians())
+        return psnr
+
+    def stops(self, finished: int) -> bool:
+        """Return whether the best PSNR on val is `train.patience` old."""
+        if self.wait is None or self._best is None:
+            return False
+        return finished - max(self._best[0], self.training.schedule.densify_stop) >= self.wait
+
+    def at_end(self) -> None:
+        """End the training with the Gaussians of the iteration that had the best PSNR on val."""
+        if self.wait is None or self._best is None:
+            return
+        from gsbench.measure.record import Stop
+
+        training, stop = self.training, Stop(self._last, self._best[0])
+        self.stop = stop
+        equal = training.curve.equal_to(stop.kept)
+        if len(equal) > 1:
+            training.report(f"step {stop.iteration}: PSNR on val is equal at {len(equal)} steps, {equal[0].iteration} "
+                            f"to {equal[-1].iteration}: it cannot decide, and the last of them is kept")  # fmt: skip
+        if self._kept is not None:
+            kept, self._kept = self._kept, None
+            now = training.state_dict()
+            training.load_state_dict(now | kept | {"hooks": now["hooks"] | kept["hooks"]})
+            training.report(f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends "
+                            f"with the Gaussians of that step")  # fmt: skip
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the kept state and its PSNR."""
+        stop = None if self.stop is None else asdict(self.stop)
+        return {"best": self._best, "kept": self._kept, "stop": stop}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the kept state, whose parts are checked when it is restored; raise InputError if it is none."""
+        from gsbench.measure.record import Stop
+        from gsbench.measure.schema import parse
+
+        best, self._kept = state["best"], state["kept"]
+        if best is not None and not (len(best) == 2 and isinstance(best[0], int) and isinstance(best[1], float)):
+            raise InputError(f"checkpoint: expected the best iteration and its PSNR, got {best!r:.80}")
+        if self._kept is not None and not isinstance(self._kept["hooks"], dict):
+            raise InputError("checkpoint: expected the state at the best PSNR on val")
+        self._best = None if best is None else (best[0], best[1])
+        self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")
+
+    def results(self) -> dict[str, Any]:
+        """Return when the training stopped, and the iteration that is kept."""
+        return {"stop": self.stop}
+
+
+def _patience(config: Config) -> float | None:
+    return cast(PatienceKey, config.train).patience
