@@ -12,10 +12,10 @@ from benchmarks.scene import SIGMA, VISIBLE, trained
 from benchmarks.stages import MODELS
 from benchmarks.timing import Cost, measure
 from benchmarks.training import training_step
+from gsbench.launch.estimate import span
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit
 from gsbench.report.paper import AVERAGE, PROTOCOLS, paper_row
-from gsbench.sweep.estimate import span
 
 COUNTS = 30_000, 150_000  # Gaussians for which a step is timed
 FIRST = 100_000  # Gaussians at the start, as `data.initial_points`

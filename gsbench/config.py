@@ -162,6 +162,7 @@ class EffectsConfig:
 class LaunchConfig:
     """Launch runs one after the other, in processes (`+launch=parallel`) or as Slurm jobs (`+launch=slurm`)."""
 
+    by: str = key("local", "set by +launch=NAME", choices=("local", "parallel", "slurm"))
     at_once: int = key(-1, "runs at a time; -1: one per CPU (parallel), all (slurm)")
     partition: str | None = key(None, "this and all keys below: Slurm only")
     minutes: int = key(240, "limit of a job; longer runs continue in another", unit="minutes")

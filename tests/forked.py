@@ -27,9 +27,7 @@ IMPORTED = (
     "gsbench.measure.perceptual",
     "gsbench.models.registry",
     "gsbench.run.run",
-    "gsbench.sweep.callbacks",
-    "gsbench.sweep.retry",
-    "gsbench.sweep.task",
+    "gsbench.launch.sweep",
 )
 _servers: list[subprocess.Popen[str]] = []  # one, from the first command on; its input ends with this process
 

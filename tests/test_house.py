@@ -20,7 +20,7 @@ FLOORS = (
     "train report fetch",
     "stability",
     "run",
-    "sweep view",
+    "launch view",
 )
 FLOOR = {folder: i for i, folders in enumerate(FLOORS) for folder in folders.split()}
 LEAST_WORDS = 4
@@ -42,7 +42,6 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/report/page": 72,
     "gsbench/run": 54,
     "gsbench/scenes": 27,
-    "gsbench/sweep": 39,
     "gsbench/train": 29,
     "gsbench/view": 28,
     "tests": 100,
@@ -58,7 +57,6 @@ VAGUE_NAMES: dict[str, int] = {
     "tests/run": 66,
     "tests/scenes": 66,
     "tests/slurm": 13,
-    "tests/sweep": 22,
     "tests/train": 31,
     "tests/view": 55,
 }
@@ -198,7 +196,6 @@ def test_libraries_are_changed_in_known_places() -> None:
     """Catches a module that changes another library, which no file of this list names."""
     found = {name: names for name, tree in GSBENCH.items() if (names := patched(tree))}
     assert found == {
-        "gsbench.sweep.container": {"SlurmExecutor", "SlurmJobEnvironment"},
         "gsbench.view.request_guard": {"websockets_server"},
     }
 

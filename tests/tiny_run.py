@@ -69,24 +69,21 @@ def main_here(*arguments: str) -> int:
     """Run the command line in this process, as if it were a new one; return its exit status."""
     from hydra.core.global_hydra import GlobalHydra
 
-    from gsbench import __main__ as entry
+    from gsbench.__main__ import run_command
+    from gsbench.run.stop import SIGNALS
 
-    argv, handler = sys.argv, signal.getsignal(signal.SIGTERM)
+    argv, handlers = sys.argv, {number: signal.getsignal(number) for number in SIGNALS}
     GlobalHydra.instance().clear()
-    entry._problems.clear()  # a test may have called `do` itself
-    entry.started.clear()
     sys.argv = ["gsbench", *arguments]
     try:
-        entry.run_command()
+        return run_command([*arguments])
     except SystemExit as end:
         return int(end.code or 0)
     finally:
         sys.argv = argv
-        signal.signal(signal.SIGTERM, handler)
-        entry._problems.clear()
-        entry.started.clear()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         GlobalHydra.instance().clear()
-    return 0
 
 
 def run_here(*words: str) -> tuple["Record", Path]:

@@ -1,6 +1,5 @@
 """Train a model: initialise it, continue from a checkpoint if there is one, and stop when a signal asks for it."""
 
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -126,8 +125,6 @@ def fit(
             trainer.run(lambda state: save(state, this, trainer.scene, plain), this.name, goes_on)
             report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
     if request.signal is not None:  # asked here, so that a signal after the last step is not lost
-        if request.signal == signal.SIGUSR2:  # submitit's handler puts the job back into the queue, and ends it
-            request.hand_on(request.signal)
         raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
                                            f"the same command continues from there")  # fmt: skip
     _check_fitted(trainer)

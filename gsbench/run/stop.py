@@ -10,8 +10,7 @@ from typing import Any
 
 from gsbench.errors import one_line
 
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that ask the process to end
-SIGNALS = (*ENDING, signal.SIGUSR2)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR2)  # Slurm sends the last before a time limit
 # Seconds after a signal in which others count as the same request. A terminal, `timeout`, systemd and the first process
 # of a sweep each signal a process that may have got the signal already.
 SAME_REQUEST = 2.0
@@ -29,7 +28,7 @@ class Stopped(BaseException):  # like KeyboardInterrupt, so that `except Excepti
 
 def listen() -> None:
     """Let signals that ask the process to end raise Stopped, except those that it ignores, such as after `nohup`."""
-    for number in ENDING:
+    for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, stop_at_once)
 
@@ -62,16 +61,12 @@ class Request:
             _is_new()
             self.signal = number
         elif time.monotonic() - _asked >= SAME_REQUEST:  # the earlier handler usually ends the process
-            self.hand_on(number, frame)
-
-    def hand_on(self, number: int, frame: FrameType | None = None) -> None:
-        """Call the signal handler that was installed before; submitit's handler requeues a Slurm job at SIGUSR2."""
-        before = self._before.get(number)
-        if callable(before):
-            before(number, frame)
-        elif before == signal.SIG_DFL:
-            signal.signal(number, signal.SIG_DFL)
-            signal.raise_signal(number)
+            before = self._before.get(number)
+            if callable(before):
+                before(number, frame)
+            elif before == signal.SIG_DFL:
+                signal.signal(number, signal.SIG_DFL)
+                signal.raise_signal(number)
 
 
 @contextmanager
@@ -90,13 +85,12 @@ def requested() -> Iterator[Request]:
         return
     for number in SIGNALS:
         before = signal.getsignal(number)
-        if before == signal.SIG_IGN or (number == signal.SIGUSR2 and before == signal.SIG_DFL):
-            continue  # background processes ignore SIGINT; SIGUSR2 matters only if submitit has a handler
-        request._before[number] = signal.signal(number, request._ask)
+        if before != signal.SIG_IGN:  # background processes ignore SIGINT
+            request._before[number] = signal.signal(number, request._ask)
     try:
         yield request
     except Exception as error:
-        if request.signal not in ENDING:
+        if request.signal is None:
             raise
         raise Stopped(request.signal, f"stopped by {signal.Signals(request.signal).name}: {one_line(error)}") from error
     finally:

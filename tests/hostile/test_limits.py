@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
+from gsbench.launch.estimate import span
 from gsbench.measure import atomic, record
 from gsbench.process import memory
 from gsbench.report import study
-from gsbench.sweep.estimate import span
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 

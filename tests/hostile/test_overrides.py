@@ -17,17 +17,17 @@ from types import FrameType
 import hydra
 import pytest
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tiny_run import overrides, write_moving_square
 
 from gsbench.config import CONF, register_schema
 from gsbench.config_roles import flat
 from gsbench.errors import InputError
+from gsbench.launch.command import compose_run, parse, runs_of
 from gsbench.measure import record
 from gsbench.run import claim
 from gsbench.run.run import run
-from gsbench.sweep.axes import expand
 from gsbench.train import checkpoint
 
 SAMPLE, ALL = 30, 700
@@ -81,8 +81,8 @@ def end(words: list[str], square: Path, results: Path) -> str:
     base = overrides(square, results, f"model={model.split()[0]}", *model.split()[1:], "train.curve_points=1")
     base = ["train.iterations=3" if word == "train.iterations=30" else word for word in base]
     try:
-        composed: DictConfig = hydra.compose("config", [w for w in expand([*base, *words]) if w != "--multirun"])
-        composed.results = str(results)
+        (run_words, *_), _ = runs_of(parse([*base, *words]))
+        composed = compose_run([*run_words, f"results={results}"]).config
         done = run(composed)
     except (InputError, HydraException, OmegaConfBaseException):
         return "refused"

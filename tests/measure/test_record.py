@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from tiny_run import ROOT
 
 from gsbench.errors import InputError, one_line
+from gsbench.launch import status as launched
 from gsbench.measure import machine
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
@@ -24,7 +25,6 @@ from gsbench.measure.curve import Point
 from gsbench.measure.provenance import git_commit, provenance, versions
 from gsbench.measure.record import METRICS, Cost, Effects, Provenance, Record, ViewScore
 from gsbench.measure.speed import RenderTimes
-from gsbench.sweep import traces
 
 
 def make(**changes: object) -> Record:
@@ -346,7 +346,7 @@ def test_published_records_are_passed_by_unless_they_are_named(tmp_path):
     for folder in (own, ours):
         files.write(make(), folder / files.FILE_NAME)
     assert files.find(tmp_path) == [own / files.FILE_NAME]
-    assert traces.read([tmp_path]).by_path.keys() == {own / files.FILE_NAME}
+    assert launched.read(tmp_path).records_by_path.keys() == {own / files.FILE_NAME}
     for root in (tmp_path / files.PUBLISHED, tmp_path / files.PUBLISHED / "mini"):
         assert files.find(root) == [ours / files.FILE_NAME]
 

@@ -43,7 +43,7 @@ def trains(results: Path, pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGUSR2, 140)])
 def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, square: Path, tmp_path: Path) -> None:
     """Catches the minutes since the last checkpoint lost, a stack trace, and a run that looks as if it still ran."""
     results = tmp_path / "results"
@@ -76,21 +76,19 @@ def test_a_run_that_another_process_does_is_left_to_it(square: Path, tmp_path: P
     third.wait()
 
 
-def test_the_handler_of_before_acts_once_the_run_has_saved() -> None:
-    """Catches a job of Slurm that is not put back into its queue: submitit's handler of SIGUSR2 does that."""
+@pytest.mark.parametrize("number", stop.SIGNALS)
+def test_the_earlier_handler_acts_once_the_run_has_ended(number: int) -> None:
+    """Catches a handler that stays after its run, so that the next signal is noted and nothing ends."""
     called = []
-    before = signal.signal(signal.SIGUSR2, lambda number, _: called.append(number))
+    before = signal.signal(number, lambda number, _: called.append(number))
     try:
         with stop.requested() as request:
-            os.kill(os.getpid(), signal.SIGUSR2)
-            assert request.signal == signal.SIGUSR2
-            assert not called
-            request.hand_on(signal.SIGUSR2)
-            assert called == [signal.SIGUSR2]
-        os.kill(os.getpid(), signal.SIGUSR2)
-        assert len(called) == 2
+            signal.raise_signal(number)
+            assert (request.signal, called) == (number, [])
+        signal.raise_signal(number)
+        assert called == [number]
     finally:
-        signal.signal(signal.SIGUSR2, before)
+        signal.signal(number, before)
 
 
 def test_a_second_signal_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

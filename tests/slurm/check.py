@@ -4,7 +4,7 @@
 
 A sweep of 2 scenes x 2 models x 2 seeds is done on this machine without Slurm; that is what every number is compared
 with. Then it is done on the Slurm of cluster.py while jobs, nodes, memory, disk and data fail under it. What fails must
-be named by `python -m gsbench.sweep status` with its reason, `... retry` must complete it, and every record that comes
+be named by `python -m gsbench.launch status` with its reason, `... retry` must complete it, and every record that comes
 out must equal the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint's tensors.
 """
 
@@ -54,7 +54,7 @@ class Sweep:
 
     def retry(self, *launch: str) -> None:
         """Put back what broke, and wait for it."""
-        self._start("gsbench.sweep", "retry", str(self.results / "mini"), *launch)
+        self._start("gsbench.launch", "retry", str(self.results / "mini"), *launch)
         self.wait()
 
     def wait(self, seconds: float = 300) -> None:
@@ -62,8 +62,8 @@ class Sweep:
         wait_until(f"{self.log}: the end of the command", lambda: self.command.poll() is not None, seconds)
 
     def status(self) -> list[dict[str, Any]]:
-        """What `python -m gsbench.sweep status` says of each run."""
-        done = self._run("gsbench.sweep", "status", str(self.results / "mini"), "--json")
+        """What `python -m gsbench.launch status` says of each run."""
+        done = self._run("gsbench.launch", "status", str(self.results / "mini"), "--json")
         return json.loads(done.stdout) if done.stdout else []
 
     def states(self) -> list[str]:
@@ -197,7 +197,7 @@ def time_limit(check: Check) -> None:
         begin = time.monotonic()
         sweep = check.sweep(name.replace(" ", "_"), *long, "launch.minutes=2", "launch.signal_seconds=60", *launch)
         sweep.wait(600)
-        log = "".join(path.read_text() for path in sweep.results.rglob("*_log.err"))
+        log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
         check.say(name, "saved and requeued at Slurm's signal", "continues from step" in log,
                   f"{log.count('continues from step')} times", begin)  # fmt: skip
         check.completed(name, sweep, 1, begin)

@@ -3,8 +3,7 @@
     apt-get install --no-install-recommends slurm-wlm slurmdbd munge mariadb-server
 
 Nothing of the machine's own configuration is read or written, and every daemon that was started is stopped at the end.
-Accounting (slurmdbd with MariaDB) is what real clusters have: without it, submitit waits for ever for a job whose
-process was killed, and nobody can say why a job ended.
+Accounting (slurmdbd with MariaDB) is what real clusters have: without it, nobody can say why a job ended.
 """
 
 import contextlib

@@ -6,10 +6,10 @@ from pathlib import Path
 import crowd
 import pytest
 
-from gsbench.sweep import estimate
-from gsbench.sweep.__main__ import main
-from gsbench.sweep.estimate import lines, span
-from gsbench.sweep.status import RunStatus
+from gsbench.launch import estimate
+from gsbench.launch.__main__ import main
+from gsbench.launch.estimate import lines, span
+from gsbench.launch.status import RunStatus
 
 
 def words(model: str, scene: str, seed: int) -> list[str]:
@@ -44,28 +44,28 @@ def runs(tmp_path: Path) -> list[RunStatus]:
 
 def test_a_run_takes_what_its_like_took(runs: list[RunStatus]) -> None:
     """Catches another model, machine or scene that counts where a seed does, and a resumed run that counts in full."""
-    found = estimate.estimate(runs)
-    assert [(run.seconds, run.least, run.most, run.compared, run.differ) for run in found.runs] == [
+    estimated = estimate.estimate(runs)
+    assert [(run.seconds, run.least, run.most, run.compared, run.differ) for run in estimated.runs] == [
         (5400.0, 3600.0, 7200.0, 2, "seed"),
         (5400.0, 3600.0, 7200.0, 2, "seed and scene"),
         (None, None, None, 0, None),
         (1800.0, 1800.0, 1800.0, 0, None),
         (1350.0, 900.0, 1800.0, 2, "seed"),
     ]
-    assert found.done == 3
-    assert found.machine is not None
-    assert found.machine.startswith("EPYC")
-    assert found.hours() == (5400 + 5400 + 1800 + 1350) / 3600
-    assert found.hours(2) == pytest.approx(1.5 + 0.5)
+    assert estimated.done == 3
+    assert estimated.machine is not None
+    assert estimated.machine.startswith("EPYC")
+    assert estimated.hours() == (5400 + 5400 + 1800 + 1350) / 3600
+    assert estimated.hours(2) == pytest.approx(1.5 + 0.5)
 
 
 def test_the_lines_say_by_what_and_what_is_not_known(runs: list[RunStatus]) -> None:
     """Catches hours that leave out runs without a word, or that look exact."""
-    said = lines(estimate.estimate(runs), 2)
-    assert said[0] == "5 of 8 runs are not done"
-    assert "2 by runs that differ in seed, 1 by runs that differ in seed and scene, 1 by their own rate" in said[1]
-    assert said[2].startswith("2 hours of training, 2 at a time (1.5 to 2.5 if each takes as long as the fastest or")
-    assert "1 (+exp=crowd model=4dgs scene=lego seed=0)" in said[3]
+    text = lines(estimate.estimate(runs), 2)
+    assert text[0] == "5 of 8 runs are not done"
+    assert "2 by runs that differ in seed, 1 by runs that differ in seed and scene, 1 by their own rate" in text[1]
+    assert text[2].startswith("2 hours of training, 2 at a time (1.5 to 2.5 if each takes as long as the fastest or")
+    assert "1 (+exp=crowd model=4dgs scene=lego seed=0)" in text[3]
     nothing = lines(estimate.estimate(runs[5:6]), 1)
     assert len(nothing) == 2
     assert "hours" not in nothing[1]
@@ -81,9 +81,9 @@ def test_the_command_reads_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture
     """Catches an estimate that no folder of results gives, and a number at once that divides by zero."""
     experiment = crowd.write(51, tmp_path)
     assert main(["estimate", str(experiment), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["done"] == 49
-    assert {run["differ"] for run in found["runs"]} == {"seed"}
+    estimated = json.loads(capsys.readouterr().out)
+    assert estimated["done"] == 49
+    assert {run["differ"] for run in estimated["runs"]} == {"seed"}
     assert main(["estimate", str(experiment)]) == 0
     assert "2 of 51 runs are not done" in capsys.readouterr().out
     assert main(["estimate", str(experiment), "--at-once", "0"]) == 2

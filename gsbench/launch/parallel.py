@@ -1,4 +1,4 @@
-"""Start the runs of a sweep in parallel processes of this machine, a process for each run (`+launch=parallel`).
+"""Do the runs of a sweep in parallel processes of this machine, a process for each run (`+launch=parallel`).
 
 A process is a fork of one that has imported torch and computed nothing: a run does not wait for imports, and there are
 no threads that a fork would lose. If one dies, for example because memory ran out, the others go on. A signal to any of
@@ -11,94 +11,84 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-
 from gsbench.errors import InputError, printable
+from gsbench.launch.command import RunConfig
+from gsbench.launch.task import do_planned
 from gsbench.process.memory import is_out_of_memory, too_little_address_space
 from gsbench.run import stop
 from gsbench.run.stop import Request, Stopped
-from gsbench.sweep.callbacks import is_parallel, write_outcome
-from gsbench.sweep.task import Problem, do
 
 POLL = 0.2  # seconds between two looks for a signal, and of a run's process for its parent
-_running: dict[BaseProcess, str] = {}  # the processes of runs, and the overrides of each
+Running = dict[BaseProcess, str]  # the processes of runs, and the overrides of each
 
 
-def do_or_start(composed: DictConfig) -> Problem | None:
-    """Do a run here, or start a process that does it; return the problem, if any, of a run that was done here.
-
-    With `+launch=parallel`, this waits until fewer than `launch.at_once` processes run.
+def launch(configs: Sequence[RunConfig], folder: Path) -> None:
+    """Do the runs of the plan in `folder`, at most `launch.at_once` at a time.
 
     Raises:
         InputError: `launch.at_once` is invalid.
-        Stopped: a signal asked this process, or that of another run, to end.
+        Stopped: a signal asked this process, or that of a run, to end; all processes have ended.
     """
-    if not is_parallel(HydraConfig.get()):
-        return do(composed)
-    at_once, cpus = composed.launch.at_once, len(os.sched_getaffinity(0))
+    at_once, cpus = configs[0].config.launch.at_once, len(os.sched_getaffinity(0))
     if at_once != -1 and at_once < 1:
         raise InputError(f"launch.at_once: expected at least 1, or -1 for one run for each CPU, got {at_once}")
     most = cpus if at_once == -1 else at_once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cpus // most)))
     _import_torch()
-    with stop.requested() as request:
-        _wait(most - 1, request)
-        if request.signal is None:
-            process = get_context("fork").Process(target=_work, args=(composed, request, os.getpid(), most))
-            process.start()
-            _running[process] = " ".join(HydraConfig.get().overrides.task)
-    if request.signal is not None:
-        raise Stopped(request.signal)
-    return None
-
-
-def wait() -> None:
-    """Wait until all processes have ended.
-
-    Raises:
-        Stopped: a signal asked this process or that of a run to end.
-    """
-    with stop.requested() as request:
-        _wait(0, request)
-    if request.signal is not None:
-        raise Stopped(request.signal)
-
-
-def end(number: int) -> None:
-    """Send a signal to all processes and wait for their end; a second signal to this process is sent to them too."""
-    for process in _running:
-        if process.is_alive() and process.pid is not None:
-            os.kill(process.pid, number)
+    running: Running = {}
     try:
-        while _running:
-            _running.popitem()[0].join()
-    except Stopped as again:
-        end(again.number)
+        with stop.requested() as request:
+            for number, config in enumerate(configs):
+                _wait(running, most - 1, request)
+                if request.signal is None:
+                    arguments = (config, folder, number, request, os.getpid(), most)
+                    process = get_context("fork").Process(target=_work, args=arguments)
+                    process.start()
+                    running[process] = " ".join(config.overrides)
+            _wait(running, 0, request)
+        if request.signal is not None:
+            raise Stopped(request.signal)
+    except Stopped as stopped:
+        _end(running, stopped.number)
+        raise
 
 
-def _wait(most: int, request: Request) -> None:
+def _wait(running: Running, most: int, request: Request) -> None:
     """Wait until at most `most` processes run, or until a signal asks this process or one of them to end."""
-    while len(_running) > most and request.signal is None:
-        ended = connection.wait([process.sentinel for process in _running], POLL)
-        for process in [process for process in _running if process.sentinel in ended]:
+    while len(running) > most and request.signal is None:
+        ended = connection.wait([process.sentinel for process in running], POLL)
+        for process in [process for process in running if process.sentinel in ended]:
             process.join()
-            _tell_end(process.exitcode or 0, _running.pop(process), request)
+            _report_end(process.exitcode or 0, running.pop(process), request)
 
 
-def _tell_end(code: int, overrides: str, request: Request) -> None:
+def _report_end(code: int, overrides: str, request: Request) -> None:
     """Print how a process ended if it was killed; if a signal asked it to end, ask this process to end too."""
     number = -code if code < 0 else code - 128
-    if number in stop.ENDING:
+    if number in stop.SIGNALS:
         request.signal = request.signal or number
     elif code < 0:
         why = " (memory may have run out)" if number == signal.SIGKILL else ""
         print(f"\ngsbench: error: {printable(overrides)}: its process was ended by {signal.Signals(number).name}{why}: "
               "the same command continues from its last checkpoint", file=sys.stderr)  # fmt: skip
+
+
+def _end(running: Running, number: int) -> None:
+    """Send a signal to all processes and wait for their end; a second signal to this process is sent to them too."""
+    for process in running:
+        if process.is_alive() and process.pid is not None:
+            os.kill(process.pid, number)
+    try:
+        for process in list(running):
+            process.join()
+            del running[process]
+    except Stopped as again:
+        _end(running, again.number)
 
 
 def _import_torch() -> None:
@@ -112,9 +102,8 @@ def _import_torch() -> None:
             raise
 
 
-def _work(composed: DictConfig, request: Request, parent: int, at_once: int) -> None:
-    """Do one of `at_once` runs in its process; `request` tells of a signal that came before the process listens."""
-    began = time.time()
+def _work(config: RunConfig, folder: Path, number: int, request: Request, parent: int, at_once: int) -> None:
+    """Do a run in its process; `request` tells of a signal that came before the process listens."""
     with contextlib.suppress(OSError):  # the kernel kills a run if memory runs out, not the parent, which reports it
         Path("/proc/self/oom_score_adj").write_text("500")
     threading.Thread(target=_end_with, args=(parent,), name="gsbench-parent", daemon=True).start()
@@ -122,7 +111,7 @@ def _work(composed: DictConfig, request: Request, parent: int, at_once: int) -> 
         stop.listen()
         if request.signal is not None:
             raise Stopped(request.signal)
-        write_outcome(HydraConfig.get(), composed, do(composed), began, at_once)
+        do_planned(config, folder, number, at_once)
     except Stopped as stopped:
         print(f"gsbench: {stopped}", file=sys.stderr)
         sys.exit(stopped.code)

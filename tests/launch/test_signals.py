@@ -12,8 +12,8 @@ from forked import Forked
 from interrupted import assert_same_bits, bits
 from tiny_run import gsbench, main_here, overrides, write_moving_square
 
+from gsbench.launch import plan, status
 from gsbench.run import progress
-from gsbench.sweep import plan, status
 from gsbench.train import checkpoint
 
 RUNS = 3
@@ -46,8 +46,8 @@ def wait_for(count: int, results: Path, sweep: Forked) -> list[int]:
     while time.monotonic() < deadline:
         assert sweep.poll() is None, sweep.err
         try:
-            if len(found := workers(results, sweep.pid)) == count:
-                return found
+            if len(pids := workers(results, sweep.pid)) == count:
+                return pids
         except ValueError:  # a file was replaced or removed just now
             pass
         time.sleep(0.02)
@@ -73,12 +73,12 @@ def test_a_signal_lets_each_run_save_and_no_other_begins(
     assert not any(Path(f"/proc/{pid}").exists() for pid in running)
     assert "Traceback" not in sweep.err
     assert f"gsbench: stopped by {number.name}" in sweep.err.splitlines()
-    found = states(tmp_path)
-    assert sorted(run.state for run in found) == ["not started", "stopped", "stopped"]
+    runs = states(tmp_path)
+    assert sorted(run.state for run in runs) == ["not started", "stopped", "stopped"]
     saved = {checkpoint.read(path).state["step"] for path in tmp_path.rglob("checkpoint.pt")}
-    assert saved == {run.step for run in found if run.state == "stopped"}
+    assert saved == {run.step for run in runs if run.state == "stopped"}
     assert {int(step) for step in re.findall(r"stopped at step (\d+), saved in", sweep.err)} == saved
-    assert {run.reason for run in found} == {
+    assert {run.reason for run in runs} == {
         None, *(f"stopped at step {step} of 100000: the same command continues" for step in saved)
     }  # fmt: skip
 
@@ -114,10 +114,10 @@ def test_a_stopped_run_is_listed_until_it_goes_on(square: Path, tmp_path: Path) 
     wait_for_training(tmp_path)
     process.send_signal(signal.SIGTERM)
     assert process.wait() == 143, process.err
-    assert [one.state for one in states(tmp_path)] == ["stopped"]
+    assert [run.state for run in states(tmp_path)] == ["stopped"]
     process = Forked(tmp_path, "gsbench", *run)
     wait_for_training(tmp_path)
-    assert [one.state for one in states(tmp_path)] == ["running"]
+    assert [run.state for run in states(tmp_path)] == ["running"]
     assert not list(tmp_path.rglob(progress.STOPPED))
     process.send_signal(signal.SIGKILL)
     process.wait()

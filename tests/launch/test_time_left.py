@@ -6,15 +6,14 @@ from pathlib import Path
 import pytest
 from tiny_run import gsbench, overrides, write_moving_square
 
-from gsbench.sweep import plan
-from gsbench.sweep.callbacks import time_left
-from gsbench.sweep.plan import Ended, Plan
+from gsbench.launch import plan
+from gsbench.launch.plan import Ended, Plan, time_left
 
 
 def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -> None:
     """Catches runs that were kept and count as trained in no time, runs that failed and are waited for, runs at once
     that are added up, and a line that divides by nothing."""
-    plan.write(Plan("joblib", [[f"seed={i}"] for i in range(10)], [], ".", "here", 1, None, 0.0), tmp_path)
+    plan.write(Plan("local", [[f"seed={i}"] for i in range(10)]), tmp_path)
     assert time_left(tmp_path, 2) == ""
     plan.write_ended(tmp_path, 0, Ended("record.json", None))  # kept
     assert time_left(tmp_path, 2) == ""

@@ -13,14 +13,13 @@ import crowd
 import pytest
 from tiny_run import ROOT
 
+from gsbench.launch import plan, status
+from gsbench.launch.__main__ import lines, main
+from gsbench.launch.plan import Ended, Plan
+from gsbench.launch.queue import Queue
+from gsbench.launch.status import RunStatus
 from gsbench.run import progress
 from gsbench.run.progress import Progress, born
-from gsbench.sweep import plan, status
-from gsbench.sweep.__main__ import lines, main
-from gsbench.sweep.finish import see_through
-from gsbench.sweep.plan import Ended, Plan
-from gsbench.sweep.slurm import Queue
-from gsbench.sweep.status import RunStatus
 
 RUN = ("7dgs", "lego", 0)
 WORDS = crowd.overrides(*RUN)
@@ -31,9 +30,9 @@ FIRST, SECOND = "2026-11-22_00-00-00.000000", "2026-11-22_00-00-01.000000"
 
 def planned(experiment: Path, name: str = FIRST, **of: object) -> Path:
     """Write the plan of one run, launched by this process unless told otherwise, and return its folder."""
-    one = Plan("basic", [[*WORDS, "results=somewhere"]], [], "/", **HERE, started=time.time())  # type: ignore[arg-type]
+    one_run = Plan("local", [[*WORDS, "results=somewhere"]])
     folder = experiment / plan.FOLDER / name
-    plan.write(dataclasses.replace(one, **of), folder)  # type: ignore[arg-type]
+    plan.write(dataclasses.replace(one_run, **of), folder)  # type: ignore[arg-type]
     return folder
 
 
@@ -115,8 +114,7 @@ def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
 )
 def test_slurm_decides_about_its_jobs(tmp_path: Path, states: dict[str, str], state: str, reason: str | None) -> None:
     """Catches a requeued job that is taken for running, and a job that Slurm forgot for anything but lost."""
-    (planned(tmp_path) / plan.JOBS / "7_0").mkdir(parents=True)
-    (tmp_path / plan.FOLDER / FIRST / plan.JOBS / "7").mkdir()  # submitit's folder of the array
+    planned(tmp_path, job="7")
     trains(tmp_path, job="7_0", **GONE)
     run = only(tmp_path, Queue(states))
     assert run.state == state
@@ -124,35 +122,31 @@ def test_slurm_decides_about_its_jobs(tmp_path: Path, states: dict[str, str], st
     assert reason is None or reason in str(run.reason)
 
 
-@pytest.mark.parametrize(("folders", "job"), [(["7"], "7"), (["7", "7_0"], "7_0")])
-def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path, folders: list[str], job: str) -> None:
-    """Catches a submitted run that is planned for ever after its job was cancelled, and an array taken for its task."""
-    for name in folders:
-        (planned(tmp_path) / plan.JOBS / name).mkdir(parents=True)
-    assert only(tmp_path, Queue({job: "PENDING Priority"})).state == "queued"
+def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path) -> None:
+    """Catches a submitted run that is planned for ever after its job was cancelled."""
+    planned(tmp_path, job="7")
+    assert only(tmp_path, Queue({"7_0": "PENDING Priority"})).state == "queued"
     run = only(tmp_path, Queue({}))
-    assert (run.state, run.job) == ("lost", job)
+    assert (run.state, run.job) == ("lost", "7_0")
     assert "never started" in str(run.reason)
 
 
 def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
     """Catches runs that are lost because squeue did not answer."""
-    (planned(tmp_path) / plan.JOBS / "7").mkdir(parents=True)
+    planned(tmp_path, job="7")
     down = Queue({}, "squeue is not on this machine")
     assert only(tmp_path, down).state == "planned"
-    trains(tmp_path, job="7")
+    trains(tmp_path, job="7_0")
     run = only(tmp_path, down)
     assert run.state == "running"
-    assert "squeue is not on this machine" in "\n".join(lines(tmp_path, [run], down.silent))
+    assert "squeue is not on this machine" in "\n".join(lines(status.Experiment(tmp_path, queue=down), [run]))
 
 
 def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> None:
     """Catches a full disk that is named nowhere: the note of the run's end still fitted, its record did not."""
-    folder = planned(tmp_path)
-    job = folder / plan.JOBS / "7"
-    job.mkdir(parents=True)
-    (job / "7_0_log.err").write_text("step 5\ngsbench: error: its record cannot be written: No space left on device\n")
-    plan.write_ended(folder, 0, plan.Ended(None, "it ended without a record"))
+    folder = planned(tmp_path, job="7")
+    plan.log_of(folder, 0).write_text("step 5\ngsbench: error: its record cannot be written: No space left on device\n")
+    plan.write_ended(folder, 0, Ended(None, "it ended without a record"))
     run = only(tmp_path, Queue({}))
     assert run.state == "failed"
     assert "it ended without a record; its log ends: gsbench: error: its record" in str(run.reason)
@@ -160,35 +154,33 @@ def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("job", "step", "log", "said"),
+    ("job", "step", "log", "reason"),
     [
         (
             "FAILED|9:0", "OUT_OF_MEMORY|0:125",
             ["step 5", "slurmstepd: error: Detected 1 oom_kill event", "srun: error: n1: task 0: Killed"],
-            "job 7 ended: OUT_OF_MEMORY; its log ends: slurmstepd: error: Detected 1 oom_kill event",
+            "job 7_0 ended: OUT_OF_MEMORY; its log ends: slurmstepd: error: Detected 1 oom_kill event",
         ),
         ("FAILED|1:0", "COMPLETED|0:0", ["bar 50 %| gsbench: error: no such file", "bye"],
-         "job 7 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file"),
-        ("TIMEOUT|0:0", "CANCELLED|0:15", ["step 5", "step 6"], "job 7 ended: TIMEOUT; its log ends: step 6"),
+         "job 7_0 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file"),
+        ("TIMEOUT|0:0", "CANCELLED|0:15", ["step 5", "step 6"], "job 7_0 ended: TIMEOUT; its log ends: step 6"),
     ],
     ids=["memory", "error", "time"],
 )  # fmt: skip
 def test_a_lost_job_says_how_it_ended(
-    job: str, step: str, log: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    job: str, step: str, log: list[str], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches memory that ran out told as a kill, as only the step of a job knows of it, and a log's last line."""
     bin_of_slurm = tmp_path / "bin"
     bin_of_slurm.mkdir()
     sacct = bin_of_slurm / "sacct"
-    sacct.write_text(f"#!/bin/sh\nprintf '7|{job}\\n7.batch|{step}\\n8|COMPLETED|0:0\\n'\n")
+    sacct.write_text(f"#!/bin/sh\nprintf '7_0|{job}\\n7_0.batch|{step}\\n7_1|COMPLETED|0:0\\n'\n")
     sacct.chmod(0o755)
     monkeypatch.setenv("PATH", f"{bin_of_slurm}:{os.environ['PATH']}")
-    folder = planned(tmp_path / "crowd") / plan.JOBS / "7"
-    folder.mkdir(parents=True)
-    (folder / "7_0_log.err").write_text("\n".join(log))
+    plan.log_of(planned(tmp_path / "crowd", job="7"), 0).write_text("\n".join(log))
     run = only(tmp_path / "crowd", Queue({}))
     assert run.state == "lost"
-    assert said in str(run.reason)
+    assert reason in str(run.reason)
 
 
 def test_a_run_that_never_started_is_lost_with_its_sweep(tmp_path: Path) -> None:
@@ -244,8 +236,8 @@ def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
     other = tmp_path / "lego" / "7dgs" / "seed1"
     other.mkdir(parents=True)
     progress.write(other, Progress(crowd.overrides("7dgs", "lego", 1), **of, steps=400))  # type: ignore[arg-type]
-    found = {run.overrides[-1]: run.state for run in status.status(status.read(tmp_path))}
-    assert found == {"seed=0": "planned", "seed=1": state}
+    states = {run.overrides[-1]: run.state for run in status.status(status.read(tmp_path))}
+    assert states == {"seed=0": "planned", "seed=1": state}
 
 
 def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,7 +253,7 @@ def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize(
-    ("log", "told"),
+    ("log", "cause"),
     [
         ("/opt/python: Permission denied\nsrun: error: n1: task 0: Exited with exit code 13\n",
          "/opt/python: Permission denied"),
@@ -271,14 +263,14 @@ def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixtur
         ("", "(empty)"),
     ],
 )  # fmt: skip
-def test_a_log_is_quoted_where_it_names_the_cause(log: str, told: str, tmp_path: Path) -> None:
+def test_a_log_is_quoted_where_it_names_the_cause(log: str, cause: str, tmp_path: Path) -> None:
     """Catches `exit code 13` alone for a job whose log says in its first line that Python may not be run."""
     path = tmp_path / "7_0_log.err"
     path.write_text(log)
-    assert status._told(path) == told
+    assert status.cause_in(path) == cause
     path.unlink()
     os.mkfifo(path)
-    assert status._told(path) == "(no log)"
+    assert status.cause_in(path) == "(no log)"
 
 
 def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
@@ -286,20 +278,6 @@ def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
     plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
     run = only(tmp_path)
     assert (run.state, run.reason) == ("failed", "seed: expected >= 0, got -1")
-
-
-def test_a_sweep_ends_with_its_own_runs(tmp_path: Path) -> None:
-    """Catches a sweep that ends badly because of a run of another sweep in the same folder of results."""
-    plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
-    words = crowd.overrides("3dgs", "trex", 1)
-    later = planned(tmp_path, SECOND, runs=[words])
-    path = tmp_path / "trex" / "3dgs" / "seed1" / "record.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(crowd.record("3dgs", "trex", 1), default=str))
-    assert len(status.status(status.read(tmp_path))) == 2
-    assert see_through(lambda: None, [later]) == ([], False)
-    (broken,), _ = see_through(lambda: None, [tmp_path / plan.FOLDER / FIRST])
-    assert broken.reason == "seed: expected >= 0, got -1"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0"])
@@ -312,22 +290,21 @@ def test_a_damaged_record_is_named(tmp_path: Path, text: str) -> None:
     assert str(path) in str(run.reason)
 
 
-def test_old_records_are_done(tmp_path: Path) -> None:
-    """Catches records from before overrides were kept that are dropped, or taken for one another."""
-    for seed in (0, 1):
-        path = tmp_path / "lego" / "7dgs" / f"seed{seed}" / "record.json"
-        path.parent.mkdir(parents=True)
-        plain = crowd.record("7dgs", "lego", seed)
-        del plain["overrides"]
-        path.write_text(json.dumps(plain, default=str))
-    assert [run.state for run in status.status(status.read(tmp_path))] == ["done", "done"]
+def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
+    """Catches a plan of another version that stops the status of all runs, or that is left out in silence."""
+    (planned(tmp_path) / plan.FILE_NAME).write_text('{"launcher": "basic"}')
+    recorded(tmp_path)
+    experiment = status.read(tmp_path)
+    (run,) = status.status(experiment)
+    assert run.state == "done"
+    assert f"a plan is left out: {tmp_path}" in lines(experiment, [run])[1]
 
 
 def test_only_what_differs_names_a_run() -> None:
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
     runs = [RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
             for seed, state in enumerate(["done", "failed", "done"])]  # fmt: skip
-    assert lines(Path("results/crowd"), runs) == [
+    assert lines(status.Experiment(Path("results/crowd")), runs) == [
         "results/crowd: 3 runs: 2 done, 1 failed", "  failed   seed=1  why",
     ]  # fmt: skip
 
@@ -337,7 +314,7 @@ def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path)
     experiment = crowd.write(500, tmp_path)
     code = (
         "import sys, time\n"
-        "from gsbench.sweep.__main__ import main\n"
+        "from gsbench.launch.__main__ import main\n"
         "code = main(sys.argv[1:])\n"
         "assert time.process_time() < 3, time.process_time()\n"
         "assert not {'torch', 'hydra', 'pandas'} & sys.modules.keys()\n"

@@ -6,19 +6,20 @@ is estimated. Loading, measuring and pictures are not counted, as a record does 
 """
 
 import heapq
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
 from gsbench.errors import InputError, printable
+from gsbench.launch.status import RunStatus
 from gsbench.measure import record as records
-from gsbench.sweep.status import RunStatus
 
-SEED, SCENE = ("seed=",), ("seed=", "scene=", "scene.name=")  # overrides that may differ
+# Overrides that may differ between a run and the finished runs it is compared with, the nearest comparison first.
+DIFFERENCES = {"seed": ("seed=",), "seed and scene": ("seed=", "scene=", "scene.name=")}
+OWN_RATE = "their own rate"
 MOST_NAMED = 3
-Finished = dict[tuple[str, ...], list[float]]  # seconds of training, by the overrides without those that may differ
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class RunEstimate:
     least: float | None
     most: float | None
     compared: int  # number of comparable runs
-    differ: str | None  # in what they may differ: "seed", "seed and scene"; None if there are none
+    differ: str | None  # in what they may differ, a key of DIFFERENCES; None if there are none
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Estimate:
     done: int
     runs: list[RunEstimate]
 
-    def hours(self, at_once: int = 1, of: str = "seconds") -> float:
+    def hours(self, at_once: int = 1, quantity: str = "seconds") -> float:
         """Return the hours until all runs with an estimate are done, if `at_once` train at a time, the longest first.
 
         Args:
             at_once: the number of runs at a time, each as fast as the finished ones.
-            of: `seconds`, `least` or `most`.
+            quantity: `seconds`, `least` or `most`.
         """
-        known = [value for run in self.runs if (value := getattr(run, of)) is not None]
+        known = [value for run in self.runs if (value := getattr(run, quantity)) is not None]
         return span(known, at_once) / 3600
 
 
@@ -57,18 +58,17 @@ def estimate(runs: Sequence[RunStatus]) -> Estimate:
 
     Only finished runs of one machine count: that of most of them.
     """
-    read = [(run.overrides, *found) for run in runs if run.state == "done" and (found := _of_record(run))]
-    machine = Counter(machine for _, machine, _ in read).most_common(1)[0][0] if read else None
-    finished: dict[tuple[str, ...], Finished] = {SEED: {}, SCENE: {}}
-    for overrides, on, took in read:
-        for differing, seconds in finished.items():
-            if on == machine:
-                seconds.setdefault(_without(overrides, differing), []).append(took)
-    left = [_left(run, finished) for run in runs if run.state != "done"]
+    costs = [(run.overrides, *cost) for run in runs if run.state == "done" and (cost := _cost(run))]
+    machine = Counter(machine for _, machine, _ in costs).most_common(1)[0][0] if costs else None
+    durations: dict[tuple[str, ...], list[float]] = defaultdict(list)  # by the overrides that may not differ
+    for overrides, on, seconds in costs:
+        for prefixes in DIFFERENCES.values() if on == machine else ():
+            durations[_without(overrides, prefixes)].append(seconds)
+    left = [_left(run, durations) for run in runs if run.state != "done"]
     return Estimate(machine, sum(run.state == "done" for run in runs), left)
 
 
-def _of_record(run: RunStatus) -> tuple[str, float] | None:
+def _cost(run: RunStatus) -> tuple[str, float] | None:
     """Return the machine and the seconds of training of a finished run; None if its record cannot be read."""
     try:
         record = records.read(Path(run.record or ""))
@@ -77,49 +77,45 @@ def _of_record(run: RunStatus) -> tuple[str, float] | None:
     return (record.provenance.machine, record.cost.train_s) if record.cost else None
 
 
-def _left(run: RunStatus, finished: dict[tuple[str, ...], Finished]) -> RunEstimate:
+def _left(run: RunStatus, durations: dict[tuple[str, ...], list[float]]) -> RunEstimate:
     """Estimate what is left of a run, from comparable runs or from its own rate; a lost run continues at its step."""
     share = 1 - run.step / run.steps if run.step and run.steps else 1.0
-    for differing, name in ((SEED, "seed"), (SCENE, "seed and scene")):
-        took = finished[differing].get(_without(run.overrides, differing))
-        if took:
-            rest = [share * one for one in took]
-            return RunEstimate(run.overrides, fmean(rest), min(rest), max(rest), len(rest), name)
-    own = run.seconds_left
-    return RunEstimate(run.overrides, own, own, own, 0, None)
+    for differ, prefixes in DIFFERENCES.items():
+        if seconds := durations.get(_without(run.overrides, prefixes)):
+            rest = [share * duration for duration in seconds]
+            return RunEstimate(run.overrides, fmean(rest), min(rest), max(rest), len(rest), differ)
+    left = run.seconds_left
+    return RunEstimate(run.overrides, left, left, left, 0, None)
 
 
-def _without(overrides: Sequence[str], differing: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(one for one in overrides if not one.startswith(differing))
+def _without(overrides: Sequence[str], prefixes: tuple[str, ...]) -> tuple[str, ...]:
+    return (*prefixes, *(override for override in overrides if not override.startswith(prefixes)))
 
 
 def span(times: Sequence[float], at_once: int) -> float:
     """Return when all runs are done, if `at_once` of them run at a time and the longest begin first."""
     ends = [0.0] * min(at_once, max(1, len(times)))
-    for one in sorted(times, reverse=True):
-        heapq.heapreplace(ends, ends[0] + one)
+    for duration in sorted(times, reverse=True):
+        heapq.heapreplace(ends, ends[0] + duration)
     return max(ends)
 
 
-def lines(found: Estimate, at_once: int) -> list[str]:
+def lines(estimated: Estimate, at_once: int) -> list[str]:
     """Return an estimate as lines of text."""
-    total = len(found.runs) + found.done
-    said = [f"{len(found.runs)} of {total} runs are not done"]
-    unknown = [run for run in found.runs if run.seconds is None]
-    by = Counter(run.differ or "their own rate" for run in found.runs if run.seconds is not None)
-    if by:
-        which = ", ".join(f"{count} by {_source(name)}" for name, count in by.items())
-        said.append(f"estimated: {which}; on {found.machine}")
-        least, most = (found.hours(at_once, of) for of in ("least", "most"))
-        said.append(f"{found.hours(at_once):.2g} hours of training, {at_once} at a time ({least:.2g} to {most:.2g} "
+    total = len(estimated.runs) + estimated.done
+    text = [f"{len(estimated.runs)} of {total} runs are not done"]
+    unknown = [run for run in estimated.runs if run.seconds is None]
+    sources = Counter(run.differ for run in estimated.runs if run.seconds is not None)
+    if sources:
+        which = ", ".join(f"{count} by {f'runs that differ in {differ}' if differ else OWN_RATE}"
+                          for differ, count in sources.items())  # fmt: skip
+        text.append(f"estimated: {which}; on {estimated.machine}")
+        least, most = (estimated.hours(at_once, quantity) for quantity in ("least", "most"))
+        text.append(f"{estimated.hours(at_once):.2g} hours of training, {at_once} at a time ({least:.2g} to {most:.2g} "
                     f"if each takes as long as the fastest or the slowest run it is compared with); loading and "
                     f"measuring are not counted")  # fmt: skip
     if unknown:
         more = f", and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
         named = ", ".join(" ".join(run.overrides) for run in unknown[:MOST_NAMED])
-        said.append(f"not estimated, as no run with the same settings is done: {len(unknown)} ({named}{more})")
-    return list(map(printable, said))
-
-
-def _source(name: str) -> str:
-    return name if name == "their own rate" else f"runs that differ in {name}"
+        text.append(f"not estimated, as no run with the same settings is done: {len(unknown)} ({named}{more})")
+    return list(map(printable, text))

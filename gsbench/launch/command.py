@@ -1,0 +1,221 @@
+"""Expand a command line to the overrides of each run, and compose the config of each by Hydra.
+
+`scene=all` becomes a run for each scene of the experiment. A wrong word is explained in one line.
+"""
+
+import argparse
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import MissingConfigException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.config import CONF, register_schema
+from gsbench.config_roles import facts
+from gsbench.errors import InputError, did_you_mean
+from gsbench.run.grammar import check_override, quoted_value, typed
+
+NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{].*|''|\"\"|")  # values for Hydra
+QUESTIONS = ("--hydra-help", "--cfg", "-c", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
+
+
+@dataclass(frozen=True)
+class Command:
+    """The words of a command line by their kind."""
+
+    overrides: list[str]
+    multirun: bool  # -m
+    config_dir: Path | None  # the folder of the user's own configs
+    asks: bool  # whether it has one of QUESTIONS
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The composed config of one run."""
+
+    overrides: list[str]
+    config: DictConfig  # without Hydra's own
+    choices: Mapping[str, str]  # the choice of each config group
+
+
+class UserConfigs(SearchPathPlugin):
+    """Tell Hydra to look for configs in the folder of --config-dir too."""
+
+    folder: ClassVar[Path | None] = None
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folder after gsbench's own."""
+        if self.folder is not None:
+            search_path.append("command-line", f"file://{self.folder}")
+
+
+def parse(words: Sequence[str]) -> Command:
+    """Separate the overrides of a command line from its options.
+
+    Raises:
+        InputError: an option is not known, or is one of Hydra that starts a run in another way.
+    """
+    parser = argparse.ArgumentParser("python -m gsbench", add_help=False, allow_abbrev=False)
+    parser.add_argument("-m", "--multirun", action="store_true")
+    parser.add_argument("-cd", "--config-dir", type=Path)
+    options, others = parser.parse_known_args(words)
+    unknown = [word for word in others if word.startswith("-")]
+    asks = any(word in QUESTIONS for word in unknown)
+    if unknown and not asks:
+        raise InputError(f"{unknown[0]}: expected -m, --config-dir=FOLDER or a question, as in python -m gsbench "
+                         f"+exp=mini --cfg job")  # fmt: skip
+    return Command(others, options.multirun, options.config_dir, asks)
+
+
+@contextmanager
+def hydra_with(config_dir: Path | None) -> Iterator[None]:
+    """Let Hydra compose gsbench's configs, and those of the user, while the block runs.
+
+    Raises:
+        InputError: the folder of the user's configs does not exist.
+    """
+    if config_dir is not None and not config_dir.is_dir():
+        raise InputError(f"--config-dir: expected a folder of YAML files, got '{config_dir}', which does not exist")
+    register_schema()
+    Plugins.instance().register(UserConfigs)
+    UserConfigs.folder = config_dir.absolute() if config_dir else None
+    with initialize_config_dir(str(CONF), job_name="gsbench", version_base="1.3"):
+        yield
+
+
+def runs_of(command: Command) -> tuple[list[list[str]], bool]:
+    """Return the overrides of each run of a command, and whether it is a sweep; use it in `hydra_with`.
+
+    A command is a sweep if it has -m, a launcher, scene=all or an experiment with axes of its own. Later axes vary
+    faster; the scenes of scene=all vary fastest.
+
+    Raises:
+        InputError: an override is wrong, the experiment has no scenes, or the command names several experiments.
+    """
+    for word in command.overrides:
+        check_override(word)
+        _check_group(*word.lstrip("+").partition("=")[::2])
+    parser = OverridesParser.create(GlobalHydra.instance().config_loader())
+    values = dict(map(_values, parser.parse_overrides(command.overrides)))
+    keys = {name.lstrip("+"): words for name, words in values.items()}
+    if len(keys.get("exp", ())) > 1:
+        raise InputError(f"+exp: expected one experiment, got {len(keys['exp'])}: type a command for each")
+    all_scenes = (
+        keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys and keys["exp"] != ["+exp=stability"]
+    )
+    base = _compose([words[0] for name, words in values.items() if name != "scene"])
+    axes = [f"{name}={text}" for name, text in (base.hydra.sweeper.params or {}).items()]
+    if not (command.multirun or all_scenes or axes or base.launch.by != "local"):
+        _check_single(values)
+        return [command.overrides], False
+    axes_first = dict(map(_values, parser.parse_overrides(axes))) | values
+    if all_scenes:
+        if not base.data.scenes:
+            raise InputError("data.scenes: expected the names of scenes, got an empty list: set them, or "
+                             "scene=custom scene.name=FOLDER")  # fmt: skip
+        axes_first.pop("scene", None)
+        axes_first["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
+    return [list(run) for run in itertools.product(*axes_first.values())], True
+
+
+def compose_run(overrides: Sequence[str]) -> RunConfig:
+    """Compose the config of a run; use it in `hydra_with`.
+
+    Raises:
+        InputError: an override is wrong, or the run has no experiment, scene or folder of data.
+    """
+    _register_scene(overrides)
+    config = _compose(overrides)
+    choices: Any = OmegaConf.to_container(config.hydra.runtime.choices)
+    with read_write(config), open_dict(config):
+        del config["hydra"]
+    check_complete(config)
+    facts("launch.by").check("launch.by", config.launch.by)
+    return RunConfig(list(overrides), config, choices)
+
+
+def check_complete(config: DictConfig) -> None:
+    """Raise InputError if a composed config names no experiment, no scene or no folder of data, with what to type."""
+    if OmegaConf.is_missing(config, "experiment"):
+        known = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
+        raise InputError(f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
+                         f"{known}. What each is: python -m gsbench --help")  # fmt: skip
+    if OmegaConf.is_missing(config.scene, "name"):
+        raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
+    if OmegaConf.is_missing(config.data, "root"):
+        raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
+                         f"{config.data.dataset} ({', '.join(config.data.scenes)}), each with "
+                         f"transforms_{{train,val,test}}.json and the images they name. "
+                         f"Published at: {config.data.published}", docs="data.md#what-is-read")  # fmt: skip
+
+
+def explain(error: Exception) -> str:
+    """Explain an error of Hydra or OmegaConf in one line, with the wrong key and the most similar one."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
+        keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
+        if keys and cause.key not in keys:
+            return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
+        return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+    return " ".join(str(error).split())
+
+
+def _compose(overrides: Sequence[str]) -> DictConfig:
+    try:
+        return compose("config", list(overrides), return_hydra_config=True)
+    except Exception as error:  # Hydra and OmegaConf raise errors of many types for a wrong word
+        raise InputError(explain(error)) from None
+
+
+def _values(override: Any) -> tuple[str, list[str]]:
+    """Return the key of a parsed override with its sign, and the override with each value of its sweep."""
+    name = override.get_key_element()
+    if not override.is_sweep_override():
+        return name, [override.input_line]
+    if not override.is_discrete_sweep():
+        raise InputError(f"{override.input_line}: expected values, such as {name}=1,2,3, got an interval")
+    return name, [f"{name}={value}" for value in override.sweep_string_iterator()]
+
+
+def _check_single(values: Mapping[str, Sequence[str]]) -> None:
+    for name, words in values.items():
+        if len(words) > 1:
+            text = ",".join(word.partition("=")[2] for word in words)
+            raise InputError(f"{name}={text}: commas separate the values of a sweep: type -m too for a run of each, or "
+                             f"{typed(name, text, several=False)} for one value")  # fmt: skip
+
+
+def _check_group(name: str, choices: str) -> None:
+    """Raise InputError if the choice of a config group is not a name, such as a number; Hydra does not explain it."""
+    if not name or not (CONF / name).is_dir():
+        return
+    for choice in choices.split(","):
+        if NO_NAME.fullmatch(choice.lower()):
+            known = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+            raise InputError(f"{name} '{choice}' is not known. {did_you_mean(choice, known)}")
+
+
+def _register_scene(overrides: Sequence[str]) -> None:
+    """Make the scene of a run a choice of the config group `scene`, if it is one of `data.scenes` without a file."""
+    (*_, scene) = ["all", *(word.partition("=")[2].strip("'\"") for word in overrides if word.startswith("scene="))]
+    folders = [CONF, *([UserConfigs.folder] if UserConfigs.folder else [])]
+    if any((folder / "scene" / f"{scene}.yaml").exists() for folder in folders):
+        return
+    if scene in _compose([word for word in overrides if not word.startswith("scene=")]).data.scenes:
+        ConfigStore.instance().store(group="scene", name=scene, node={"name": scene})

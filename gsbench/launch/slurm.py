@@ -1,0 +1,123 @@
+"""Submit the runs of a sweep to Slurm as a job array (`+launch=slurm`), and wait for its end.
+
+The script of the array does its run by `python -m gsbench.launch job`, in a container image if `launch.container` names
+one. Slurm signals a run before its time limit (USR2): the run saves a checkpoint and ends with the exit status STOPPED,
+and the script, which is outside of the image, puts its job back into the queue.
+"""
+
+import os
+import shlex
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.errors import InputError, printable
+from gsbench.launch import plan
+from gsbench.launch.command import RunConfig
+from gsbench.launch.plan import Plan
+from gsbench.launch.queue import ask, queue
+
+SUBMITTING = 300  # time limit of sbatch, seconds; after it, jobs may run that no plan knows
+POLL = 10.0  # seconds between two looks at Slurm's queue
+STOPPED = 128 + signal.SIGUSR2  # exit status
+PATHS = ("results", "data.root", "init.ply", "protocol.lpips_alex", "protocol.lpips_vgg")  # keys that hold a path
+SCRIPT = """\
+#!/bin/bash
+# Written by gsbench: each job of the array does the run of its number.
+trap : USR2 TERM  # Slurm's signals are for the run, which saves a checkpoint
+# Since Slurm 22.05 srun does not take the CPUs of its job over, and a step would be bound to one of them.
+export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK OMP_NUM_THREADS=$SLURM_CPUS_PER_TASK
+{setup}
+srun --unbuffered {command} -P -u -m gsbench.launch job {folder} "$SLURM_ARRAY_TASK_ID"
+status=$?
+requeues={folder}/"$SLURM_ARRAY_TASK_ID.requeues"
+touch "$requeues"
+if [ $status -eq {stopped} ] && [ "$(wc -l < "$requeues")" -lt {requeues} ]; then
+  date >> "$requeues"
+  exec scontrol requeue "$SLURM_JOB_ID"
+fi
+exit $status
+"""
+
+
+def launch(configs: Sequence[RunConfig], planned: Plan, folder: Path) -> None:
+    """Submit the runs of the plan in `folder` as a job array, and wait until its last job has left the queue.
+
+    Raises:
+        InputError: this is no machine of a cluster, Slurm refuses the jobs, or the container image is missing.
+    """
+    if shutil.which("sbatch") is None:
+        raise InputError("+launch=slurm: expected a machine of a Slurm cluster, sbatch is not on PATH: use its login "
+                         "node, or +launch=parallel", docs="runs.md#slurm-from-a-login-node-to-the-table")  # fmt: skip
+    settings, script = configs[0].config.launch, folder / "job.sh"
+    command = shlex.quote(sys.executable) if settings.container is None else in_container(configs, folder)
+    script.write_text(SCRIPT.format(setup=settings.setup, command=command, folder=shlex.quote(str(folder)),
+                                    stopped=STOPPED, requeues=settings.requeues))  # fmt: skip
+    options = {
+        "job-name": configs[0].config.experiment,
+        "partition": settings.partition,
+        "time": settings.minutes,
+        "cpus-per-task": settings.cpus,
+        "gpus-per-node": settings.gpus,
+        "mem": settings.memory,
+        "signal": f"USR2@{settings.signal_seconds}",
+        "array": f"0-{len(configs) - 1}" + (f"%{settings.at_once}" if settings.at_once > 0 else ""),
+        "output": folder / "%a.log",
+        "open-mode": "append",
+        "requeue": True,  # when its node fails
+        **settings.sbatch,
+    }
+    flags = [f"--{name}" if value is True else f"--{name}={value}"
+             for name, value in options.items() if value is not None and value is not False]  # fmt: skip
+    answer = ask("sbatch", "--parsable", *flags, str(script), seconds=SUBMITTING)
+    if isinstance(answer, str) or answer.returncode:
+        reason = answer if isinstance(answer, str) else answer.stderr
+        raise InputError(f"Slurm refused the jobs: {printable(' '.join(reason.split()))}")
+    job = answer.stdout.strip().partition(";")[0]
+    plan.write(replace(planned, job=job), folder)
+    while (waiting := queue([job])).states or waiting.silent:
+        time.sleep(POLL)
+
+
+def in_container(configs: Sequence[RunConfig], folder: Path) -> str:
+    """Return the words of a shell that start Python in the container image, with the folders of the runs bound.
+
+    The modules of the image come first (`python -P`): a checkout in the current folder has no kernels for the image.
+
+    Raises:
+        InputError: the image does not exist, or a folder cannot be bound.
+    """
+    settings = configs[0].config.launch
+    image = Path(settings.container).absolute()
+    if not image.exists():
+        raise InputError(f"launch.container: expected an image, a file or folder that all nodes see, got '{image}', "
+                         "which does not exist: build one", docs="install.md#in-a-container")  # fmt: skip
+    config_dir = plan.read(folder / plan.FILE_NAME).config_dir
+    paths = {os.getcwd(), *filter(None, (config_dir, os.environ.get("TORCH_HOME")))}
+    paths |= {path for config in configs for path in _paths(config.config)}
+    binds = sorted({os.path.abspath(path) for path in paths if os.path.exists(path)})
+    for path in binds:
+        if "," in path or ":" in path:
+            raise InputError(f"launch.container: expected folders without ',' and ':', which part the folders that are "
+                             f"bound, got '{path}': rename it")  # fmt: skip
+    gpu = " --nv" if settings.gpus else ""
+    bound = shlex.join(["--bind", ",".join(binds), "--pwd", os.getcwd(), str(image), "python3"])
+    return f"{settings.container_command}{gpu} {bound}"
+
+
+def _paths(config: DictConfig) -> Iterator[str]:
+    """Yield the files and folders that a config names."""
+    for key in PATHS:
+        try:
+            value = OmegaConf.select(config, key)
+        except OmegaConfBaseException:  # it names a variable that only the node has, such as TMPDIR
+            continue
+        if value is not None and not value.startswith("pkg://"):
+            yield value

@@ -1,0 +1,133 @@
+"""The runs of a command line: scenes as an axis, sweeps without a flag, ablations that change what they name."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsbench.config import CONF
+from gsbench.config_roles import flat
+from gsbench.errors import InputError
+from gsbench.launch.command import compose_run, hydra_with, parse, runs_of
+from gsbench.launch.plan import identity
+
+MINI = ("moving-matte", "pendulum", "suzanne")
+ABLATIONS = {  # what each changes of 7DGS as it is; of another model, only its name
+    "none": {},
+    "no_agr": {"agr": False},
+    "fixed_lambda": {"model.lr.lambda.start": 0.0},
+    "no_time_split": {"model.options.split_in_time": False},
+    "time_only": {"model.name": "4dgs"},
+    "direction_only": {"model.name": "6dgs"},
+    "no_effects": {"model.name": "3dgs"},
+    "paper_order": {"model.options.factor_order": "paper"},
+    "schur": {"model.options.scheme": "schur"},
+    "cholesky": {"model.options.scheme": "cholesky"},
+    "raw_off_diagonal": {"model.options.off_diagonal": "raw"},
+    "row_scaled": {"model.options.off_diagonal": "row_scaled"},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hydra() -> Iterator[None]:
+    with hydra_with(None):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("words", "runs"),
+    [
+        ("+exp=mini", [f"+exp=mini scene={scene}" for scene in MINI]),
+        ("scene=all +exp=mini seed=1", [f"+exp=mini seed=1 scene={scene}" for scene in MINI]),
+        ("+exp=mini model=4dgs,7dgs -m scene=dust", [f"+exp=mini model={m} scene=dust" for m in ("4dgs", "7dgs")]),
+        ("+exp=mini data.scenes=[new,dust]", [f"+exp=mini data.scenes=[new,dust] scene={s}" for s in ("new", "dust")]),
+        ("+exp=mini scene=dust +launch=slurm", ["+exp=mini scene=dust +launch=slurm"]),
+        ("+exp=ablation scene=dust +ablation=none,schur", ["+ablation=none +exp=ablation scene=dust",
+                                                           "+ablation=schur +exp=ablation scene=dust"]),
+    ],
+)  # fmt: skip
+def test_the_runs_of_a_sweep(words: str, runs: list[str]) -> None:
+    """Catches scenes that one job does one after the other, axes in another order, a run for Slurm that trains on the
+    login node, and axes of an experiment that a command line cannot replace."""
+    assert runs_of(parse(words.split())) == ([run.split() for run in runs], True)
+
+
+@pytest.mark.parametrize(
+    "words", ["+exp=mini scene=suzanne", "+exp=mini scene=suzanne +launch=local"]
+)
+def test_a_single_run_is_as_it_was_typed(words: str) -> None:
+    """Catches a plan for a run that is of no sweep."""
+    assert runs_of(parse(words.split())) == ([words.split()], False)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("+exp=mini data.scenes=[]", "empty list"),
+        ("+exp=mini,dnerf", "expected one experiment"),
+        ("+exp=mini model=7", "model '7' is not known"),
+        ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
+        ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
+        ("+exp=mini --multi", "--multi: expected -m"),
+    ],
+)
+def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
+    """Catches a sweep of no run that ends well, and options of Hydra that would be dropped in silence."""
+    with pytest.raises(InputError, match=message):
+        runs_of(parse(words.split()))
+
+
+def test_scenes_of_the_user_are_choices_and_typos_are_not() -> None:
+    """Catches a retry or a job that cannot compose a scene without a file, and a scene that is no scene."""
+    assert compose_run(["+exp=mini", "data.scenes=[new]", "scene=new"]).config.scene.name == "new"
+    with pytest.raises(InputError, match="scene 'newer' is not known"):
+        compose_run(["+exp=mini", "data.scenes=[new]", "scene=newer"])
+
+
+def test_configs_of_the_user_are_found_in_their_folder(tmp_path: Path) -> None:
+    """Catches --config-dir that is read for the help alone, that stays for the next command, or that is mistyped."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    (tmp_path / "launch").mkdir()
+    (tmp_path / "launch" / "cluster.yaml").write_text("# @package _global_\nlaunch: {by: slurm, partition: gpu}\n")
+    words = ["+exp=mini", "scene=suzanne", "+launch=cluster"]
+    GlobalHydra.instance().clear()
+    with hydra_with(tmp_path):
+        assert compose_run(words).config.launch.partition == "gpu"
+    with pytest.raises(InputError, match="which does not exist"), hydra_with(tmp_path / "none"):
+        pass
+    with hydra_with(None), pytest.raises(InputError, match="launch 'cluster' is not known"):
+        compose_run(words)
+
+
+def _settings(word: str) -> dict[str, Any]:
+    with hydra_with(None):
+        config = compose_run(["+exp=ablation", "scene=suzanne", word]).config
+    return dict(flat(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_changes_what_it_names_and_nothing_else(name: str) -> None:
+    """Catches an ablation that is the whole model, or one that changes a second thing."""
+    whole, changed = (_settings(f"+ablation={ablation}") for ablation in ("none", name))
+    is_other = "model.name" in ABLATIONS[name]
+    differs = {key: value for key, value in changed.items() if whole.get(key) != value}
+    assert (differs | ABLATIONS[name] == differs) if is_other else (differs == ABLATIONS[name])
+    assert not is_other or changed["agr"] is True  # AGR stays, so that only the effects differ
+
+
+def test_the_ablation_sweeps_over_all_ablations_by_itself() -> None:
+    """Catches an ablation that is shipped and not in the sweep, and a plan that forgets the experiment's own axes."""
+    with hydra_with(None):
+        runs, is_sweep = runs_of(parse(["+exp=ablation", "scene=suzanne"]))
+    assert is_sweep
+    assert sorted(run[0] for run in runs) == sorted(f"+ablation={name}" for name in ABLATIONS)
+    assert {path.stem for path in (CONF / "ablation").glob("*.yaml")} == set(ABLATIONS)
+
+
+def test_launch_settings_change_no_number() -> None:
+    """Catches a partition, or a results folder, that makes another run of the same run."""
+    words = ["model=7dgs", "+launch=slurm", "launch.partition=gpu", "+launch.sbatch.qos=x", "results=r", "resume=false"]
+    assert identity([*words, "+exp=mini"]) == ("+exp=mini", "model=7dgs")

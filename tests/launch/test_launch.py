@@ -1,0 +1,159 @@
+"""Sweeps as they are launched: the plan, several processes, retry, and ablations that change what they say."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import crowd
+import pytest
+import torch
+from forked import python_m
+from tiny_run import gsbench, main_here, overrides, write_moving_square
+
+from gsbench.errors import InputError
+from gsbench.launch import plan, status
+from gsbench.launch import sweep as launcher
+from gsbench.launch.__main__ import main as sweep_main
+from gsbench.launch.command import RunConfig, compose_run, hydra_with
+from gsbench.launch.plan import Ended, Plan, identity
+from gsbench.launch.status import RecordStatus
+from gsbench.launch.sweep import retry
+from gsbench.train import checkpoint
+
+SCENE = ("scene=", "scene.name=")
+
+
+@pytest.fixture
+def square(tmp_path: Path) -> Path:
+    return write_moving_square(tmp_path / "data")
+
+
+def sweep(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `python -m gsbench.launch`."""
+    return python_m("gsbench.launch", *arguments)
+
+
+def states(experiment: Path) -> list[str]:
+    return sorted(run.state for run in status.status(status.read(experiment)))
+
+
+def test_retry_takes_only_settings_of_the_launch(tmp_path: Path) -> None:
+    """Catches a retry that may change what its runs are."""
+    with pytest.raises(InputError, match=r"launch\.memory=16G, got 'train\.iterations=5'"):
+        retry(status.read(tmp_path), ["train.iterations=5"])
+    with pytest.raises(InputError, match=r"config key 'launch\.nosuch' is not known"):
+        retry(status.read(tmp_path), ["launch.nosuch=1"])
+
+
+def test_retry_passes_over_what_cannot_be_launched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a stack trace, or a whole retry that ends, for a folder that is gone and words that are not known."""
+    monkeypatch.chdir(tmp_path)
+    experiment, gone = tmp_path / "mini", str(tmp_path / "gone")
+    asked = {
+        gone: ["+exp=mini", "scene=suzanne", "seed=0"],
+        str(tmp_path): ["+exp=mini", "scene=suzanne", "train.iteratons=5", "seed=1"],
+        "/": ["+exp=mini", "seed=[", "seed=2"],
+        "/usr": ["+exp=mini", "scene=suzanne", "+launch=parallel", "launch.at_once=0", "seed=3"],
+    }
+    for number, (cwd, words) in enumerate(asked.items()):
+        plan.write(
+            Plan("local", [words], cwd=cwd, born=None, started=0.0),
+            experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000",
+        )
+    assert sweep_main(["retry", str(experiment)]) == 1  # they are lost as before
+    errors = [line for line in capsys.readouterr().err.splitlines() if "cannot be launched again" in line]
+    reasons = (f"'{gone}'", "Did you mean 'iterations'", "at input '['", "launch.at_once: expected at least 1")
+    for line, reason in zip(sorted(errors), reasons, strict=True):
+        assert reason in line
+
+
+def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a retry that says that no run failed, beside a status that lists one."""
+    run = ("7dgs", "lego", 0)
+    folder = tmp_path / "mini" / "lego" / "7dgs" / "seed0"
+    folder.mkdir(parents=True)
+    broken = crowd.record(*run) | {"status": "failed", "reason": "out of memory"}
+    (folder / "record.json").write_text(json.dumps(broken, default=str))
+    assert sweep_main(["retry", str(tmp_path / "mini")]) == 1
+    errors = capsys.readouterr().err
+    assert f"python -m gsbench {' '.join(identity(crowd.overrides(*run)))} results={tmp_path}" in errors
+    assert "no run was stopped" not in errors
+
+
+def test_a_retry_launches_with_the_settings_that_it_gets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches more memory that is asked for and never used, and a run that loses what decides its numbers."""
+    monkeypatch.chdir(tmp_path)  # a retry goes to where the command was typed
+    experiment = tmp_path / "mini"
+    words = ["+exp=mini", "model=4dgs", "scene=suzanne", "seed=3", "launch.memory=8G", "results=elsewhere"]
+    plan.write(Plan("local", [words], born=None, started=0.0), experiment / plan.FOLDER / "2026-11-22_00-00-00.000000")
+    launched: list[RunConfig] = []
+    monkeypatch.setattr(launcher, "launch", lambda configs, _: launched.extend(configs))
+    assert retry(status.read(experiment), ["launch.memory=16G"]) == 1
+    ((config),) = (run.config for run in launched)
+    assert (config.model.name, config.seed, config.launch.memory) == ("4dgs", 3, "16G")
+    assert config.results == str(tmp_path)
+
+
+def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a sweep that ends badly because of a run of another sweep in the same folder of results."""
+    words = ["+exp=mini", "scene=suzanne", "model=3dgs", f"results={tmp_path}"]
+    ends = {"0": Ended(reason="step 0: nan"), "1": Ended("mini/record.json")}
+    monkeypatch.setattr(launcher, "do_planned", lambda config, folder, number: plan.write_ended(
+        folder, number, ends[str(config.config.seed)]))  # fmt: skip
+    monkeypatch.setattr(status, "_kept", lambda _, run: run and run.ended.record and RecordStatus(
+        tmp_path, "ok", None, 20.0, 0.0))  # fmt: skip
+    with hydra_with(None):
+        outcomes = [launcher.launch([compose_run([*words, f"seed={seed}"])], None) for seed in ends]
+    assert [[run.reason for run in outcome.broken] for outcome in outcomes] == [["step 0: nan"], []]
+
+
+def test_retry_does_what_is_missing_and_repeats_nothing(square: Path, tmp_path: Path) -> None:
+    """Catches a retry that loses a run's overrides, trains a finished run again, or hides that nothing is left."""
+    results = tmp_path / "results"
+    words = [word for word in overrides(square, results, "model=3dgs", "seed=0,1") if not word.startswith(SCENE)]
+    assert gsbench("-m", *words).returncode == 0  # scene=all: the scene has no file in conf/
+    experiment = results / "dnerf"
+    kept, lost = sorted(experiment.rglob("record.json"))
+    assert states(experiment) == ["done", "done"]
+    before = kept.stat().st_mtime_ns, lost.read_text()
+    shutil.rmtree(lost.parent)
+    assert states(experiment) == ["done", "failed"]
+    again = sweep("retry", str(experiment))
+    assert again.returncode == 0, again.stderr
+    assert "1 runs again" in again.stderr
+    assert states(experiment) == ["done", "done"]
+    assert kept.stat().st_mtime_ns == before[0]
+    assert json.loads(lost.read_text())["metrics"] == json.loads(before[1])["metrics"]
+    assert "no run was stopped, failed" in sweep("retry", str(experiment)).stderr
+
+
+@pytest.mark.slow
+def test_several_processes_give_the_bits_of_one(square: Path, tmp_path: Path) -> None:
+    """Catches runs that depend on the process they share, or on how many run beside them."""
+    for launch in ("local", "parallel"):
+        words = overrides(square, tmp_path / launch, f"+launch={launch}", "launch.at_once=2", "model=7dgs", "seed=0,1")
+        assert gsbench("-m", *words).returncode == 0
+        assert states(tmp_path / launch / "dnerf") == ["done"] * 2
+    for path in sorted((tmp_path / "local").rglob("checkpoint.pt")):
+        other = tmp_path / "parallel" / path.relative_to(tmp_path / "local")
+        here, beside = (checkpoint.read(file).state["model"] for file in (path, other))
+        assert all(torch.equal(here[name], beside[name]) for name in here)
+        metrics = [json.loads(file.with_name("record.json").read_text())["metrics"] for file in (path, other)]
+        assert metrics[0] == metrics[1]
+
+
+def test_without_slurm_the_error_says_where_to_go(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches an error of submitit that only asks whether this is a cluster."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["-m", "+exp=mini", "scene=suzanne", "model=3dgs", "+launch=slurm", f"results={tmp_path / 'results'}"]
+    assert main_here(*words) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith("gsbench: error: +launch=slurm: expected a machine of a Slurm cluster, sbatch is not on")
+    assert message.endswith("(docs/runs.md#slurm-from-a-login-node-to-the-table)")
