@@ -154,20 +154,14 @@ def count_readers(
 
 
 def decode_photo(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
-    """Decode a PNG as `decode_png` does, or a JPEG to RGB; its EXIF orientation is ignored, as COLMAP ignores it."""
-    if not data.startswith(_JPEG):
-        return decode_png(data, where)
-    photo_size(data, where)
-    with _jpeg(data, where) as image:  # Pillow, because OpenCV fills the missing rows of a truncated JPEG with grey
-        return np.array(image)
+    """Decode an 8- or 16-bit PNG, or a JPEG; an EXIF orientation is ignored, as COLMAP ignores it.
 
-
-def decode_png(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
-    """Decode an 8- or 16-bit PNG to RGB or RGBA pixels.
-
-    The file is checked first, because OpenCV may fill the missing rows of a truncated file with black.
+    The file is checked first, because OpenCV may fill the missing rows of a truncated PNG with black.
     """
-    png_size(data, where)
+    photo_size(data, where)
+    if data.startswith(_JPEG):
+        with _jpeg(data, where) as image:  # Pillow, because OpenCV fills the missing rows of a JPEG with grey
+            return np.array(image)
     pixels = _decode(data, where)
     if pixels.ndim != 3 or pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: expected 8- or 16-bit RGB or RGBA, got {pixels.dtype} of shape {pixels.shape}")
@@ -177,9 +171,11 @@ def decode_png(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, a
 
 def decode_regions(data: bytes, size: Size, where: str) -> NDArray[np.uint8]:  # [H, W]
     """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel."""
-    own = png_size(data, where, NUMBERS)
-    if own != size:
-        raise InputError(f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {own[0]}x{own[1]}")
+    actual = png_size(data, where, NUMBERS)
+    if actual != size:
+        raise InputError(
+            f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {actual[0]}x{actual[1]}"
+        )
     return _decode(data, where)
 
 

@@ -3,7 +3,7 @@
 In messages `where` is the path of an image and the file that names it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,27 +117,35 @@ def size_of(path: Path, where: str) -> Size:
 
 
 def read(
-    shots: Sequence[Shot],  # at least one
+    shots: Sequence[Shot],
     *,
     downscale: int,
     background: tuple[float, float, float],
     resize: str | None,
+    in_8_bits: bool | None = None,
+    decode: Callable[[Shot, bytes], Pixels] = lambda shot, data: images.decode_photo(data, shot.where),
 ) -> Shots:
-    """Read all images by several threads.
+    """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis.
 
-    Images of a small scene are stored as floats, those of a large scene in 8 bits. K is scaled as the image is, by the
-    ratio of the sizes along each axis.
+    Args:
+        shots: the images, at least one.
+        downscale: the integer factor by which they are reduced.
+        background: the colour behind images with alpha.
+        resize: the filter by which they are reduced; see `gsbench.scenes.load`.
+        in_8_bits: whether pixels stay in 8 bits; None: those of a large scene do, others are stored as floats.
+        decode: the function that decodes the bytes of an image.
     """
     first = shots[0]
     data = images.read_image(first.path, first.where)
     size = images.photo_size(data, first.where)
     reduced = images.reduced_size(size, downscale, first.where)
-    in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
+    if in_8_bits is None:
+        in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
     def read_one(shot: Shot) -> tuple[View, str, bool]:
         data = images.read_image(shot.path, shot.where)
-        lens = _lens_of_image(images.photo_size(data, shot.where), size, shot)
-        decoded = images.decode_photo(data, shot.where)
+        decoded = decode(shot, data)
+        lens = _lens_of_image((decoded.shape[1], decoded.shape[0]), size, shot)
         if decoded.shape[2] == 4 and any(lens.distortion):
             raise InputError(f"{shot.where}: expected an image without alpha, as its camera has distortion: undo it by "
                              "`colmap image_undistorter`")  # fmt: skip

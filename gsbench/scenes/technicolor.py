@@ -3,20 +3,21 @@
 import math
 import re
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
 from gsbench.reading import read_file
-from gsbench.scenes import colmap, files, images
+from gsbench.scenes import colmap, files, images, shots
 from gsbench.scenes.images import Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.scene import Camera, Points, Scene, View
+from gsbench.scenes.scene import Points, Scene, View
+from gsbench.scenes.shots import Lens, Shot
 
 CAMERAS = "cameras_parameters.txt"
 COLUMNS = ("f", "cu", "cv", "ar", "sk", "qw", "qx", "qy", "qz", "tx", "ty", "tz")  # intrinsics, rotation, translation
@@ -128,15 +129,13 @@ def _number(text: str, where: str) -> float:
     return number
 
 
-def _camera(row: dict[str, float], size: Size, reduced: Size) -> Camera:
-    """Make a camera from a row of the table."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")])  # scipy has w last
-    viewmat[:3, :3] = torch.from_numpy(rotation.as_matrix())
-    viewmat[:3, 3] = torch.tensor([row["tx"], row["ty"], row["tz"]], dtype=torch.float64)
-    sx, sy = reduced[0] / size[0], reduced[1] / size[1]
-    K = torch.tensor([[row["f"] * sx, 0, row["cu"] * sx], [0, row["f"] * row["ar"] * sy, row["cv"] * sy], [0, 0, 1]])
-    return Camera(viewmat, K, *reduced)
+def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:
+    """Return the viewmat [4, 4] and the intrinsics of a row of the table, for images of a size."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()  # scipy: w last
+    viewmat[:3, 3] = row["tx"], row["ty"], row["tz"]
+    K = np.array([[row["f"], 0, row["cu"]], [0, row["f"] * row["ar"], row["cv"]], [0, 0, 1]])
+    return torch.from_numpy(viewmat), Lens(*size, K, (0.0, 0.0, 0.0, 0.0))
 
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
@@ -195,67 +194,49 @@ def _read_views(
     downscale: int,
     resize: str | None,
 ) -> tuple[list[View], dict[str, str]]:
-    """Read all images by several threads; return their views, and the SHA-256 of each file by name.
+    """Return the views of all images, and the SHA-256 of each file by name.
 
-    The name of a damaged image that is replaced also says by which image, so that a fingerprint tells it.
+    The name of a damaged image that is replaced also says by which image, so that a fingerprint depends on it.
     """
     first, last = listed[0].frame, listed[-1].frame
-    where = str(listed[0].path)
-    size = images.png_size(images.read_image(listed[0].path, where), where)
-    reduced = images.reduced_size(size, downscale, where)
-    cameras = [_camera(row, size, reduced) for row in rows]
+    size = shots.size_of(listed[0].path, str(listed[0].path))
+    cameras = [_camera(row, size) for row in rows]
+    by_path = {image.path: image for image in listed}
+    listed_shots = [
+        Shot(image.path, None, image.path.stem, str(image.path), (image.frame - first) / max(1, last - first),
+             *cameras[image.camera])
+        for image in listed
+    ]  # fmt: skip
 
-    def read(image: _Image) -> tuple[View, str]:
-        where = str(image.path)
-        data = images.read_image(image.path, where)
-        if image in replaced:
-            _check_damaged(data, image)
-            before = replaced[image].path
-            decoded = _decode(images.read_image(before, str(before)), before, size)
-        else:
-            decoded = _decode_or_advise(data, image, size)
-        is_kept = downscale == 1 and decoded.dtype.name == "uint8"
-        pixels = torch.from_numpy(decoded) if is_kept else images.composite(decoded, (0, 0, 0), reduced, resize)
-        time = (image.frame - first) / max(1, last - first)
-        return View(image.path.stem, cameras[image.camera], time, pixels), files.digest(data)
+    def decode(shot: Shot, data: bytes) -> images.Pixels:
+        image = by_path[shot.path]
+        if image not in replaced:
+            return _decode(image, data)
+        try:
+            images.decode_photo(data, shot.where)
+        except images.DamagedError:
+            before = replaced[image]
+            return _decode(before, images.read_image(before.path, str(before.path)), is_named=True)
+        raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
 
-    kept = 3 if downscale == 1 else 12
-    threads = images.count_readers(size, len(listed), downscale, where, kept)
-    with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
-        read_all = list(pool.map(read, listed))
+    loaded = shots.read(listed_shots, downscale=downscale, background=(0, 0, 0), resize=resize,
+                        in_8_bits=downscale == 1, decode=decode)  # fmt: skip
     names = [f"{i.path.name} replaced by {replaced[i].path.name}" if i in replaced else i.path.name for i in listed]
-    digests = {name: digest for name, (_, digest) in zip(names, read_all, strict=True)}
-    return [view for view, _ in read_all], digests
+    return loaded.views, dict(zip(names, loaded.digests, strict=True))
 
 
-def _decode(data: bytes, path: Path, size: Size) -> images.Pixels:
-    """Decode an image; raise InputError if it is damaged, is not opaque, or has another size than the first image."""
-    if images.png_size(data, str(path)) != size:
-        raise InputError(f"{path}: expected {size[0]}x{size[1]} as the first image, got another size")
-    decoded = images.decode_png(data, str(path))
-    if decoded.shape[2] != 3:
-        raise InputError(f"{path}: expected an opaque RGB image, got one with alpha")
-    return decoded
-
-
-def _decode_or_advise(data: bytes, image: _Image, size: Size) -> images.Pixels:
-    """Decode an image; if a training image is damaged, the error names the option that replaces it."""
+def _decode(image: _Image, data: bytes, *, is_named: bool = False) -> images.Pixels:
+    """Decode an opaque image; if a training image is damaged, the error names the option that replaces it."""
     try:
-        return _decode(data, image.path, size)
+        decoded = images.decode_photo(data, str(image.path))
     except images.DamagedError as error:
-        if image.camera == TEST_CAMERA:
+        if image.camera == TEST_CAMERA or is_named:
             raise
         advice = f"replace it by the frame before with data.repair=[{image.path.stem}]"
         raise images.DamagedError(f"{error}, or {advice}") from error
-
-
-def _check_damaged(data: bytes, image: _Image) -> None:
-    """Raise InputError if an image that is to be replaced is whole."""
-    try:
-        images.decode_png(data, str(image.path))
-    except images.DamagedError:
-        return
-    raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
+    if decoded.shape[2] != 3:
+        raise InputError(f"{image.path}: expected an opaque RGB image, got one with alpha")
+    return decoded
 
 
 def _points(root: Path) -> Points | None:

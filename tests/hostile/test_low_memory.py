@@ -42,10 +42,10 @@ def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch: pytest.Monkey
         error.code = cv2.Error.StsNoMem
         raise error
 
-    monkeypatch.setattr(images, "png_size", lambda *_: (1, 1))
+    monkeypatch.setattr(images, "photo_size", lambda *_: (1, 1))
     monkeypatch.setattr(cv2, "imdecode", full)
     with pytest.raises(MemoryError, match=r"r_0\.png: OpenCV has none"):
-        images.decode_png(b"png", "r_0.png")
+        images.decode_photo(b"png", "r_0.png")
 
 
 @pytest.mark.slow

@@ -226,7 +226,7 @@ def test_memory_is_asked_for_before_an_image_is_decoded(tiny: Path, monkeypatch:
     """Catches images of a few kilobytes that fill the memory with gigabytes of pixels, and a message without sizes."""
     for name in ("train/r_0.png", "train/r_1.png", "val/r_0.png", "test/r_0.png"):
         (tiny / name).write_bytes(png(8192, 8192, b""))
-    monkeypatch.setattr(images, "decode_png", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(images, "decode_photo", lambda *_: pytest.fail("decoded"))
     monkeypatch.setattr(memory, "available", lambda: int(4.5 * 2**30))
     with pytest.raises(TooLargeError) as caught:
         scenes.load(tiny)
@@ -285,14 +285,14 @@ def test_png_with_a_changed_byte_is_refused(at: int, flip: int) -> None:
     data = bytearray(GOOD_PNG)
     data[at] ^= flip
     with pytest.raises(InputError):
-        images.decode_png(bytes(data), "x.png")
+        images.decode_photo(bytes(data), "x.png")
 
 
 @given(st.integers(0, len(GOOD_PNG) - 1))
 def test_png_cut_anywhere_is_refused(length: int) -> None:
     """Catches a truncated file whose missing rows would come out black."""
     with pytest.raises(InputError):
-        images.decode_png(GOOD_PNG[:length], "x.png")
+        images.decode_photo(GOOD_PNG[:length], "x.png")
 
 
 @pytest.fixture(scope="module")
