@@ -1,6 +1,7 @@
 """Find the files of a data set inside the scene's folder, and compute a hash of all of them."""
 
 import hashlib
+import math
 import os
 import re
 from collections import Counter
@@ -101,14 +102,23 @@ def _order(name: str) -> int:
     return _SUFFIXES.index(os.path.splitext(name)[1].lower())
 
 
+def number(text: str, largest: float, message: str) -> float:
+    """Convert a text to a number; raise InputError with a message and the text if it is none or above `largest`."""
+    try:
+        value = float(text) if "_" not in text else math.nan
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= largest:
+        raise InputError(f"{message}, got {text[:40]!a}")
+    return value
+
+
 def digest(data: bytes) -> str:
     """Return the SHA-256 of `data` in hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
-def fingerprint(
-    digests: Mapping[str, str],  # file name relative to the scene's folder -> its sha256
-) -> str:
+def fingerprint(digests: Mapping[str, str]) -> str:  # file name relative to the scene's folder -> its sha256
     """Return one SHA-256 for a set of files: the hash of the output of `sha256sum` for the files, sorted by name.
 
     Names are relative to the scene's folder, so moving the folder keeps the hash. To compute the hash of a Blender

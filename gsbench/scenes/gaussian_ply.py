@@ -20,7 +20,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN
 from gsbench.process.memory import require
-from gsbench.scenes.ply import compressed, read_vertices, refused
+from gsbench.scenes.ply import columns, compressed, read_vertices, refused
 from gsbench.scenes.scene import Camera
 
 MAX_DEGREE = 3  # largest SH degree of gsbench's models; a file may have degree 4
@@ -75,7 +75,7 @@ def read_trained(path: Path) -> TrainedGaussians:
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    left_out = _check_columns(names, [name for columns in _COLUMNS.values() for name in columns], path)
+    left_out = _check_columns(names, [name for group in _COLUMNS.values() for name in group], path)
     if left_out:
         print(f"{path}: columns that change no image are left out: {_shortened(left_out)}", file=sys.stderr)
     if networks := _deformations(path):
@@ -89,7 +89,7 @@ def read_trained(path: Path) -> TrainedGaussians:
         raise InputError(f"{path}: f_rest_*: expected the numbers 0 to {count - 1}, found no '{missing[0]}'")
     require(_VALUE * len(vertices) * (14 + count), f"{path}: {len(vertices)} Gaussians", "use a smaller file")
     vertices = _with_finite_logits(vertices, path)
-    read = {name: _table(vertices, columns, path) for name, columns in _COLUMNS.items()}
+    read = {name: _table(vertices, group, path) for name, group in _COLUMNS.items()}
     if not (read["quats"].square().sum(1) > 0).all():
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
@@ -181,15 +181,8 @@ def _fuse(
           f"raster.antialias=true", file=sys.stderr)  # fmt: skip
 
 
-def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:
-    """Return some properties of PLY vertices as [N, len(names)] float32; raise InputError if a value is not finite."""
-    table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
-    bad = ~(np.abs(table) <= _LARGEST)
-    if bad.any():
-        named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
-        raise InputError(f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
-                         f"Gaussians have others: remove them")  # fmt: skip
-    return torch.from_numpy(table.astype(np.float32))
+def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:  # [N, len(names)] float32
+    return torch.from_numpy(columns(vertices, names, path, _LARGEST).astype(np.float32))
 
 
 def _check_columns(names: Sequence[str], needed: Sequence[str], path: Path) -> list[str]:
@@ -203,8 +196,8 @@ def _check_columns(names: Sequence[str], needed: Sequence[str], path: Path) -> l
     if any(map(_PACKED.fullmatch, names)):
         raise compressed(path, "SuperSplat's columns packed_*")
     for method, pattern in _METHODS.items():
-        if columns := [name for name in names if re.fullmatch(pattern, name)]:
-            raise refused(path, f"expected Gaussians of 3DGS, the columns {_shortened(columns):.200} are of {method} "
+        if others := [name for name in names if re.fullmatch(pattern, name)]:
+            raise refused(path, f"expected Gaussians of 3DGS, the columns {_shortened(others):.200} are of {method} "
                                  f"and change the look: give a PLY of 3D Gaussians, for instance those of one time, "
                                  f"or remove the columns")  # fmt: skip
     missing = [name for name in needed if name not in names]

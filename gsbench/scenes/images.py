@@ -80,9 +80,7 @@ def photo_size(data: bytes, where: str) -> Size:
         return _check_size(*image.size, where)
 
 
-def is_turned(
-    data: bytes,  # of an image that was checked
-) -> bool:
+def is_turned(data: bytes) -> bool:  # of an image that was checked
     """Return whether a JPEG has an EXIF orientation by which other programs turn or mirror it."""
     if not data.startswith(_JPEG):
         return False
@@ -171,18 +169,13 @@ def decode_photo(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA,
 
 def decode_regions(data: bytes, size: Size, where: str) -> NDArray[np.uint8]:  # [H, W]
     """Decode a mask, an 8-bit grey PNG with the number of the object in each pixel."""
-    actual = png_size(data, where, NUMBERS)
-    if actual != size:
-        raise InputError(
-            f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {actual[0]}x{actual[1]}"
-        )
+    width, height = png_size(data, where, NUMBERS)
+    if (width, height) != size:
+        raise InputError(f"{where}: expected {size[0]}x{size[1]} as the image of this mask, got {width}x{height}")
     return _decode(data, where)
 
 
-def subsample(
-    numbers: Pixels,  # [H, W] the number of the object in each pixel
-    size: Size,
-) -> Tensor:  # [h, w] 8 bits
+def subsample(numbers: Pixels, size: Size) -> Tensor:  # [H, W] the number of the object in each pixel -> [h, w] 8 bits
     """Reduce a mask: each pixel has the number at its centre."""
     rows, columns = (
         (2 * np.arange(after) + 1) * before // (2 * after)
@@ -191,10 +184,7 @@ def subsample(
     return torch.from_numpy(numbers[rows[:, None], columns])
 
 
-def alpha_of(
-    pixels: Pixels,  # [H, W, 3|4] as stored
-    size: Size,
-) -> Tensor | None:  # [h, w] 8 bits
+def alpha_of(pixels: Pixels, size: Size) -> Tensor | None:  # [H, W, 3|4] as stored -> [h, w] 8 bits
     """Return the alpha channel of an image, reduced by averaging; None for an image without alpha."""
     if pixels.shape[2] == 3:
         return None

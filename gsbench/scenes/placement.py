@@ -33,44 +33,24 @@ _MOST_PAIRS = 1 << 22  # of points and cameras whose depths are computed
 def standard_scene(
     *,
     name: str,
-    train: list[View],
+    train: list[View],  # with viewmats in float64 in the user's coordinates, as those of val and test
     val: list[View],
     test: list[View],
     background: tuple[float, float, float],
-    points: Points | None,
-    fingerprint: str,
-    repaired: tuple[str, ...] = (),
-    up: tuple[float, float, float] | None = UP,
-    notes: tuple[str, ...] = (),
+    points: Points | None,  # the data set's own, in float64, in the user's coordinates
+    fingerprint: str,  # SHA-256 of the files
+    repaired: tuple[str, ...] = (),  # names of damaged images that were replaced
+    up: tuple[float, float, float] | None = UP,  # None: it is estimated from the cameras
+    notes: tuple[str, ...] = (),  # of the reader, a line each
 ) -> Scene:
-    """Return a scene whose cameras and points are in single precision, in the standard place and size.
-
-    Args:
-        name: the name of the scene.
-        train: the training views, with viewmats in float64 in the user's coordinates.
-        val: the validation views.
-        test: the test views.
-        background: the background colour.
-        points: the data set's own points in float64, in the user's coordinates; None if it has none.
-        fingerprint: the SHA-256 of the files.
-        repaired: the names of damaged images that were replaced.
-        up: which way is up; None: it is estimated from the cameras.
-        notes: what the reader tells about the files, a line each.
-    """
+    """Return a scene whose cameras and points are in single precision, in the standard place and size."""
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
     centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
     axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
     seen, share = _seen_points(name, train, points)
     middle, size = place_and_size(centers, axes, seen)
     placement = _placement(middle, size)
-    # The views of an array share their cameras.
-    cameras = {
-        id(view.camera): replace(view.camera, viewmat=placement.viewmat_to_standard(view.camera.viewmat))
-        for view in (*train, *val, *test)
-    }
-    train, val, test = (
-        [replace(view, camera=cameras[id(view.camera)]) for view in views] for views in (train, val, test)
-    )
+    train, val, test = ([_placed(view, placement) for view in views] for views in (train, val, test))
     moved = torch.stack([view.camera.viewmat for view in train])
     is_near = torch.from_numpy(_are_near(centers, size))
     lines = _notes(placement, is_near)
@@ -92,6 +72,11 @@ def standard_scene(
         placement=placement,
         notes=(*notes, *lines),
     )
+
+
+def _placed(view: View, placement: Placement) -> View:
+    camera = view.camera
+    return replace(view, camera=replace(camera, viewmat=placement.viewmat_to_standard(camera.viewmat)))
 
 
 def place_and_size(

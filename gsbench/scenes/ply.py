@@ -5,6 +5,7 @@ A damaged file raises `InputError`, and a compressed one with the command that o
 
 import re
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,6 +157,20 @@ def _check_readable(path: Path, data: bytes) -> None:
     for mark, form in _COMPRESSED.items():
         if data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark:
             raise compressed(path, form)
+
+
+def columns(vertices: NDArray[np.void], names: Sequence[str], path: Path, largest: float) -> NDArray[np.float64]:
+    """Return some properties of vertices as [P, len(names)]; raise InputError for a missing one or a wrong value."""
+    for name in names:
+        if name not in (vertices.dtype.names or ()):
+            raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")
+    table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
+    bad = ~(np.abs(table) <= largest)
+    if bad.any():
+        named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
+        raise InputError(f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
+                         f"vertices have others: remove them")  # fmt: skip
+    return table
 
 
 def compressed(path: Path, form: str) -> InputError:

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.tensors import check_number, check_tensor
 from gsbench.process.memory import require
-from gsbench.scenes.ply import read_vertices
+from gsbench.scenes.ply import columns, read_vertices
 from gsbench.scenes.scene import Camera, Points
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: colour = 0.5 + SH_C0 f_dc
@@ -23,6 +22,7 @@ NEAREST, FARTHEST = 2.0, 100.0  # range of depths of points in a frustum, in uni
 FAR = 4.0  # distance from the middle, beyond which a point lies far outside; three quarters of the points lie within 1
 ROUNDS = 50  # largest number of rounds in which points in a frustum are drawn
 
+_LARGEST = float(np.finfo(np.float32).max)
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
 
 
@@ -72,10 +72,7 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
                      f"{ROUNDS * count} random points are seen by all: set data.initial_half_width")  # fmt: skip
 
 
-def is_seen(
-    points: Tensor,  # [P, 3] in the dtype of the camera
-    camera: Camera,
-) -> Tensor:  # [P] bool
+def is_seen(points: Tensor, camera: Camera) -> Tensor:  # [P, 3] in the dtype of the camera -> [P] bool
     """Return which points are inside the image of a camera."""
     x = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.to(points).T
     pixel = x[:, :2] / x[:, 2:]
@@ -90,16 +87,16 @@ def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
     return float(seen.float().mean())
 
 
-def read_ply(path: str | Path) -> Points:
+def read_ply(path: Path) -> Points:
     """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
     Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1].
     """
-    vertices = read_vertices(Path(path))
-    means = _columns(vertices, ("x", "y", "z"), path)
+    vertices = read_vertices(path)
+    means = columns(vertices, ("x", "y", "z"), path, _LARGEST)
     names = vertices.dtype.names or ()
     if "red" in names:
-        colors = _columns(vertices, ("red", "green", "blue"), path)
+        colors = columns(vertices, ("red", "green", "blue"), path, _LARGEST)
         kind = vertices.dtype["red"]
         if kind.kind in "iu":
             colors = colors / np.iinfo(kind).max
@@ -108,14 +105,11 @@ def read_ply(path: str | Path) -> Points:
     elif "f_dc_0" not in names:
         raise InputError(f"{path}: expected colours as red green blue, or as f_dc_0..2, found {names!r:.120}: add them")
     else:
-        colors = (0.5 + SH_C0 * _columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path)).clip(0, 1)
+        colors = (0.5 + SH_C0 * columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path, _LARGEST)).clip(0, 1)
     return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)))
 
 
-def nearest_distances(
-    means: Tensor,  # [P, 3]
-    k: int = 3,
-) -> Tensor:  # [P] in the dtype and on the device of `means`
+def nearest_distances(means: Tensor, k: int = 3) -> Tensor:  # [P, 3] -> [P] in the dtype and on the device of `means`
     """Return the root mean square distance of each point to its `k` nearest neighbours, the initial scale of 3DGS.
 
     The result is at least sqrt(1e-7), as in the code of 3DGS.
@@ -144,9 +138,7 @@ def size_of(points: Points) -> float:
     return size if 0 < size < math.inf else 1.0
 
 
-def far_outside(
-    means: Tensor,  # [P, 3]
-) -> Tensor:  # [P] bool
+def far_outside(means: Tensor) -> Tensor:  # [P, 3] -> [P] bool
     """Return which points lie far outside: over FAR times as far from the median as three quarters of the points.
 
     Structure from motion places some points at a random depth. No point of a cube or of a normal distribution is far
@@ -155,14 +147,3 @@ def far_outside(
     distances = (means.double() - means.double().median(0).values).norm(dim=1)
     within = distances.kthvalue(max(1, math.ceil(0.75 * len(distances)))).values
     return distances > FAR * within if within > 0 else torch.zeros_like(distances, dtype=torch.bool)
-
-
-def _columns(vertices: NDArray[np.void], names: tuple[str, str, str], path: str | Path) -> NDArray[np.float64]:
-    """Return three properties of PLY vertices as [P, 3] float64; raise InputError if a value is not finite."""
-    for name in names:
-        if name not in (vertices.dtype.names or ()):
-            raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")
-    columns = np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
-    if not (np.abs(columns) <= np.finfo(np.float32).max).all():
-        raise InputError(f"{path}: {' '.join(names)}: expected finite numbers, some are not")
-    return columns

@@ -112,17 +112,11 @@ class Placement:
         """Return the distance of neighbouring floats at the scene, in units of the cameras' distance."""
         return 2**-23 * max(map(abs, self.center)) / (self.unit * STANDARD)
 
-    def to_standard(
-        self,
-        positions: Tensor,  # [.., 3] in the user's coordinates
-    ) -> Tensor:  # [.., 3] float32
+    def to_standard(self, positions: Tensor) -> Tensor:  # [.., 3] in the user's coordinates -> [.., 3] float32
         """Convert positions to the coordinates of the training; the difference is taken in double precision."""
         return ((positions.double() - positions.new_tensor(self.center, dtype=torch.float64)) / self.unit).float()
 
-    def to_user(
-        self,
-        positions: Tensor,  # [.., 3] in the coordinates of the training
-    ) -> Tensor:  # [.., 3] float64
+    def to_user(self, positions: Tensor) -> Tensor:  # [.., 3] in the coordinates of the training -> [.., 3] float64
         """Convert positions to the user's coordinates."""
         return positions.double() * self.unit + positions.new_tensor(self.center, dtype=torch.float64)
 
@@ -185,9 +179,7 @@ def hold_out(views: list[View], every: int) -> tuple[list[View], list[View]]:
     return [view for i, view in enumerate(views, 1) if i % every], views[every - 1 :: every]
 
 
-def to_floats(
-    pixels: Tensor,  # [..] floats in [0, 1] or 8 bits
-) -> Tensor:
+def to_floats(pixels: Tensor) -> Tensor:  # [..] floats in [0, 1] or 8 bits
     """Return the values of an image in [0, 1]; those of 8 bits are divided by 255."""
     if pixels.is_floating_point():
         return pixels
@@ -196,9 +188,7 @@ def to_floats(
     return pixels.float().div_(torch.full((), 255.0, device=pixels.device))
 
 
-def scene_extent(
-    viewmats: Tensor,  # [C, 4, 4] the training cameras
-) -> float:
+def scene_extent(viewmats: Tensor) -> float:  # [C, 4, 4] the training cameras
     """Return the extent of a scene: 1.1 x the largest distance of a camera from the mean camera position.
 
     3DGS computes the extent in the same way (`getNerfppNorm`). Learning rates of positions and the threshold between
@@ -209,9 +199,7 @@ def scene_extent(
     return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
 
 
-def up_of(
-    viewmats: Tensor,  # [C, 4, 4] the training cameras
-) -> tuple[float, float, float]:
+def up_of(viewmats: Tensor) -> tuple[float, float, float]:  # [C, 4, 4] the training cameras
     """Estimate which way is up from the cameras, for data whose world axes are arbitrary, as COLMAP's are.
 
     The mean of the cameras' up vectors leans towards the scene if the cameras look down and stand on one side of it.

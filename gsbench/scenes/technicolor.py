@@ -43,24 +43,18 @@ def load(
     downscale: int,
     background: tuple[float, float, float],
     resize: str | None = None,
-    frames: tuple[int, int] | None = None,
+    frames: tuple[int, int] | None = None,  # the first and the last
     repair: tuple[str, ...] = (),
 ) -> Scene:
-    """Load a scene of the Technicolor light field data (Sabater et al. 2017).
+    """Load a scene of the Technicolor light field data (Sabater et al. 2017); see `gsbench.scenes.load`.
 
     The folder has images `<Scene>_undist_<frame>_<camera>.png` and a table of cameras `cameras_parameters.txt` with
     intrinsics in pixels and poses (world to camera, OpenCV axes). Camera 10 is the test split, the others are for
     training. Times are 0 for the first frame to 1 for the last. Initial points come from a COLMAP model in `sparse/0`
     or from `points3d.ply`, if one of these exists.
 
-    Args:
-        root: the folder of the scene.
-        downscale: the integer factor by which images are reduced; with 1 they stay in 8 bits.
-        background: the background colour of renders; the images of the data set are opaque.
-        resize: the filter by which images are reduced; None: the mean of blocks.
-        frames: the first and the last frame to load; None: all frames.
-        repair: names of damaged images, such as Birthday_undist_00173_09, each replaced by the image of the same camera
-            one frame before. Names of other scenes are ignored, so that the scenes of a data set can share a list.
+    Names in `repair`, such as Birthday_undist_00173_09, are those of damaged images, each replaced by the image of the
+    same camera one frame before. Names of other scenes are ignored, so that the scenes of a data set can share a list.
 
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file. An image in `repair` is
@@ -106,7 +100,10 @@ def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
         where = f"{source}: camera {i}"
         if len(values) != len(header):
             raise InputError(f"{where}: expected {len(header)} numbers as the header has names, got {len(values)}")
-        row = {name: _number(value, f"{where}: {name}") for name, value in zip(header, values, strict=True)}
+        row = {
+            name: files.number(value, 1e9, f"{where}: {name}: expected a number")
+            for name, value in zip(header, values, strict=True)
+        }
         for name in ("sk", *DISTORTION):
             if row.get(name, 0.0) != 0:
                 raise InputError(f"{where}: {name}: expected 0, a pinhole camera, got {row[name]}: take the release's "
@@ -117,16 +114,6 @@ def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
             raise InputError(f"{where}: expected a unit quaternion qw qx qy qz")
         rows.append(row)
     return rows
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not abs(number) < 1e9:
-        raise InputError(f"{where}: expected a number, got {text[:40]!a}")
-    return number
 
 
 def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:

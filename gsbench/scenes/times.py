@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError
 from gsbench.reading import read_file
-from gsbench.scenes.files import digest, without_suffix
+from gsbench.scenes.files import digest, number, without_suffix
 
 TABLE = "times.csv"
 _MAX_TABLE = 1 << 26  # bytes of times.csv
@@ -123,34 +123,24 @@ def table_of(root: Path) -> Path | None:
     return root / (TABLE if TABLE in names else names[0]) if names else None
 
 
-def of_names(
-    names: Sequence[str],  # of images, with folders
-    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
-    places: Sequence[Hashable],  # from `places_of`
-    source: Path,  # the file that names the images, for messages
-) -> Times:
+def of_names(names: Sequence[str], viewmats: NDArray[np.float64], places: Sequence[Hashable], source: Path) -> Times:
     """Return the time of each image from a number in its name, scaled to [0, 1]; None for all without such numbers."""
     columns = _columns(names, source)
     changing = [column for column in columns if len(set(column.values)) > 1]
     if not changing:
         if columns:
-            _check_distinct(names, [Fraction(0)] * len(names), places, f"{source}: ")
+            check_distinct(names, [Fraction(0)] * len(names), places, source)
         why = "the numbers in the names do not change" if columns else "the names have no numbers"
         return Times([None] * len(names), [f"times: none, as {why} and there is no {TABLE}"])
     column = _time_among(changing, names, viewmats, places, source)
     if column is None:
         note = f"times: none, as the names have only the number of the camera; write {TABLE} if the scene moves"
         return Times([None] * len(names), [note])
-    _check_distinct(names, column.values, places, f"{source}: ")
+    check_distinct(names, column.values, places, source)
     return Times([*_scaled(column.values)], [_described(column, names)])
 
 
-def of_table(
-    data: bytes,  # of times.csv
-    path: Path,
-    names: Sequence[str],  # of images, with folders
-    places: Sequence[Hashable],  # from `places_of`
-) -> Times:
+def of_table(data: bytes, path: Path, names: Sequence[str], places: Sequence[Hashable]) -> Times:  # data: of times.csv
     """Return the time of each image from times.csv, scaled to [0, 1]; None for all if all times are equal.
 
     The table has a first line with `name` and `time`, in any case and order. Columns are separated by commas,
@@ -170,12 +160,12 @@ def of_table(
             f"{path}: expected the first line name,time, got {','.join(columns)[:60]!a}", docs="data.md#times"
         )
     table: dict[str, Fraction] = {}
-    for number, row in filled[1:]:
+    for line, row in filled[1:]:
         cells = dict(zip(columns, row, strict=False))
         name, text = cells.get("name", ""), cells.get("time", "")
         if len(row) < len(columns) or any(row[len(columns) :]) or not name or name in table:
-            raise InputError(f"{path}: line {number}: expected a name, once, and its time, got {','.join(row)[:60]!a}")
-        table[name] = _exact(text.replace(",", ".") if separator == ";" else text, f"{path}: line {number}")
+            raise InputError(f"{path}: line {line}: expected a name, once, and its time, got {','.join(row)[:60]!a}")
+        table[name] = _exact(text.replace(",", ".") if separator == ";" else text, f"{path}: line {line}")
     loose: dict[str, list[str]] = defaultdict(list)
     for name in table:
         loose[_loose(name)].append(name)
@@ -191,7 +181,7 @@ def of_table(
     rest += f"; columns that are not read: {', '.join(others)[:60]!a}" if any(others) else ""
     if len(set(values)) == 1:
         return Times([None] * len(names), [f"times: none, as all times of {TABLE} are equal{rest}"])
-    _check_distinct(names, values, places, f"{path}: ")
+    check_distinct(names, values, places, path)
     first, last = float(min(values)), float(max(values))
     return Times([*_scaled(values)], [f"times: {TABLE}, {first:.10g} to {last:.10g}, scaled to [0, 1]{rest}"])
 
@@ -224,45 +214,33 @@ def of_fields(
 
 
 def check_distinct(
-    names: Sequence[str],  # of images
-    times: Sequence[float | None],
-    places: Sequence[Hashable],  # from `places_of`
-    where: str,
-) -> None:
-    """Raise InputError if two images of a fixed camera have the same time."""
-    if all(time is not None for time in times):
-        _check_distinct(
-            names, [Fraction(time or 0.0) for time in times], places, f"{where}: ", "give them their own times"
-        )
-
-
-def _check_distinct(
     names: Sequence[str],
-    values: Sequence[Fraction],
+    times: Sequence[float | Fraction | None],
     places: Sequence[Hashable],
-    where: str,
+    source: Path,
     cure: str = f"write {TABLE}, or correct it",
 ) -> None:
-    seen: dict[tuple[Hashable, Fraction], str] = {}
-    for name, value, place in zip(names, values, places, strict=True):
-        other = seen.setdefault((place, value), name)
+    """Raise InputError if two images of a fixed camera have the same time."""
+    first: dict[tuple[Hashable, float | Fraction], str] = {}
+    for name, time, place in zip(names, times, places, strict=True):
+        other = name if time is None else first.setdefault((place, time), name)
         if other != name:
-            raise InputError(f"{where}images {other[:80]!a} and {name[:80]!a}: expected different times, as their pose "
-                             f"and intrinsics are equal, got the same: {cure}", docs="data.md#times")  # fmt: skip
+            raise InputError(f"{source}: images {other[:80]!a} and {name[:80]!a}: expected different times, as their "
+                             f"pose and intrinsics are equal, got the same: {cure}", docs="data.md#times")  # fmt: skip
 
 
 def _columns(names: Sequence[str], source: Path) -> list[_Column]:
     """Return the numbers that all names have, place by place from the right."""
     numbers = _numbers(names, source)
-    least = min(len(one) for one in numbers)
+    least = min(len(row) for row in numbers)
     if not least and any(numbers):
-        name = next(name for name, one in zip(names, numbers, strict=True) if not one)
+        name = next(name for name, row in zip(names, numbers, strict=True) if not row)
         raise InputError(f"{source}: image {name[:80]!a}: expected a number in its name, as others have: rename it, or "
                          f"write {TABLE}", docs="data.md#times")  # fmt: skip
-    columns = [_Column(tuple(one[at] for one in numbers), len(numbers[0]) + at + 1, len(numbers[0]))
+    columns = [_Column(tuple(row[at] for row in numbers), len(numbers[0]) + at + 1, len(numbers[0]))
                for at in range(-least, 0)]  # fmt: skip
-    if len({len(one) for one in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
-        few, many = (next(name for name, one in zip(names, numbers, strict=True) if len(one) == count)
+    if len({len(row) for row in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
+        few, many = (next(name for name, row in zip(names, numbers, strict=True) if len(row) == count)
                      for count in (least, max(map(len, numbers))))  # fmt: skip
         raise InputError(f"{source}: images {few[:60]!a} and {many[:60]!a}: expected names of one form, the first has "
                          f"fewer numbers: rename them, or write {TABLE}", docs="data.md#times")  # fmt: skip
@@ -275,15 +253,15 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
     moments: list[re.Match[str] | None] = [None] * len(names)
     for pattern in _MOMENTS:
         matches = [list(pattern.finditer(name)) for name in plain]
-        if all(len(one) == 1 for one in matches):
-            moments = [one[0] for one in matches]
+        if all(len(match) == 1 for match in matches):
+            moments = [match[0] for match in matches]
             break
-    number = _DECIMAL if _have_decimals(plain) else _WHOLE
-    found = []
+    pattern = _DECIMAL if _have_decimals(plain) else _WHOLE
+    listed = []
     for name, moment in zip(plain, moments, strict=True):
         numbers, at = [], 0
         inside = moment.span() if moment else (-1, -1)
-        spans = [match.span() for match in number.finditer(name)]
+        spans = [match.span() for match in pattern.finditer(name)]
         spans = [(a, b) for a, b in spans if b <= inside[0] or a >= inside[1]] if moment else spans
         for start, end in sorted([*spans, *([inside] if moment else [])]):
             label = name[at:start].rpartition("/")[2]
@@ -292,8 +270,8 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
                      _exact(name[start:end], f"{source}: image {name[start:end][:40]}"))  # fmt: skip
             numbers.append(_Number(value, label, is_moment))
             at = end
-        found.append(numbers)
-    return found
+        listed.append(numbers)
+    return listed
 
 
 def _have_decimals(names: Sequence[str]) -> bool:
@@ -321,19 +299,9 @@ def _seconds(moment: re.Match[str], source: Path) -> Fraction:
 
 def _exact(text: str, where: str) -> Fraction:
     """Convert a number exactly: nanoseconds of a clock have more digits than a float."""
-    number = _number(text, where)
-    is_short = len(text) < _LONGEST and abs(number) >= _SMALLEST
-    return Fraction(text) if is_short else Fraction(number)
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        number = float(text) if "_" not in text else np.nan
-    except ValueError:
-        number = np.nan
-    if not abs(number) <= _LARGEST:
-        raise InputError(f"{where}: expected a time, got {text[:40]!a}", docs="data.md#times")
-    return number
+    value = number(text, _LARGEST, f"{where}: expected a time")
+    is_short = len(text) < _LONGEST and abs(value) >= _SMALLEST
+    return Fraction(text) if is_short else Fraction(value)
 
 
 def _time_among(

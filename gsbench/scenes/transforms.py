@@ -34,6 +34,7 @@ _NERFSTUDIO_KEYS = frozenset((*_SPLITS, "ply_file_path", "applied_transform", "a
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 _FRAME_KEYS = {"file_path", "transform_matrix", "time", "rotation"}  # NeRF-synthetic's rotation is not part of the pose
 _MOST_KEYS = 8  # named in a sentence
+_OWN_TIMES = "give them their own times"
 _SMALLEST = 1e-6  # pixels; smaller lengths become zero in single precision
 _LARGEST = 1e30  # largest number in a file; its square in double and its sums in single precision are finite
 _AGREE = 1e-3  # relative tolerance between two statements of one focal length
@@ -307,12 +308,10 @@ def _times(splits: dict[str, Split]) -> tuple[dict[str, list[float | None]], lis
     if splits["train"].frames[0].time is None:
         return {name: [None] * len(split.frames) for name, split in splits.items()}, []
     for split in splits.values():
-        times.check_distinct(
-            [frame.name for frame in split.frames], [frame.time for frame in split.frames], _places_of(split.frames),
-            str(split.source),
-        )  # fmt: skip
-    fields = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits.values()}
-    timed, notes = times.of_fields(fields)
+        names, fields = [frame.name for frame in split.frames], [frame.time for frame in split.frames]
+        times.check_distinct(names, fields, _places_of(split.frames), split.source, _OWN_TIMES)
+    by_file = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits.values()}
+    timed, notes = times.of_fields(by_file)
     return {name: timed[str(split.source)] for name, split in splits.items()}, notes
 
 
@@ -357,7 +356,7 @@ def _nerfstudio_times(root: Path, split: Split) -> tuple[times.Times, dict[str, 
         viewmats = np.stack([frame.viewmat.double().numpy() for frame in split.frames])
         return times.of_images(root, names, viewmats, places, split.source)
     fields = [frame.time or 0.0 for frame in split.frames]
-    times.check_distinct(names, fields, places, str(split.source))
+    times.check_distinct(names, fields, places, split.source, _OWN_TIMES)
     timed, notes = times.of_fields({NERFSTUDIO: fields})
     return times.Times(timed[NERFSTUDIO], notes), {}
 

@@ -97,7 +97,7 @@ BAD_PLY = {
     "half a colour": (GOOD.replace(b"uchar blue", b"uchar b"), "blue"),
     "not a number, ascii": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 one"), "expected numbers"),
     "colour 256, ascii": (GOOD_ASCII.replace(b"1 1 1\n", b"1 1 256\n"), "blue"),
-    "position not finite": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 nan"), "x y z"),
+    "position not finite": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 nan"), "y: expected finite numbers, 3 of 3"),
     "float colour of 255": (ply(np.full(1, 255, [(n, "f4") for n, _ in VERTEX])), "red green blue"),
 }
 

@@ -113,7 +113,7 @@ def spoilt(name: str, value: float) -> np.ndarray:
         (np.ones(N, [(name, "f4") for name in "xyz"]), "cloud of points"),
         (np.ones(N, [(name, "f4") for name in columns(1)[:-1] if name != "f_rest_3"]), "f_rest"),
         (np.ones(N, [(name.replace("rest_3", "rest_33"), "f4") for name in columns(1)]), "'f_rest_3'"),
-        (spoilt("x", np.nan), r"a\.ply: x: expected finite numbers, 1 of 5 Gaussians"),
+        (spoilt("x", np.nan), r"a\.ply: x: expected finite numbers, 1 of 5 vertices"),
         (spoilt("scale_1", -np.inf), "scale_1: expected finite numbers, 1 of 5"),
         (spoilt("opacity", np.nan), "opacity: expected finite numbers, 1 of 5"),
         (np.zeros(N, [(name, "f4") for name in columns(0)]), "quaternions"),
