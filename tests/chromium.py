@@ -18,6 +18,6 @@ def launched(*flags: str) -> Iterator[Any]:
         pytest.skip("needs Debian's chromium: apt-get install chromium (or CHROMIUM=FILE)")
     api = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is in the dev extra")
     with api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *flags])
-        yield found
-        found.close()
+        path = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *flags])
+        yield path
+        path.close()

@@ -32,7 +32,7 @@ def _sources(repo: Any) -> object:
         folder = source.path.removeprefix("file://")
         for where, folders, names in os.walk(folder) if source.scheme() == "file" else ():
             folders.sort()
-            files += [(where, name, (found := os.stat(Path(where, name))).st_mtime_ns, found.st_size)
+            files += [(where, name, (status := os.stat(Path(where, name))).st_mtime_ns, status.st_size)
                       for name in sorted(names)]  # fmt: skip
     return (*((source.scheme(), source.path) for source in repo.get_sources()), *files,
             pickle.dumps(ConfigStore.instance().repo))  # fmt: skip

@@ -23,9 +23,9 @@ def run_through_kills(
     """Repeat a run that is killed after so many checkpoints until it finishes, and return its record and folder."""
     written, attempts, save = 0, 0, checkpoint.save
 
-    def save_and_die(*given: Any) -> None:
+    def save_and_die(*arguments: Any) -> None:
         nonlocal written
-        save(*given)
+        save(*arguments)
         written += 1
         if written == saves:
             raise Killed
@@ -34,11 +34,11 @@ def run_through_kills(
     while True:
         written, attempts = 0, attempts + 1
         try:
-            found = run()
+            ended = run()
         except Killed:
             continue
         assert attempts > 1, "the run was never killed"
-        return found
+        return ended
 
 
 def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
@@ -57,8 +57,8 @@ def bits(folder: Path) -> dict[str, Any]:
     """The final state of a run without times and without what it chose on val, for `assert_same_bits`."""
     state = dict(checkpoint.read(folder / checkpoint.FILE_NAME).state)
     state["hooks"] = {name: hook for name, hook in state["hooks"].items() if name != "choices"}
-    found: dict[str, Any] = checkpoint.without_times(state)
-    return found
+    comparable: dict[str, Any] = checkpoint.without_times(state)
+    return comparable
 
 
 def assert_same_bits(a: object, b: object, where: str = "state") -> None:

@@ -42,9 +42,9 @@ for x, a, b in zip(raw, got, want, strict=True):
 def blocks() -> list[tuple[str, str | None, str]]:
     """The example's files: path, the line that the text goes before (None: a new file), the text."""
     page = (ROOT / "docs" / "adding_a_kernel.md").read_text()
-    found = re.findall(r"^`(gsbench/[\w/]+\.\w+)`(?:, before `(.*?)`)?:\n\n```\w+\n(.*?)^```", page,
+    listings = re.findall(r"^`(gsbench/[\w/]+\.\w+)`(?:, before `(.*?)`)?:\n\n```\w+\n(.*?)^```", page,
                        flags=re.MULTILINE | re.DOTALL)  # fmt: skip
-    return [(path, before or None, text) for path, before, text in found]
+    return [(path, before or None, text) for path, before, text in listings]
 
 
 def test_it_touches_fewer_than_eight_files() -> None:

@@ -20,16 +20,16 @@ from gsbench.scenes.gaussian_ply import ply_of, read_trained
 def blocks() -> dict[str, str]:
     """The example's two files by their path in the project."""
     page = (ROOT / "docs" / "adding_a_model.md").read_text()
-    found = re.findall(r"^`([\w/]+\.(?:py|yaml))`:\n\n```\w+\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    assert len(found) == 2
-    return dict(found)
+    results = re.findall(r"^`([\w/]+\.(?:py|yaml))`:\n\n```\w+\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    assert len(results) == 2
+    return dict(results)
 
 
 def methods_for_gates() -> str:
     """The methods that the page adds to the example so that gates can simplify it."""
     page = (ROOT / "docs" / "adding_a_model.md").read_text()
-    (found,) = re.findall(r"^```py\n(def static.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    return textwrap.indent(found.replace("\n\n\n", "\n\n"), "    ")
+    (results,) = re.findall(r"^```py\n(def static.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+    return textwrap.indent(results.replace("\n\n\n", "\n\n"), "    ")
 
 
 # An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
@@ -89,28 +89,28 @@ def gated(project: Path, data: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def records(results: Path) -> dict[str, Record]:
-    return {found.model: found for found in map(record.read, record.find(results))}
+    return {results.model: results for results in map(record.read, record.find(results))}
 
 
 def test_the_worked_example_trains_with_and_without_agr_and_is_gated(gated: Path) -> None:
     """Catches documentation that no longer runs: a copy of the project, the page's two files, a short run of each."""
-    found = records(gated)
+    results = records(gated)
     for label in ("gated_balls", "gated_balls_agr"):
-        assert found[label].status == "ok", found[label].reason
-        assert found[label].on_demand is not None
-        assert found[label].on_demand.gates
+        assert results[label].status == "ok", results[label].reason
+        assert results[label].on_demand is not None
+        assert results[label].on_demand.gates
 
 
 def test_a_model_that_cannot_be_gated_is_refused_before_step_0(gated: Path) -> None:
     """Catches a training that is lost at its gate, after the last step, to a method that the model lacks."""
-    found = records(gated)
+    results = records(gated)
     for label in ("blinks", "blinks_agr"):
-        assert found[label].status == "failed"
-        assert found[label].reason == (
+        assert results[label].status == "failed"
+        assert results[label].reason == (
             "effects.gate: expected a model that gates can simplify, Balls is no GatedModel: make it one, "
             "or use effects.gate=off (docs/adding_a_model.md)"
         )
-        assert found[label].provenance.data_hash == "not loaded"  # a run that began to train has the hash
+        assert results[label].provenance.data_hash == "not loaded"  # a run that began to train has the hash
 
 
 def test_export_start_from_a_ply_and_a_nan(project: Path, data: Path, gated: Path, tmp_path: Path) -> None:
@@ -127,12 +127,12 @@ def test_export_start_from_a_ply_and_a_nan(project: Path, data: Path, gated: Pat
     start = f"+init.ply={tmp_path}/balls.ply,{tmp_path}/bright.ply"
     done = run(project, "gsbench", "-m", *overrides(data, tmp_path / "started", "model=balls,blinks", start))
     assert "Traceback" not in done.stderr, done.stderr
-    found = [record.read(path) for path in record.find(tmp_path / "started")]
-    assert sorted((one.model, one.status) for one in found) == [
+    results = [record.read(path) for path in record.find(tmp_path / "started")]
+    assert sorted((run_record.model, run_record.status) for run_record in results) == [
         ("balls", "diverged"), ("balls", "ok"), ("blinks", "diverged"), ("blinks", "ok")
     ]  # fmt: skip
-    for one in found:
-        assert one.status == "ok" or "it resembles the stability case 'loud_harmonics'" in str(one.reason)
+    for run_record in results:
+        assert run_record.status == "ok" or "it resembles the stability case 'loud_harmonics'" in str(run_record.reason)
 
 
 def test_the_example_passes_the_linters(tmp_path: Path) -> None:

@@ -36,20 +36,20 @@ def test_every_stage_is_timed_once_and_has_a_floor() -> None:
     expected |= {"check values", "bin", "loss forward + backward", "Adam", "whole step"}
     for name in MODELS:
         agr = {"AGR forward", "AGR backward"} if name == "7dgs" else set()
-        found = [row.name.removeprefix(f"{name} ") for row in stage_rows if row.name.startswith(f"{name} ")]
-        assert sorted(found) == sorted(expected | agr)
+        names_of = [row.name.removeprefix(f"{name} ") for row in stage_rows if row.name.startswith(f"{name} ")]
+        assert sorted(names_of) == sorted(expected | agr)
     for name in SUCCESSORS:
-        found = [row.name for row in stage_rows if row.name.startswith(f"{name} ")]
-        assert found == [f"{name} slice forward", f"{name} slice backward"]
+        names_of = [row.name for row in stage_rows if row.name.startswith(f"{name} ")]
+        assert names_of == [f"{name} slice forward", f"{name} slice backward"]
 
 
 def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
     """Catches stages that are timed with every Gaussian visible, or with visible ones far apart."""
     for name in ("4dgs", "7dgs", "dgs", "dbs", "freetime"):
         fitted, view = scene.trained(name, 1600), one_view(32, 32)
-        seen = fitted.slice(Query.of(view.camera, view.time)).opacities >= ALPHA_MIN
-        assert abs(float(seen.float().mean()) - scene.VISIBLE) < 0.02
-        assert seen.unflatten(0, (-1, 16)).any(1).float().mean() < 0.6  # it is 1 in any order
+        gaussians = fitted.slice(Query.of(view.camera, view.time)).opacities >= ALPHA_MIN
+        assert abs(float(gaussians.float().mean()) - scene.VISIBLE) < 0.02
+        assert gaussians.unflatten(0, (-1, 16)).any(1).float().mean() < 0.6  # it is 1 in any order
 
 
 def test_gradients_of_a_stage_are_added_in_place() -> None:
@@ -68,8 +68,8 @@ def test_blended_alphas_are_those_of_the_image() -> None:
     view = one_view(32, 24)
     fitted = scene.model("3dgs", 4, sigma=0.3)
     fitted.select(torch.tensor([0]))
-    seen = fitted.slice(Query.of(view.camera, view.time))
-    drawn = rasterize_slice(seen, view.camera, torch.zeros(3), fitted.backend).alpha > 0
+    gaussians = fitted.slice(Query.of(view.camera, view.time))
+    drawn = rasterize_slice(gaussians, view.camera, torch.zeros(3), fitted.backend).alpha > 0
     assert 0 < drawn.sum() < drawn.numel()
     assert blended_alphas(recorded(fitted, view)["project"]) == drawn.sum()
     stacked = scene.model("3dgs", 20, sigma=30.0)  # each covers the image: 1e-4 of the light is left after some

@@ -41,9 +41,9 @@ def commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return subprocess.check_output(["git", "rev-parse", "HEAD"], cwd=root, text=True).strip()
 
 
-def install(found: Built, _: Path) -> None:
-    (found.folder / "site/gsbench").mkdir(parents=True)
-    (found.folder / "site/gsbench/__init__.py").write_text("MILLISECONDS = 2.5")
+def install(commit_built: Built, _: Path) -> None:
+    (commit_built.folder / "site/gsbench").mkdir(parents=True)
+    (commit_built.folder / "site/gsbench/__init__.py").write_text("MILLISECONDS = 2.5")
 
 
 def test_a_commit_is_measured_by_its_own_benchmarks(

@@ -14,7 +14,7 @@ def test_changed_data_runs_again_and_training_views_keep_their_score(tmp_path: P
 
     The training and what is measured on its views stay the same to the bit.
     """
-    data, found = write_moving_square(tmp_path / "data"), []
+    data, runs = write_moving_square(tmp_path / "data"), []
     arguments = overrides(data, tmp_path / "results", "model=3dgs")
     for is_changed in (False, True):
         done = gsbench(*arguments)
@@ -23,8 +23,8 @@ def test_changed_data_runs_again_and_training_views_keep_their_score(tmp_path: P
         (path,) = record.find(tmp_path / "results")
         metrics = record.read(path).metrics
         assert metrics is not None
-        found.append(metrics)
+        runs.append(metrics)
         for image in (data / "square" / "test").glob("*.png"):
             assert cv2.imwrite(str(image), np.full((SIZE, SIZE, 4), 255, np.uint8))
-    assert found[0]["psnr"] != found[1]["psnr"]
-    assert found[0]["psnr_train"] == found[1]["psnr_train"]
+    assert runs[0]["psnr"] != runs[1]["psnr"]
+    assert runs[0]["psnr_train"] == runs[1]["psnr_train"]

@@ -101,17 +101,17 @@ def test_what_is_typed_wrong_is_told_in_one_line(
 ) -> None:
     """Catches a stack trace, or a message that does not name the key, the nearest valid one, or what to do."""
     assert main_here(*arguments, *([f"results={tmp_path}"] if "+exp" in arguments[0] else [])) != 0
-    said = capsys.readouterr().err
-    errors = [line for line in said.splitlines() if line.startswith("gsbench: error:")]
-    assert errors, said
-    assert "Traceback" not in said
+    printed = capsys.readouterr().err
+    errors = [line for line in printed.splitlines() if line.startswith("gsbench: error:")]
+    assert errors, printed
+    assert "Traceback" not in printed
     for part in expected:
         assert part in errors[0]
     for path in record.find(tmp_path):  # a run that has a name leaves a row that says why it was refused
-        one = record.read(path)
-        assert (one.status, one.metrics) == ("failed", None)
-        assert one.reason is not None
-        assert one.reason in said
+        run = record.read(path)
+        assert (run.status, run.metrics) == ("failed", None)
+        assert run.reason is not None
+        assert run.reason in printed
 
 
 @pytest.mark.parametrize(
@@ -130,10 +130,10 @@ def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(
 def test_a_failed_run_says_its_reason_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches the reason on stdout and on stderr, which a terminal shows twice."""
     assert main_here("+exp=mini", "scene=suzanne", "train.iterations=0", f"results={tmp_path}") == 1
-    said = capsys.readouterr()
-    assert (said.out + said.err).count("train.iterations: expected") == 1
-    assert "failed; " in said.out
-    assert "record.json" in said.out
+    printed = capsys.readouterr()
+    assert (printed.out + printed.err).count("train.iterations: expected") == 1
+    assert "failed; " in printed.out
+    assert "record.json" in printed.out
 
 
 @pytest.mark.parametrize(("place", "root"), [("a/b/square", ""), ("a/square", ""), ("a/square", "a/square")])
@@ -158,17 +158,17 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
     sweep = ["-m", *overrides(square, tmp_path), "model=4dgs,3dgs", "agr=true,false"]
     first = gsbench(*sweep)
     assert first.returncode == 0, first.stderr
-    found = {one.model: one for one in map(record.read, record.find(tmp_path))}
-    assert set(found) == {"3dgs", "3dgs_agr", "4dgs", "4dgs_agr"}
-    for label, one in found.items():
-        assert one.status == "ok"
-        assert one.effects.refinement == label.endswith("_agr")
-        assert one.effects.time == label.startswith("4dgs")
-        assert one.metrics is not None
-        assert one.cost is not None
-        assert len(one.curve) == 2
-        assert one.metrics["psnr"] is not None
-        assert set(one.cost.stage_s) >= {"slice", "raster", "loss", "backward", "optimizer"}
+    runs = {run.model: run for run in map(record.read, record.find(tmp_path))}
+    assert set(runs) == {"3dgs", "3dgs_agr", "4dgs", "4dgs_agr"}
+    for label, run in runs.items():
+        assert run.status == "ok"
+        assert run.effects.refinement == label.endswith("_agr")
+        assert run.effects.time == label.startswith("4dgs")
+        assert run.metrics is not None
+        assert run.cost is not None
+        assert len(run.curve) == 2
+        assert run.metrics["psnr"] is not None
+        assert set(run.cost.stage_s) >= {"slice", "raster", "loss", "backward", "optimizer"}
         (pictures,) = (tmp_path / "dnerf" / "square").glob(f"{label},*/seed0/pictures.png")
         assert pictures.is_file()
     written = {p: p.stat().st_mtime_ns for p in record.find(tmp_path)}
@@ -182,8 +182,8 @@ def test_other_numbers_are_another_run(square: Path, tmp_path: Path) -> None:
     """Catches a sweep over a number of the recipe whose runs overwrite each other, and finished runs done again."""
     sweep = ["-m", *overrides(square, tmp_path, "model=3dgs", "train.iterations=30,31")]
     assert gsbench(*sweep).returncode == 0
-    for one in map(record.read, record.find(tmp_path)):
-        assert f"iterations={one.curve[-1].iteration}" in one.variant.split(",")
+    for run in map(record.read, record.find(tmp_path)):
+        assert f"iterations={run.curve[-1].iteration}" in run.variant.split(",")
     assert len(record.find(tmp_path)) == 2
     assert gsbench(*sweep).stdout.count("finished before, kept") == 2
 
@@ -247,7 +247,7 @@ def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "gsbench: error: broken: " in done.stderr
     assert "gone" in done.stderr
-    statuses = {one.scene: one.status for one in map(record.read, record.find(tmp_path / "results"))}
+    statuses = {run.scene: run.status for run in map(record.read, record.find(tmp_path / "results"))}
     assert statuses == {"broken": "failed", "square": "ok"}
 
 
@@ -271,13 +271,13 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path
     sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
     done = gsbench(*sweep, "model.lr.means.start=1e38")
     assert done.returncode == 1
-    found = [record.read(path) for path in record.find(tmp_path)]
-    assert len(found) == 2
-    for one in found:
-        assert one.status == "diverged"
-        assert one.reason is not None
-        assert one.reason.startswith("step 1: ")
-        assert one.metrics is None
+    runs = [record.read(path) for path in record.find(tmp_path)]
+    assert len(runs) == 2
+    for run in runs:
+        assert run.status == "diverged"
+        assert run.reason is not None
+        assert run.reason.startswith("step 1: ")
+        assert run.metrics is None
     assert done.stderr.count("gsbench: error: square: diverged: step 1: ") == 2
     assert "Error executing" not in done.stdout + done.stderr
 
@@ -296,6 +296,6 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(
 
     monkeypatch.setattr(step, "rasterize_slice", full)
     assert main_here("-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1") == 1
-    statuses = {one.seed: (one.status, one.reason) for one in map(record.read, record.find(tmp_path))}
+    statuses = {run.seed: (run.status, run.reason) for run in map(record.read, record.find(tmp_path))}
     reason = "out of memory: pictures need 9.0 MiB: lower the picture's size"
     assert statuses == {0: ("failed", reason), 1: ("ok", None)}

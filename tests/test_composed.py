@@ -29,11 +29,11 @@ def test_what_is_kept_is_what_hydra_composes(monkeypatch: pytest.MonkeyPatch) ->
     kept.append(composition(CONF, *WORDS[:-1]))
     monkeypatch.setattr(config_loader_impl, "create_defaults_list", create_defaults_list)
     monkeypatch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", composed._compose)
-    for found, words in ((kept[1], WORDS), (kept[2], WORDS[:-1])):
+    for composed_now, words in ((kept[1], WORDS), (kept[2], WORDS[:-1])):
         expected = composition(CONF, *words)
-        assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
-        assert OmegaConf.get_type(found, "train") is OmegaConf.get_type(expected, "train")
-        assert OmegaConf.is_struct(found) == OmegaConf.is_struct(expected)
+        assert OmegaConf.to_yaml(composed_now) == OmegaConf.to_yaml(expected)
+        assert OmegaConf.get_type(composed_now, "train") is OmegaConf.get_type(expected, "train")
+        assert OmegaConf.is_struct(composed_now) == OmegaConf.is_struct(expected)
 
 
 def test_a_file_that_changed_is_read_again(tmp_path: Path) -> None:

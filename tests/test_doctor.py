@@ -19,7 +19,7 @@ from gsbench.process import memory
 def checks(capsys, status: int = 0) -> dict[str, Check]:
     """The checks that `python -m gsbench doctor --json` prints, by name."""
     assert main_here("doctor", "--json") == status
-    return {found["name"]: Check(**found) for found in json.loads(capsys.readouterr().out)["checks"]}
+    return {listed["name"]: Check(**listed) for listed in json.loads(capsys.readouterr().out)["checks"]}
 
 
 def test_one_screen_names_every_part(capsys, monkeypatch):
@@ -30,13 +30,13 @@ def test_one_screen_names_every_part(capsys, monkeypatch):
     assert main_here("doctor") == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 20
-    found = checks(capsys)
-    assert lines == [check.line for check in found.values()]
-    assert found.keys() == {"gsbench", "python", "packages", "extras", "processor", "threads", "memory", "disk",
+    listed = checks(capsys)
+    assert lines == [check.line for check in listed.values()]
+    assert listed.keys() == {"gsbench", "python", "packages", "extras", "processor", "threads", "memory", "disk",
                             "compiler", "kernels", "gpu", "lpips alex", "lpips vgg", "data"}  # fmt: skip
-    assert torch.__version__ in found["packages"].found
-    assert found["memory"].found.startswith("3.0 of")
-    assert all(check.todo for check in found.values() if check.state == ABSENT and check.name != "gpu")
+    assert torch.__version__ in listed["packages"].found
+    assert listed["memory"].found.startswith("3.0 of")
+    assert all(check.todo for check in listed.values() if check.state == ABSENT and check.name != "gpu")
 
 
 @pytest.mark.parametrize("name", ["kernels", "disk", "threads"])
@@ -45,9 +45,9 @@ def test_a_part_that_is_broken_is_status_1_with_advice(name, capsys, monkeypatch
     monkeypatch.setattr(kernels, "_native", None if name == "kernels" else kernels._native)
     monkeypatch.setattr(doctor, "LEAST_DISK", 1 << 60 if name == "disk" else 0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4096 if name == "threads" else 1)
-    found = checks(capsys, status=1)
-    assert {check.name for check in found.values() if check.state == BROKEN} == {name}
-    assert found[name].todo
+    listed = checks(capsys, status=1)
+    assert {check.name for check in listed.values() if check.state == BROKEN} == {name}
+    assert listed[name].todo
 
 
 def test_the_compiler_is_the_one_that_builds(capsys, monkeypatch, tmp_path):
@@ -83,12 +83,12 @@ def test_missing_packages_and_an_unforeseen_error_are_lines(capsys, monkeypatch)
 
     monkeypatch.setattr(metadata, "version", version)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: crash())
-    found = checks(capsys, status=1)
-    assert found["packages"].found == "missing: scipy"
-    assert "view" in found["extras"].todo
-    assert "view" not in found["extras"].found
-    assert (found["disk"].state, found["disk"].found) == (BROKEN, "OSError: the disk")
-    assert found["data"].state == OK
+    listed = checks(capsys, status=1)
+    assert listed["packages"].found == "missing: scipy"
+    assert "view" in listed["extras"].todo
+    assert "view" not in listed["extras"].found
+    assert (listed["disk"].state, listed["disk"].found) == (BROKEN, "OSError: the disk")
+    assert listed["data"].state == OK
 
 
 @pytest.mark.parametrize("built", [True, False])
@@ -98,9 +98,9 @@ def test_a_gpu_is_named_with_its_kernels(built, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: device)
     monkeypatch.setattr(cuda, "_cuda", torch if built else None)
-    found = checks(capsys, status=0 if built else 1)["gpu"]
-    assert "Invented GPU, 80 GiB" in found.found
-    assert (found.state == OK) == built == (not found.todo)
+    listed = checks(capsys, status=0 if built else 1)["gpu"]
+    assert "Invented GPU, 80 GiB" in listed.found
+    assert (listed.state == OK) == built == (not listed.todo)
 
 
 def test_a_driver_without_a_device_is_told(capsys, monkeypatch):
@@ -109,13 +109,13 @@ def test_a_driver_without_a_device_is_told(capsys, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/nvidia-smi" if name == "nvidia-smi" else which(name))
     assert checks(capsys, status=1)["gpu"].state == BROKEN
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    found = checks(capsys)
-    assert (found["gpu"].state, found["compiler"].state) == (ABSENT, ABSENT)
+    listed = checks(capsys)
+    assert (listed["gpu"].state, listed["compiler"].state) == (ABSENT, ABSENT)
 
 
 def test_weights_that_are_here_need_no_advice(capsys, monkeypatch):
     """Catches advice to fetch what is there."""
     monkeypatch.setattr(perceptual, "is_here", lambda backbone: backbone == "alex")
-    found = checks(capsys)
-    assert (found["lpips alex"].state, found["lpips alex"].todo) == (OK, "")
-    assert found["lpips vgg"].todo == "python -m gsbench.fetch lpips-vgg"
+    listed = checks(capsys)
+    assert (listed["lpips alex"].state, listed["lpips alex"].todo) == (OK, "")
+    assert listed["lpips vgg"].todo == "python -m gsbench.fetch lpips-vgg"

@@ -29,7 +29,9 @@ def kept(name: str) -> list[dict[str, Any]]:
 def printed(outputs: list[Any]) -> str:
     """What cells printed."""
     return "".join(
-        "".join(one["text"]) for one in outputs if one["output_type"] == "stream" and one["name"] == "stdout"
+        "".join(output["text"])
+        for output in outputs
+        if output["output_type"] == "stream" and output["name"] == "stdout"
     )
 
 
@@ -64,10 +66,10 @@ def test_their_model_is_the_one_of_the_page() -> None:
     """Catches a notebook and a page that explain two different models by one name."""
     page = {Path(path).name: text.strip() for path, text in blocks().items()}
     assert page["balls.py"].partition("\n\n")[2].strip() in sources("first_look", "code")
-    own = sources("own_model", "code")
-    assert f"%%writefile own_model/balls.py\n{page['balls.py']}" in own
+    cells_of_model = sources("own_model", "code")
+    assert f"%%writefile own_model/balls.py\n{page['balls.py']}" in cells_of_model
     settings = page["balls.yaml"].replace("name: balls\n", "name: balls\nmodule: balls\n")
-    assert f"%%writefile own_model/model/balls.yaml\n{settings}" in own
+    assert f"%%writefile own_model/model/balls.yaml\n{settings}" in cells_of_model
 
 
 def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:

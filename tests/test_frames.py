@@ -35,19 +35,19 @@ class Refused(Recorded):
 
 def test_on_a_cpu_frames_are_launched() -> None:
     """Catches a protocol that speaks of replays where there are none."""
-    frame, made = measuring.frames(trainer(CPU), VIEW)
-    assert (frame(VIEW), made) == ("launched", {})
+    frame, frames = measuring.frames(trainer(CPU), VIEW)
+    assert (frame(VIEW), frames) == ("launched", {})
 
 
-@pytest.mark.parametrize(("replay", "made"), [(Recorded, "replayed"), (Refused, "launched")])
+@pytest.mark.parametrize(("replay", "frames"), [(Recorded, "replayed"), (Refused, "launched")])
 def test_on_a_gpu_the_record_says_which(
-    replay: type[Recorded], made: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    replay: type[Recorded], frames: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a finished training lost to a model that waits for the device, and an FPS that hides how it was made."""
     monkeypatch.setattr(measuring, "GraphedFrames", replay)
-    frame, told = measuring.frames(trainer(CUDA), VIEW)
-    assert (frame(VIEW), told) == (made, {"frames": made})
-    said = capsys.readouterr().err
-    assert ("cannot record this model: operation not permitted when stream is capturing\n" in said) == (
-        made == "launched"
+    frame, text = measuring.frames(trainer(CUDA), VIEW)
+    assert (frame(VIEW), text) == (frames, {"frames": frames})
+    text = capsys.readouterr().err
+    assert ("cannot record this model: operation not permitted when stream is capturing\n" in text) == (
+        frames == "launched"
     )

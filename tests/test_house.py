@@ -64,11 +64,11 @@ VAGUE_NAMES: dict[str, int] = {
 
 def modules(root: Path) -> dict[str, ast.Module]:
     """Every module of a package by its dotted name, parsed."""
-    found = {}
+    parsed = {}
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root.parent).with_suffix("").parts
-        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text())
-    return found
+        parsed[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = ast.parse(path.read_text())
+    return parsed
 
 
 def imports(parsed: dict[str, ast.Module]) -> dict[str, set[str]]:
@@ -78,15 +78,15 @@ def imports(parsed: dict[str, ast.Module]) -> dict[str, set[str]]:
     """
     graph: dict[str, set[str]] = {}
     for name, tree in parsed.items():
-        found: set[str] = set()
+        imported: set[str] = set()
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
+                imported |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 assert not node.level, f"{name}: expected absolute imports, got a relative one in line {node.lineno}"
                 whole = [f"{node.module}.{alias.name}" for alias in node.names]
-                found |= {one if one in parsed else str(node.module) for one in whole}
-        graph[name] = (found & parsed.keys()) - {name}
+                imported |= {module if module in parsed else str(node.module) for module in whole}
+        graph[name] = (imported & parsed.keys()) - {name}
     return graph
 
 
@@ -99,12 +99,12 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
             return [*path[path.index(name) :], name]
         if name not in done:
             for imported in sorted(graph[name]):
-                if found := visit(imported, [*path, name]):
-                    return found
+                if cycle := visit(imported, [*path, name]):
+                    return cycle
             done.add(name)
         return []
 
-    return next((found for name in graph if (found := visit(name, []))), [])
+    return next((cycle for name in graph if (cycle := visit(name, []))), [])
 
 
 def folder(module: str) -> str:
@@ -144,7 +144,7 @@ def patched(tree: ast.Module) -> set[str]:
             if whole.partition(".")[0] not in {"gsbench", *sys.stdlib_module_names}:
                 foreign.add(alias.asname or alias.name.partition(".")[0])
     targets = [target for node in ast.walk(tree) if isinstance(node, ast.Assign) for target in node.targets]
-    targets += [one for target in targets if isinstance(target, ast.Tuple) for one in target.elts]
+    targets += [part for target in targets if isinstance(target, ast.Tuple) for part in target.elts]
     places = [ast.unparse(target).partition(".")[0] for target in targets if isinstance(target, ast.Attribute)]
     return foreign & set(places)
 
@@ -194,8 +194,8 @@ def test_imports_run_down() -> None:
 
 def test_libraries_are_changed_in_known_places() -> None:
     """Catches a module that changes another library, which no file of this list names."""
-    found = {name: names for name, tree in GSBENCH.items() if (names := patched(tree))}
-    assert found == {
+    changed = {name: names for name, tree in GSBENCH.items() if (names := patched(tree))}
+    assert changed == {
         "gsbench.view.request_guard": {"websockets_server"},
     }
 

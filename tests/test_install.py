@@ -55,8 +55,8 @@ def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist: Path, tm
         archive.extractall(tmp_path / "source", filter="data")
     (source,) = (tmp_path / "source").iterdir()
     # Any cmake will do for what is not built.
-    wheel, said = built("build_wheel", source, tmp_path, "cmake.version=>=3.22", CXX="/bin/false")
-    assert "the native kernels are not built, for want of a C++20 compiler" in " ".join(said.split())
+    wheel, printed = built("build_wheel", source, tmp_path, "cmake.version=>=3.22", CXX="/bin/false")
+    assert "the native kernels are not built, for want of a C++20 compiler" in " ".join(printed.split())
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "site")

@@ -18,30 +18,31 @@ GPL = re.compile(r"(?<!L)GPL|(?<!Lesser )General Public License")
 def test_every_dependency_is_listed() -> None:
     """Catches a dependency whose licence nobody has looked at."""
     assert licences.direct().keys() <= ROWS.keys()
-    assert {name_of(one.metadata["Name"]) for one in licences.along()} <= ROWS.keys()
+    assert {name_of(package.metadata["Name"]) for package in licences.along()} <= ROWS.keys()
     assert len(licences.along()) > 20
 
 
 @pytest.mark.parametrize("name", ROWS)
 def test_the_tables_say_what_the_metadata_say(name: str) -> None:
     """Catches a table that was written by hand, or before a dependency took another licence."""
-    version, said = ROWS[name]
+    version, text = ROWS[name]
     try:
-        found = metadata.distribution(name)
+        listed = metadata.distribution(name)
     except metadata.PackageNotFoundError:
         pytest.skip("not installed here")
-    licence = licence_of(found)
+    licence = licence_of(listed)
     assert licence
-    assert bool(GPL.search(licence)) == ("**GPL" in said)
-    if found.version.partition("+")[0] == version:  # of another version the text may differ
-        assert said.replace("*", "").partition("; ")[0] == licence
+    assert bool(GPL.search(licence)) == ("**GPL" in text)
+    if listed.version.partition("+")[0] == version:  # of another version the text may differ
+        assert text.replace("*", "").partition("; ")[0] == licence
 
 
 def test_no_user_installs_the_gpl() -> None:
     """Catches a library whose licence would become that of every program that imports gsbench."""
-    found = {one.metadata["Name"]: licence_of(one) for one in licences.installed(licences.of_users(), set())}
-    assert len(found) > 20
-    assert {name: said for name, said in found.items() if GPL.search(said)} == {}
+    every = licences.installed(licences.of_users(), set())
+    listed = {package.metadata["Name"]: licence_of(package) for package in every}
+    assert len(listed) > 20
+    assert {name: text for name, text in listed.items() if GPL.search(text)} == {}
 
 
 def test_the_gpl_would_be_found() -> None:
@@ -52,9 +53,9 @@ def test_the_gpl_would_be_found() -> None:
 def test_the_sbom_lists_what_users_install(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a bill of materials that leaves out what comes along, or has what only developers install."""
     licences.main(["--sbom"])
-    found = json.loads(capsys.readouterr().out)
-    named = {one["name"]: one for one in found["components"]}
-    assert found["metadata"]["component"]["purl"].startswith("pkg:pypi/gsbench-splatting@")
+    listed = json.loads(capsys.readouterr().out)
+    named = {package["name"]: package for package in listed["components"]}
+    assert listed["metadata"]["component"]["purl"].startswith("pkg:pypi/gsbench-splatting@")
     assert {"torch", "markupsafe", "viser"} <= named.keys()
     assert not {"plyfile", "pytest", "gsbench"} & named.keys()
     assert named["hydra-core"]["purl"] == f"pkg:pypi/hydra-core@{metadata.version('hydra-core')}"

@@ -20,14 +20,14 @@ def prose(page: Path) -> str:
 def slugs(page: Path) -> set[str]:
     """The anchors that GitHub gives the headings of a page."""
     text = re.sub(r"^(```+).*?^\1", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
-    seen: Counter[str] = Counter()
-    found = set()
+    counts: Counter[str] = Counter()
+    anchors = set()
     for heading in re.findall(r"^#+ +(.*?) *$", text, re.MULTILINE):
         words = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower()
         slug = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
-        found.add(f"{slug}-{seen[slug]}" if seen[slug] else slug)
-        seen[slug] += 1
-    return found
+        anchors.add(f"{slug}-{counts[slug]}" if counts[slug] else slug)
+        counts[slug] += 1
+    return anchors
 
 
 def broken(page: Path) -> list[str]:
@@ -60,7 +60,7 @@ def test_links_that_are_broken_are_found(tmp_path: Path) -> None:
         "# Own\n[a](../other.md#one-two-three) [b](#own) [c](https://a.b/c) `[d](e.md)` [f](../other.md#twice-1)\n"
         "```\n[g](h.md)\n```\n[i](j.md) [k](../other.md#four) [l](#m) [n](../../../../etc/hostname)\n"
     )
-    assert [one.split(": ")[1] for one in broken(page)] == [
+    assert [link.split(": ")[1] for link in broken(page)] == [
         "j.md",
         "../other.md#four",
         "#m",

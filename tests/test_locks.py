@@ -28,12 +28,12 @@ INSTALLED = (
 
 def locked(path: Path) -> dict[str, list[Requirement]]:
     """The requirements of a lock by name; where a package has no version for every Python, there are two."""
-    found: dict[str, list[Requirement]] = {}
+    by_name: dict[str, list[Requirement]] = {}
     for line in path.read_text().replace("\\\n", " ").splitlines():
         if line and not line.startswith("#"):
-            one = Requirement(line.partition(" --hash=")[0])
-            found.setdefault(canonicalize_name(one.name), []).append(one)
-    return found
+            requirement = Requirement(line.partition(" --hash=")[0])
+            by_name.setdefault(canonicalize_name(requirement.name), []).append(requirement)
+    return by_name
 
 
 ALL: dict[str, list[Requirement]] = {}
@@ -43,7 +43,7 @@ for lock in LOCKS:
 
 def holds(asked: Requirement) -> bool:
     """Whether every locked version of a package is one that is asked for."""
-    versions = [str(one.specifier).removeprefix("==") for one in ALL.get(canonicalize_name(asked.name), [])]
+    versions = [str(package.specifier).removeprefix("==") for package in ALL.get(canonicalize_name(asked.name), [])]
     return bool(versions) and all(asked.specifier.contains(version, prereleases=True) for version in versions)
 
 
@@ -62,8 +62,13 @@ TRACKERS = {"tensorboard", "wandb", "mlflow"}  # extras that `make` does not ins
 def test_what_gsbench_asks_for_is_locked() -> None:
     """Catches a dependency that is added to pyproject.toml or changed in constraints.txt without `make locks`."""
     asked = [*OURS["dependencies"], *PYPROJECT["build-system"]["requires"]]
-    asked += [one for name, extra in OURS["optional-dependencies"].items() if name not in TRACKERS for one in extra]
-    assert [one for one in asked if not holds(Requirement(one))] == []
+    asked += [
+        requirement
+        for name, extra in OURS["optional-dependencies"].items()
+        if name not in TRACKERS
+        for requirement in extra
+    ]
+    assert [package for package in asked if not holds(Requirement(package))] == []
     pins = (ROOT / "constraints.txt").read_text().splitlines()
     assert [pin for pin in pins if not pin.startswith("#") and not holds(Requirement(pin))] == []
     (cpu,) = locked(ROOT / "locks/torch_cpu.txt")["torch"]
@@ -114,13 +119,13 @@ def test_a_file_with_another_hash_is_refused(tmp_path: Path) -> None:
         str(tmp_path),
     ]
     right = hashlib.sha256(wheel.read_bytes()).hexdigest()
-    for digest, said in (("0" * 64, "DO NOT MATCH THE HASHES"), (right, "")):
+    for digest, message in (("0" * 64, "DO NOT MATCH THE HASHES"), (right, "")):
         lock.write_text(f"trial==1 --hash=sha256:{digest}\n")
         done = subprocess.run([*pip, "--target", str(tmp_path / "out"), "--requirement", str(lock)],
                               capture_output=True, text=True, check=False)  # fmt: skip
-        assert bool(done.returncode) == bool(said), done.stderr
-        assert said in done.stderr
-        assert (tmp_path / "out").exists() != bool(said)
+        assert bool(done.returncode) == bool(message), done.stderr
+        assert message in done.stderr
+        assert (tmp_path / "out").exists() != bool(message)
 
 
 def test_actions_are_named_by_commit() -> None:
@@ -128,4 +133,4 @@ def test_actions_are_named_by_commit() -> None:
     for path in (ROOT / ".github/workflows").glob("*.yml"):
         used = re.findall(r"uses: *(.*)", path.read_text())
         assert used
-        assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v[\d.]+", one) for one in used), used
+        assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v[\d.]+", requirement) for requirement in used), used

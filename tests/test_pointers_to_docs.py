@@ -14,7 +14,7 @@ from gsbench.errors import DOCS, InputError, TooLargeError
 SOURCES = sorted((ROOT / "gsbench").rglob("*.py"))
 
 
-def given(source: str) -> list[str]:
+def pointers_in(source: str) -> list[str]:
     """What the calls in a source give as `docs=`."""
     calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
     return [ast.literal_eval(word.value) for call in calls for word in call.keywords if word.arg == "docs"]
@@ -32,13 +32,13 @@ def test_pointers_lead_to_a_heading(path: Path) -> None:
     """Catches a page that was moved, and a heading that was reworded, under an error that names it."""
     source = path.read_text()
     written = re.findall(rf"\b{DOCS}/(\w+\.md(?:#[\w-]+)?)", source)
-    assert [pointer for pointer in (*given(source), *written) if missing(pointer)] == []
+    assert [pointer for pointer in (*pointers_in(source), *written) if missing(pointer)] == []
 
 
 def test_a_test_of_pointers_finds_them() -> None:
     """Catches a walk that sees no pointer, and a check that accepts any."""
-    assert sum(len(given(path.read_text())) for path in SOURCES) > 30
-    assert given("raise InputError(f'{x}', docs='data.md#fetching') from None") == ["data.md#fetching"]
+    assert sum(len(pointers_in(path.read_text())) for path in SOURCES) > 30
+    assert pointers_in("raise InputError(f'{x}', docs='data.md#fetching') from None") == ["data.md#fetching"]
     assert not missing("data.md#fetching")
     assert missing("data.md#fetched")
     assert missing("datum.md")
@@ -55,6 +55,6 @@ def test_the_printed_line_ends_with_the_pointer(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize("kind", [InputError, TooLargeError])
 def test_a_worker_sends_the_pointer(kind: type[InputError]) -> None:
     """Catches an error that cannot be unpickled in the process that started the worker, or that has two pointers."""
-    told = pickle.loads(pickle.dumps(kind("no images", docs="data.md")))
-    assert type(told) is kind
-    assert str(told) == "no images (docs/data.md)"
+    sent = pickle.loads(pickle.dumps(kind("no images", docs="data.md")))
+    assert type(sent) is kind
+    assert str(sent) == "no images (docs/data.md)"

@@ -38,10 +38,10 @@ def test_rates_of_the_paper() -> None:
     for iterations in (1000, 30_000):
         config = composed("model=7dgs", "+recipe=paper", f"train.iterations={iterations}")
         for progress in (0.0, 0.5):
-            found = rates(config, progress)
-            assert found["times"] == found["directions"] == 2.5e-2
-            assert found["log_diagonal"] == 5e-2
-            assert found["shape"] == found["motion"] == found["coupling"] == 1e-2
+            of_run = rates(config, progress)
+            assert of_run["times"] == of_run["directions"] == 2.5e-2
+            assert of_run["log_diagonal"] == 5e-2
+            assert of_run["shape"] == of_run["motion"] == of_run["coupling"] == 1e-2
         assert (config.agr, config.model.agr_octaves) == (True, 10)
         assert Schedule(config.train, 3, config.agr).densify_every == 100
         assert config.model.options["factor_order"] == "paper"
@@ -51,8 +51,8 @@ def test_rates_of_the_paper() -> None:
 def test_rates_of_the_authors_code() -> None:
     """Catches AGR, which that code does not have, a lambda that learns, and entries that are not row-scaled."""
     config = composed("model=7dgs", "+recipe=authors")
-    found = rates(config, 0.5)
-    assert (found["log_diagonal"], found["shape"], found["motion"], found["lambda"]) == (5e-3, 1e-3, 1e-3, 0)
+    of_run = rates(config, 0.5)
+    assert (of_run["log_diagonal"], of_run["shape"], of_run["motion"], of_run["lambda"]) == (5e-3, 1e-3, 1e-3, 0)
     assert not config.agr
     assert Schedule(composed("+recipe=authors", "train.iterations=30000").train, 3, agr=False).densify_every == 100
     assert config.model.options["lambda_t"] == config.model.options["lambda_d"] == 0.01
@@ -100,9 +100,9 @@ def test_trials_change_what_they_say(path: Path) -> None:
 def test_every_model_has_the_same_number_of_trials() -> None:
     """Catches a model that was tuned more than another."""
     folders = [folder for folder in (CONF / "trial").iterdir() if folder.is_dir()]
-    own = {folder.name: sorted(path.name for path in folder.glob("*.yaml")) for folder in folders}
-    assert own.keys() == {"3dgs", "4dgs", "6dgs", "7dgs", "dgs", "dbs", "freetime", "ubs"}
-    assert {len(names) for names in own.values()} == {5}
+    settings = {folder.name: sorted(path.name for path in folder.glob("*.yaml")) for folder in folders}
+    assert settings.keys() == {"3dgs", "4dgs", "6dgs", "7dgs", "dgs", "dbs", "freetime", "ubs"}
+    assert {len(names) for names in settings.values()} == {5}
 
 
 def test_the_suite_names_every_scene_once() -> None:
@@ -112,10 +112,10 @@ def test_the_suite_names_every_scene_once() -> None:
         listed = list(compose("config", ["+exp=suite", "scene=suite/trex100"]).data.scenes)
         assert sorted(listed) == sorted(f"suite/{path.stem}" for path in (CONF / "scene" / "suite").glob("*.yaml"))
         for name in listed:
-            one = compose("config", ["+exp=suite", f"scene={name}"])
-            assert f"suite/{one.scene.name}" == name
-            assert one.data.dataset in ("monocular", "rig", "array", "static")
-            assert (one.experiment, one.train.iterations, one.train.batch_size) == ("suite", 1000, 2)
+            value = compose("config", ["+exp=suite", f"scene={name}"])
+            assert f"suite/{value.scene.name}" == name
+            assert value.data.dataset in ("monocular", "rig", "array", "static")
+            assert (value.experiment, value.train.iterations, value.train.batch_size) == ("suite", 1000, 2)
 
 
 @pytest.mark.parametrize("folder", ["../other", "/etc", "a/../../b"])

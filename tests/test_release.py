@@ -37,7 +37,7 @@ def test_the_version_is_one() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert str(citation["version"]) == gsbench.__version__
     assert "version" not in PYPROJECT["project"]
-    (source,) = (one["input"] for one in PYPROJECT["tool"]["dynamic-metadata"] if one["field"] == "version")
+    (source,) = (entry["input"] for entry in PYPROJECT["tool"]["dynamic-metadata"] if entry["field"] == "version")
     assert f'__version__ = "{gsbench.__version__}"' in (ROOT / source).read_text()
     for page in ("CONTRIBUTING.md", "docs/install.md"):
         named = re.findall(r"(?:gsbench(?:_splatting)?[- ]|\bv)(\d+\.\d+\.\d+)", (ROOT / page).read_text())
@@ -59,19 +59,19 @@ STRANGERS = re.compile(r"gsbench\[[a-zA-Z]|pip3? install(?: +-\S+(?: +\S+\.txt)?
 
 def test_nobody_is_told_to_install_a_strangers_package() -> None:
     """Catches a page, a message, a workflow or an image that installs gsbench by that name, and that name itself."""
-    for told in (
+    for line in (
         "pip install 'gsbench[view]'",
         "`pip install gsbench`",
         "pip install -c c.txt gsbench==0.3",
         "gsbench[dev]",
     ):
-        assert STRANGERS.search(told), told
-    for told in (
+        assert STRANGERS.search(line), line
+    for line in (
         f"'{how_to_install('view')}'",
         "pip install gsbench_splatting-0.3.0-cp311.whl",
         "pip install -c c.txt .",
     ):
-        assert not STRANGERS.search(told), told
+        assert not STRANGERS.search(line), line
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
     if tracked.returncode:
         pytest.skip("not a checkout: git lists no files")
@@ -83,7 +83,7 @@ def test_nobody_is_told_to_install_a_strangers_package() -> None:
         if path.is_file() and path.name not in ("CHANGELOG.md", Path(__file__).name)
     }
     assert len(texts) > 300
-    assert {path: found[0] for path, text in texts.items() if (found := STRANGERS.search(text))} == {}
+    assert {path: match[0] for path, text in texts.items() if (match := STRANGERS.search(text))} == {}
     assert PYPROJECT["project"]["name"] != "gsbench"
     assert PYPROJECT["project"]["scripts"] == {"gsbench": extras.COMMAND}
 
@@ -114,23 +114,23 @@ def test_the_image_is_of_a_wheel_of_this_project() -> None:
     folder = ROOT / "containers"
     text = re.sub(r"\\\n\s*", "", (folder / "Dockerfile").read_text())
     steps = [(word, rest) for word, rest in re.findall(r"^([A-Z]+) (.*)$", text, re.MULTILINE)]
-    said = dict(steps)  # the last of each
-    *sources, target = said["COPY"].split()
-    (wheel,) = (one for one in sources if one.endswith(".whl"))
+    last_step = dict(steps)  # the last of each
+    *sources, target = last_step["COPY"].split()
+    (wheel,) = (entry for entry in sources if entry.endswith(".whl"))
     assert fnmatch.fnmatch(f"dist/{DISTRIBUTION}-{gsbench.__version__}-cp311-cp311-manylinux_2_28_x86_64.whl", wheel)
     assert "3.11" in PYTHONS
     assert "Python 3.11" in text  # of the base image
     kept = [line[1:] for line in (folder / "Dockerfile.dockerignore").read_text().splitlines() if line[0] == "!"]
     for source in sources:
-        assert any(fnmatch.fnmatch(source.replace("*", "x"), one) for one in kept), source
+        assert any(fnmatch.fnmatch(source.replace("*", "x"), entry) for entry in kept), source
         assert source == wheel or (ROOT / source).is_file()
     (install,) = (rest for word, rest in steps if "pip install" in rest and word == "RUN")
     assert f"--constraint {target}constraints.txt" in install
     (extras,) = re.findall(r"\$wheel\[([a-z,]+)\]", install)
     assert set(extras.split(",")) <= PYPROJECT["project"]["optional-dependencies"].keys()
     assert [word for word, _ in steps].index("USER") > steps.index(("RUN", install))
-    assert said["USER"] not in ("root", "0")
-    assert said["ENTRYPOINT"] == '["python", "-m", "gsbench"]'
+    assert last_step["USER"] not in ("root", "0")
+    assert last_step["ENTRYPOINT"] == '["python", "-m", "gsbench"]'
     definition = (folder / "gsbench.def").read_text()
     (archive,) = re.findall(r"^From: (.*)$", definition, re.MULTILINE)
     assert f"docker save gsbench -o {archive}" in definition
@@ -141,10 +141,10 @@ def test_the_image_is_of_a_wheel_of_this_project() -> None:
 def test_workflows_run_what_there_is(name: str) -> None:
     """Catches a target of make, a script or a file of a trigger that has been renamed."""
     parsed = workflow(name)
-    said = commands(parsed["jobs"])
-    targets = re.findall(r"^make ([a-z-]+)", said, re.MULTILINE)
+    lines = commands(parsed["jobs"])
+    targets = re.findall(r"^make ([a-z-]+)", lines, re.MULTILINE)
     assert all(re.search(rf"^{target}:", MAKEFILE, re.MULTILINE) for target in targets)
-    files = re.findall(r"tests/\w+\.py|constraints\.txt", said)
+    files = re.findall(r"tests/\w+\.py|constraints\.txt", lines)
     files += (parsed[True].get("pull_request") or {}).get("paths", [])  # YAML 1.1 reads `on` as true
     assert targets or files
     assert all(any(ROOT.glob(file)) for file in files)

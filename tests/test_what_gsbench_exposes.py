@@ -27,8 +27,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def examples(name: str) -> list[doctest.DocTest]:
     """The examples in the documentation of a public name."""
-    found = doctest.DocTestFinder(recurse=False).find(getattr(gsbench, name), name, globs={})
-    return [test for test in found if test.examples]
+    exposed = doctest.DocTestFinder(recurse=False).find(getattr(gsbench, name), name, globs={})
+    return [test for test in exposed if test.examples]
 
 
 def failures(tests: list[doctest.DocTest]) -> int:
@@ -84,9 +84,9 @@ def test_import_gsbench_is_quick() -> None:
 
 def test_star_gives_the_public_names() -> None:
     """Catches a name in `__all__` that nothing defines."""
-    given: dict[str, object] = {}
-    exec("from gsbench import *", given)
-    assert set(given) - {"__builtins__"} == set(gsbench.__all__)
+    arguments: dict[str, object] = {}
+    exec("from gsbench import *", arguments)
+    assert set(arguments) - {"__builtins__"} == set(gsbench.__all__)
 
 
 def test_a_name_that_is_not_public_is_refused() -> None:
@@ -98,14 +98,14 @@ def test_type_checkers_see_what_runs() -> None:
     """Catches a name that mypy takes from one module and Python from another, or that only one of them knows."""
     tree = ast.parse(Path(gsbench.__file__).read_text())
     guard = next(node for node in tree.body if isinstance(node, ast.If))
-    seen = {
+    visited = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
         for node in guard.body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    assert seen == gsbench._PUBLIC
-    assert sorted(seen) == gsbench.__all__
+    assert visited == gsbench._PUBLIC
+    assert sorted(visited) == gsbench.__all__
     assert (Path(gsbench.__file__).parent / "py.typed").is_file()
 
 

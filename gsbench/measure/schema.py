@@ -30,6 +30,8 @@ def parse(kind: type[T], plain: object, file: str, most: int = MOST_ENTRIES) -> 
         raise InputError(f"{file}: {place.strip('.`') or 'the file'}: {printable(text)[:300]}") from None
     except RecursionError:
         raise InputError(f"{file}: expected fewer objects within objects") from None
+    except UnicodeEncodeError:  # msgspec compares keys and choices as UTF-8, which has no lone surrogate
+        raise InputError(f"{file}: expected Unicode text, got half of a surrogate pair") from None
     return parsed
 
 

@@ -72,13 +72,13 @@ class Handler(BaseHTTPRequestHandler):
 @pytest.fixture
 def server() -> Iterator[ThreadingHTTPServer]:
     Handler.files, Handler.asked = {"file.bin": PAYLOAD, "dnerf.zip": GOOD}, []
-    made = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=made.serve_forever, args=(0.02,))
+    serving = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=serving.serve_forever, args=(0.02,))
     thread.start()
-    yield made
-    made.shutdown()
+    yield serving
+    serving.shutdown()
     thread.join()
-    made.server_close()
+    serving.server_close()
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_a_file_that_was_there_is_said_to_be(address: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("path", "sha256", "said"),
+    ("path", "sha256", "message"),
     [
         ("/cut/file.bin", None, "broke off"),
         ("/file.bin", "00000000", "expected file.bin with SHA-256 00000000"),
@@ -123,10 +123,10 @@ def test_a_file_that_was_there_is_said_to_be(address: str, tmp_path: Path) -> No
     ],
 )
 def test_what_is_not_the_file_is_not_kept(
-    path: str, sha256: str | None, said: str, address: str, tmp_path: Path
+    path: str, sha256: str | None, message: str, address: str, tmp_path: Path
 ) -> None:
     """Catches half a file, another file or a page of words in the place of weights."""
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         download(source(address + path, tmp_path, sha256), tmp_path)
     assert str(caught.value).isprintable()
     assert [*tmp_path.iterdir()] == []
@@ -159,10 +159,10 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again."""
-    for said in ("unpacked into", "nothing fetched"):
+    for message in ("unpacked into", "nothing fetched"):
         assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
         out = capsys.readouterr().out
-        assert said in out
+        assert message in out
         assert f"data.root={tmp_path}/data/dnerf/data has lego, trex" in out
     assert (tmp_path / "data/dnerf/data/a.txt").read_bytes() == b"a"
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["dnerf"]
@@ -170,7 +170,7 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
 
 
 @pytest.mark.parametrize(
-    ("archive", "said"),
+    ("archive", "message"),
     [
         (zipped({"a/../../evil": b""}), "outside"),
         (zipped({"/tmp/evil": b""}), "outside"),
@@ -192,14 +192,14 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
     ],
 )
 def test_a_hostile_or_damaged_archive_is_refused(
-    archive: bytes, said: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    archive: bytes, message: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     """Catches a file that is written beside the folder, and half a data set in it."""
     Handler.files["dnerf.zip"] = archive
     assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench.fetch:")]
-    assert said in line
+    assert message in line
     assert line.isprintable()
     assert [*(tmp_path / "data").iterdir()] == []
     assert not (tmp_path / "evil").exists()
@@ -234,7 +234,7 @@ def test_a_dry_run_fetches_nothing(
     assert fetched(address, tmp_path, monkeypatch, "--list") == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
     assert fetched(address, tmp_path, monkeypatch, "--list", "--json") == 0
-    listed = {one["name"]: (one["target"], one["there"]) for one in json.loads(capsys.readouterr().out)}
+    listed = {row["name"]: (row["target"], row["there"]) for row in json.loads(capsys.readouterr().out)}
     assert len(listed) == 4
     assert listed["dnerf"] == (f"{tmp_path}/data/dnerf", False)
 

@@ -52,7 +52,7 @@ def trainer(folder: Path) -> Trainer:
 def leaves(state: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The paths to everything in a nested state, the branches too."""
     members = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()
-    return [path, *(found for key, value in members for found in leaves(value, (*path, key)))]
+    return [path, *(leaf for key, value in members for leaf in leaves(value, (*path, key)))]
 
 
 def replaced(state: Any, path: tuple[Any, ...], change: Callable[[Any], Any]) -> Any:
@@ -83,12 +83,12 @@ def harm(draw: random.Random) -> Callable[[Any], Any]:
 
 def check(seeds: range, folder: Path) -> int:
     """Load harmed checkpoints; how many were refused."""
-    found = checkpoint.read(folder / checkpoint.FILE_NAME)
-    paths, fitted, refused = leaves(found.state), trainer(folder), 0
+    whole = checkpoint.read(folder / checkpoint.FILE_NAME)
+    paths, fitted, refused = leaves(whole.state), trainer(folder), 0
     for seed in seeds:
         draw = random.Random(seed)
         path = draw.choice(paths)
-        state = replaced(found.state, path, harm(draw))
+        state = replaced(whole.state, path, harm(draw))
         try:
             fitted.load_state_dict(state)
             fitted.model.set_active(fitted.schedule.active(5))
@@ -146,16 +146,16 @@ HOSTILE_STATES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 def endless(state: dict[str, Any]) -> dict[str, Any]:
     """A state with a list that holds itself."""
-    own: list[Any] = []
-    own.append(own)
-    return {**state, "hooks": own}
+    endless_list: list[Any] = []
+    endless_list.append(endless_list)
+    return {**state, "hooks": endless_list}
 
 
 @pytest.mark.parametrize("name", HOSTILE_STATES)
 def test_hostile_states_with_the_right_hash_are_one_line(name: str, folder: Path, tmp_path: Path) -> None:
     """Catches what a hash does not: someone else has written the file, hash and all."""
-    fitted, found = trainer(folder), checkpoint.read(folder / checkpoint.FILE_NAME)
-    path = rewritten(folder, tmp_path, state=HOSTILE_STATES[name](found.state)) / checkpoint.FILE_NAME
+    fitted, whole = trainer(folder), checkpoint.read(folder / checkpoint.FILE_NAME)
+    path = rewritten(folder, tmp_path, state=HOSTILE_STATES[name](whole.state)) / checkpoint.FILE_NAME
     with pytest.raises(InputError) as caught:
         fitted.load_state_dict(checkpoint.read(path).state)
     assert str(caught.value).isprintable()
@@ -220,15 +220,15 @@ VALUES = (None, -1, 0, 10**30, 1e300, "", "text", "../..", "${oc.env:HOME}", "${
 
 def test_any_value_in_a_config_or_a_scene_is_one_line(folder: Path) -> None:
     """Catches a division by recipe_iterations=0, and every other value that no run of gsbench has written."""
-    found, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
+    whole, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
     cases = [(part, path, draw.choice(VALUES)) for part in ("config", "scene")
-             for path in leaves(getattr(found, part)) if path]  # fmt: skip
+             for path in leaves(getattr(whole, part)) if path]  # fmt: skip
     never = [("config", ("train", "recipe_iterations"), 0), ("config", ("model", "options", "agr"), 1)]
     cases = [*draw.sample(cases, SAMPLE), *never]
     refused = 0
     for part, path, value in cases:
-        state = replaced(getattr(found, part), path, lambda _, value=value: value)
-        with monkeyread(Checkpoint(**{**vars(found), part: state})):
+        state = replaced(getattr(whole, part), path, lambda _, value=value: value)
+        with monkeyread(Checkpoint(**{**vars(whole), part: state})):
             refused += is_refused(folder, f"{part} {path} = {value!r}")
     assert refused > 0.4 * len(cases)
 
@@ -253,11 +253,11 @@ def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
 
 def test_a_config_and_a_scene_of_the_wrong_type_are_refused(folder: Path, tmp_path: Path) -> None:
     """Catches a stack trace for a checkpoint that someone else has written."""
-    found = checkpoint.read(folder / checkpoint.FILE_NAME)
-    for config, scene in (({}, found.scene), (found.config, {}), ({**found.config, "seed": "x"}, found.scene),
-                          ({**found.config, "train": 3}, found.scene), (found.config, {**found.scene, "extent": "x"}),
-                          (found.config, {**found.scene, "up": [0.0, 0.0, 0.0]}),
-                          ({**found.config, "model": {"name": "nosuch"}}, found.scene)):  # fmt: skip
-        checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("t", "d", found.state, config, scene))
+    whole = checkpoint.read(folder / checkpoint.FILE_NAME)
+    for config, scene in (({}, whole.scene), (whole.config, {}), ({**whole.config, "seed": "x"}, whole.scene),
+                          ({**whole.config, "train": 3}, whole.scene), (whole.config, {**whole.scene, "extent": "x"}),
+                          (whole.config, {**whole.scene, "up": [0.0, 0.0, 0.0]}),
+                          ({**whole.config, "model": {"name": "nosuch"}}, whole.scene)):  # fmt: skip
+        checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("t", "d", whole.state, config, scene))
         with pytest.raises(InputError):
             load_run(tmp_path)

@@ -15,7 +15,7 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "said"),
+    ("words", "status", "message"),
     [
         (["~seed"], 2, "config key 'seed': expected a value, it was deleted"),
         (["~init"], 2, "config key 'init': expected a value"),
@@ -33,22 +33,35 @@ def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["seed=-1"], 2, "seed: expected 0 <= seed"),
         (["results=/dev/null"], 2, "results: expected a folder that can be written"),
         (["trian.iterations=5"], 2, "trian"),
-        (["train.ssim_weight=2"], 1, "train.ssim_weight: expected 0 to 1"),
+        (["train.ssim_weight=2"], 1, "train.ssim_weight: expected 0 to 1, got 2"),
+        (["protocol.renders=5"], 1, "protocol.renders: expected 30 to 1000000, got 5"),
+        (["protocol.lpips_alex=/nowhere.npz"], 1, "/nowhere.npz: expected the weights"),
+        (["train.checkpoint_minutes=nan"], 1, "train.checkpoint_minutes: expected a finite number, got nan"),
+        (["seed=9223372036854775808"], 2, "seed: expected 0 <= seed < 2^63"),
+        (["train.densify.grad_threshold=nan"], 1, "train.densify.grad_threshold: expected a finite number"),
+        (["model.lr.means.start=-1"], 1, "model.lr.means.start: expected at least 0"),
+        (["+foo=1"], 1, "config key 'foo' is not known"),
+        (["+train.iteratons=1"], 1, "config key 'train.iteratons' is not known. Did you mean 'iterations'?"),
+        (["model=7dgs", "model.options.directional_half=no"], 1, "directional_half: expected bool, got 'no'"),
+        (["device=cpu:5"], 1, "device 'cpu:5' is not known"),
+        (["data.root=pkg://nosuch"], 1, "data.root: expected pkg://MODULE"),
         (["scene.downscale=16"], 1, "scene.downscale=16: expected images of at least 11 pixels"),
         (["train.coarse=[[2,3000]]"], 1, "train.coarse, after the factor 2: expected images of at least 11 pixels"),
         (["-m", "seed=0,1", "+launch=parallel", "launch.at_once=0"], 2, "launch.at_once: expected at least 1"),
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(
-    words: list[str], status: int, said: str, square: Path, tmp_path: Path,
+    words: list[str], status: int, message: str, square: Path, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """Catches a stack trace of gsbench's or of Hydra's, and one exit status for bad input and for failed runs."""
+    """Catches a stack trace of gsbench's or of Hydra's, one exit status for bad input and for failed runs, and a fault
+    that costs a whole training before it is noticed."""
     assert main_here(*overrides(square, tmp_path, "model=3dgs"), *words) == status
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: error:")]
     assert len(errors) == 1
-    assert said in errors[0]
+    assert message in errors[0]
     assert [record.read(path).status for path in record.find(tmp_path)] == (["failed"] if status == 1 else [])
+    assert not list(tmp_path.rglob("checkpoint.pt")), "refused after the training"
 
 
 def test_a_scene_without_a_name_says_which_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,9 +105,9 @@ def test_a_training_that_diverges_without_harmonics_has_a_record(
     words = overrides(square, tmp_path, "model=3dgs", "model.sh_degree=0", "model.lr.means.start=1e38")
     assert main_here(*words) == 1
     (path,) = record.find(tmp_path)
-    found = record.read(path)
-    assert found.status == "diverged"
-    assert "it resembles" in str(found.reason) or "no Gaussian's gradient" in str(found.reason)
+    written = record.read(path)
+    assert written.status == "diverged"
+    assert "it resembles" in str(written.reason) or "no Gaussian's gradient" in str(written.reason)
     capsys.readouterr()
 
 
@@ -109,9 +122,9 @@ def test_an_error_that_nobody_foresaw_is_a_record(
     monkeypatch.setattr("gsbench.run.attempt.Attempt.measure", fault)
     words = [*overrides(square, tmp_path, "model=3dgs"), "-m", "seed=0,1"]
     assert main_here(*words) == 1
-    found = [record.read(path) for path in record.find(tmp_path)]
-    assert [one.status for one in found] == ["failed", "failed"]
-    for one, path in zip(found, record.find(tmp_path), strict=True):
-        assert "did not foresee, ZeroDivisionError: here" in str(one.reason)
+    written = [record.read(path) for path in record.find(tmp_path)]
+    assert [run.status for run in written] == ["failed", "failed"]
+    for run, path in zip(written, record.find(tmp_path), strict=True):
+        assert "did not foresee, ZeroDivisionError: here" in str(run.reason)
         assert "in fault" in path.with_name("traceback.txt").read_text()
     capsys.readouterr()

@@ -7,7 +7,6 @@ import errno
 import io
 import os
 import random
-import re
 import signal
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -87,7 +86,6 @@ def end(words: list[str], square: Path, results: Path) -> str:
     except (InputError, HydraException, OmegaConfBaseException):
         return "refused"
     assert done is not None
-    assert done.status in record.STATUSES
     (path,) = record.find(results)
     assert record.read(path).status == done.status
     if done.status == "failed":
@@ -162,7 +160,7 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
         composed.seed = 1
         done = run(composed)
     assert done is not None
-    (path,) = (found.with_name(checkpoint.FILE_NAME) for found in tmp_path.rglob("seed1/record.json"))
+    (path,) = (written.with_name(checkpoint.FILE_NAME) for written in tmp_path.rglob("seed1/record.json"))
     assert (done.status, done.reason) == ("failed", f"{path}: No space left on device")
     with monkeypatch.context() as patched:
         patched.setattr(checkpoint, "save", full)
@@ -174,36 +172,3 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
         patched.setattr(claim, "create_atomically", full)
         with pytest.raises(InputError, match=r"seed2: the run cannot be claimed: .*No space left on device"):
             run(composed)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["protocol.renders=5"], "protocol.renders: expected 30 to 1000000, got 5"),
-        (["protocol.lpips_alex=/nowhere.npz"], "/nowhere.npz: expected the weights"),
-        (["train.checkpoint_minutes=nan"], "train.checkpoint_minutes: expected a finite number, got nan"),
-        (["seed=9223372036854775808"], "seed: expected 0 <= seed < 2^63"),
-        (["train.densify.grad_threshold=nan"], "train.densify.grad_threshold: expected a finite number"),
-        (["train.ssim_weight=2"], "train.ssim_weight: expected 0 to 1, got 2"),
-        (["model.lr.means.start=-1"], "model.lr.means.start: expected at least 0"),
-        (["+foo=1"], "config key 'foo' is not known"),
-        (["+train.iteratons=1"], "config key 'train.iteratons' is not known. Did you mean 'iterations'?"),
-        (["model=7dgs", "model.options.directional_half=no"], "directional_half: expected bool, got 'no'"),
-        (["device=cpu:5"], "device 'cpu:5' is not known"),
-        (["data.root=pkg://nosuch"], "data.root: expected pkg://MODULE"),
-    ],
-)  # fmt: skip
-def test_what_used_to_be_found_after_the_training_is_refused_before_it(
-    words: list[str], said: str, square: Path, tmp_path: Path
-) -> None:
-    """Catches faults that cost a whole training before they were noticed, and refusals that leave no row."""
-    composed = hydra.compose("config", [*overrides(square, tmp_path, "model=3dgs"), *words])
-    if "seed" in words[0]:  # it has no name, so it can have no row
-        with pytest.raises(InputError, match=re.escape(said)):
-            run(composed)
-        return
-    done = run(composed)
-    assert done is not None
-    assert done.status == "failed"
-    assert said in str(done.reason)
-    assert not list(tmp_path.rglob("checkpoint.pt"))

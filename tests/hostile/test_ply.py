@@ -54,10 +54,10 @@ def draw(seed: int, folder: Path) -> Case:
         done.append(replace_file(r, path))
 
     def call_trained() -> None:
-        given = read_trained(path)
-        numbers = [value for value in vars(given).values() if isinstance(value, torch.Tensor)]
+        gaussians = read_trained(path)
+        numbers = [value for value in vars(gaussians).values() if isinstance(value, torch.Tensor)]
         assert len(numbers) == 6
-        assert all(value.isfinite().all() and len(value) == len(given) for value in numbers)
+        assert all(value.isfinite().all() and len(value) == len(gaussians) for value in numbers)
 
     def call() -> None:
         points = read_ply(path)

@@ -28,18 +28,18 @@ def draw(seed: int, _: Path) -> Case:
     if r.random() < 0.2:
         return draw_model(r)
     name, target = r.choice(list(targets().items()))
-    given, done = dict(target.arguments), []
-    for key, x in given.items():
+    arguments, done = dict(target.arguments), []
+    for key, x in arguments.items():
         if isinstance(x, Tensor) and x.dim() and x.is_floating_point() and r.random() < 0.3:
-            given[key], what = disturb_layout(r, x, repeat=key not in UNIQUE)
+            arguments[key], what = disturb_layout(r, x, repeat=key not in UNIQUE)
             done.append(f"{key} {what}")
     changed = r.random() < 0.6
     if changed:
-        key = r.choice(list(given))
-        tensor = isinstance(given[key], Tensor)
-        given[key], what = disturb(r, given[key]) if tensor else _number(r)
+        key = r.choice(list(arguments))
+        tensor = isinstance(arguments[key], Tensor)
+        arguments[key], what = disturb(r, arguments[key]) if tensor else _number(r)
         done.append(f"{key} {what}")
-    return Case(f"{name}: {', '.join(done)}", lambda: check(target, given, changed))
+    return Case(f"{name}: {', '.join(done)}", lambda: check(target, arguments, changed))
 
 
 def _number(r: random.Random) -> tuple[Any, str]:
@@ -47,39 +47,39 @@ def _number(r: random.Random) -> tuple[Any, str]:
     return value, f"= {value!r}"
 
 
-def check(target: Target, given: dict[str, Any], changed: bool) -> None:
+def check(target: Target, arguments: dict[str, Any], changed: bool) -> None:
     """Call a function; where only layouts differ, compare results and gradients with those of plain arguments."""
-    same = {key: plain(x) for key, x in given.items()}
-    results, gradients = _call(target.function, target, given)
+    same = {key: plain(x) for key, x in arguments.items()}
+    results, gradients = _call(target.function, target, arguments)
     if changed:
         return
     expected, their_gradients = _call(target.function, target, same)
     if target.function is not adam:  # it has changed its arguments
         with torch.no_grad():
-            _compare([x for x in _tensors(target.function(**given)) if x.numel()], expected, 1e-6)
+            _compare([x for x in _tensors(target.function(**arguments)) if x.numel()], expected, 1e-6)
     _compare(results, expected, 1e-6)
     _compare(gradients, their_gradients, 1e-5)
     if target.function is rasterize:
-        exact = {key: plain(x).double() if isinstance(x, Tensor) else x for key, x in given.items()}
+        exact = {key: plain(x).double() if isinstance(x, Tensor) else x for key, x in arguments.items()}
         expected, their_gradients = _call(target.function, target, exact | {"backend": "reference"})
         _compare(results[:2], expected[:2], 1e-4)
         _compare(gradients, their_gradients, 1e-3)
 
 
-def _call(function: Callable[..., Any], target: Target, given: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
+def _call(function: Callable[..., Any], target: Target, arguments: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
     """Return results and the gradients of a sum of their squares by every float tensor, as leaves of a graph."""
     leaves = []
-    given = dict(given)
-    for key, x in given.items():
+    arguments = dict(arguments)
+    for key, x in arguments.items():
         if isinstance(x, Tensor) and x.is_floating_point() and key not in target.constant and not x.is_sparse:
-            given[key] = x.detach().requires_grad_()
-            leaves.append(given[key])
-    result = function(**given)
+            arguments[key] = x.detach().requires_grad_()
+            leaves.append(arguments[key])
+    result = function(**arguments)
     results = [x for x in _tensors(result) if x.numel()]
     with_gradient = [x for x in results if x.requires_grad]
     if with_gradient:
         sum(x.double().square().sum() for x in with_gradient).backward()
-    in_place = [given[key] for key in ("parameter", "mean", "square")] if function is adam else []
+    in_place = [arguments[key] for key in ("parameter", "mean", "square")] if function is adam else []
     for leaf in leaves:
         assert leaf.grad is None or leaf.grad.shape == leaf.shape
     return [*results, *in_place], [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves]

@@ -44,8 +44,8 @@ def test_failures_are_named_with_seed_and_input(tmp_path: Path, monkeypatch: pyt
         pool.check("test_ply", 20)
     finally:
         pool.stop()
-    told = str(caught.value)
+    message = str(caught.value)
     for seed, name in enumerate(ENDS):
-        assert (f'test_workers.draw({seed}): "the case that is {name}"' in told) == (seed >= 2)
-    assert "exit status -11" in told
-    assert "no answer within 5 s" in told
+        assert (f'test_workers.draw({seed}): "the case that is {name}"' in message) == (seed >= 2)
+    assert "exit status -11" in message
+    assert "no answer within 5 s" in message

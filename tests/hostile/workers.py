@@ -63,13 +63,13 @@ class Pool:
         failures = []
         for seed in range(count):
             self.worker = self.worker or _Worker(self.folder)
-            outcome, told = self.worker.run(module, seed)
+            outcome, report = self.worker.run(module, seed)
             if outcome in ("died", "hung"):
                 self.stop()
             if outcome in counts:
                 counts[outcome] += 1
             else:
-                failures.append(f"{module}.draw({seed}): {told}")
+                failures.append(f"{module}.draw({seed}): {report}")
         assert not failures, f"{len(failures)} of {count} cases failed:\n\n" + "\n\n".join(failures)
         assert min(counts.values()) >= count / 20, f"expected both outcomes, got {counts}"
 
@@ -105,8 +105,8 @@ class _Worker:
             return "hung", f"{what}: no answer within {LIMIT_S} s"
         if answer == "died":
             return "died", f"{what}: the process died, exit status {self.process.wait()}: {self._stderr()}"
-        outcome, told = json.loads(answer)
-        return outcome, f"{what}: {told}"
+        outcome, report = json.loads(answer)
+        return outcome, f"{what}: {report}"
 
     def stop(self) -> None:
         """End the process."""
@@ -143,8 +143,8 @@ def _serve(folder: Path) -> None:
     print("ready", file=answers, flush=True)
     for line in sys.stdin:
         module, seed = line.split()
-        with tempfile.TemporaryDirectory(dir=folder) as own:
-            case: Case = importlib.import_module(module).draw(int(seed), Path(own))
+        with tempfile.TemporaryDirectory(dir=folder) as case_folder:
+            case: Case = importlib.import_module(module).draw(int(seed), Path(case_folder))
             print(json.dumps(case.what)[:600], file=answers, flush=True)
             print(json.dumps(_judge(case)), file=answers, flush=True)
 

@@ -54,9 +54,7 @@ def test_the_runs_of_a_sweep(words: str, runs: list[str]) -> None:
     assert runs_of(parse(words.split())) == ([run.split() for run in runs], True)
 
 
-@pytest.mark.parametrize(
-    "words", ["+exp=mini scene=suzanne", "+exp=mini scene=suzanne +launch=local"]
-)
+@pytest.mark.parametrize("words", ["+exp=mini scene=suzanne", "+exp=mini scene=suzanne +launch=local"])
 def test_a_single_run_is_as_it_was_typed(words: str) -> None:
     """Catches a plan for a run that is of no sweep."""
     assert runs_of(parse(words.split())) == ([words.split()], False)

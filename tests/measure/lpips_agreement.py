@@ -64,15 +64,15 @@ def import_lpips() -> types.ModuleType:
 
 def compare(lpips: types.ModuleType, backbone: str) -> None:
     """Equal to the last bit, on images whose sides the strides do not divide, too."""
-    theirs = lpips.LPIPS(net=backbone, pnet_rand=True, verbose=False)
+    published = lpips.LPIPS(net=backbone, pnet_rand=True, verbose=False)
     # their keys are net.slice2.3.weight, where 3 is the layer's number in the trunk
-    trunk = {".".join(key.split(".")[-2:]): value for key, value in theirs.net.state_dict().items()}
-    linear = [getattr(theirs, f"lin{i}").model[1].weight.detach() for i in range(5)]
+    trunk = {".".join(key.split(".")[-2:]): value for key, value in published.net.state_dict().items()}
+    linear = [getattr(published, f"lin{i}").model[1].weight.detach() for i in range(5)]
     ours = Perceptual(BACKBONES[backbone], trunk, linear)
     for shape in ((2, 3, 64, 64), (1, 3, 37, 53)):
         a, b = torch.rand(shape) * 2 - 1, torch.rand(shape) * 2 - 1
         with torch.no_grad():
-            expected = theirs(a, b).flatten()
+            expected = published(a, b).flatten()
             assert (expected > 1e-6).all()
             assert torch.equal(ours(a, b), expected), (backbone, shape, ours(a, b), expected)
 

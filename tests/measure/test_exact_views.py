@@ -44,7 +44,7 @@ def test_numbers_that_are_none_decide_nothing() -> None:
     assert sorted([30.0, None, math.inf, math.nan, 130.0, 29.0], key=rank)[-2:] == [math.inf, 130.0]
     assert rank(None) == rank(math.nan) < rank(-5.0) < rank(99.0) < rank(math.inf) == rank(130.0)
     assert math.isnan(capped(math.nan))
-    assert [decides(one) for one in (30.0, MOST_PSNR, math.nan)] == [True, False, False]
+    assert [decides(item) for item in (30.0, MOST_PSNR, math.nan)] == [True, False, False]
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.3, 0.6, 0.9)])
@@ -52,13 +52,13 @@ def test_one_exact_view_leaves_every_mean_finite(background: tuple[float, float,
     """Catches a PSNR of a split that is infinite as one of its views is empty, and a mean without this view."""
     empty = torch.tensor(background).expand(16, 16, 3)
     other = torch.full((16, 16, 3), 0.5)
-    found = evaluate([("a", empty, empty), ("b", other + 0.1, other)], background=background)
-    assert found.metrics["psnr"] == fmean([100.0, psnr(other + 0.1, other)])
-    assert found.metrics["psnr_channel_mean"] == pytest.approx(60.0, abs=1e-4)
-    assert found.metrics["psnr_background_only"] == fmean([100.0, psnr(empty, other)])
-    assert found.metrics["ssim"] is not None
-    assert [one.psnr for one in found.per_view] == [100.0, psnr(other + 0.1, other)]
-    assert [one.exact for one in found.per_view] == [["a"], []]
+    scores = evaluate([("a", empty, empty), ("b", other + 0.1, other)], background=background)
+    assert scores.metrics["psnr"] == fmean([100.0, psnr(other + 0.1, other)])
+    assert scores.metrics["psnr_channel_mean"] == pytest.approx(60.0, abs=1e-4)
+    assert scores.metrics["psnr_background_only"] == fmean([100.0, psnr(empty, other)])
+    assert scores.metrics["ssim"] is not None
+    assert [item.psnr for item in scores.per_view] == [100.0, psnr(other + 0.1, other)]
+    assert [item.exact for item in scores.per_view] == [["a"], []]
     alone = evaluate([("b", other + 0.1, other)], background=background)
     assert alone.metrics["psnr"] == psnr(other + 0.1, other)  # to the last bit
 
@@ -75,10 +75,10 @@ def test_errors_too_small_for_a_square_are_exact() -> None:
 def test_a_view_that_is_not_a_number_is_named() -> None:
     """Catches an empty metric whose reason does not say which of many views was at fault."""
     truth = torch.full((16, 16, 3), 0.5)
-    found = evaluate([("a", truth + 0.1, truth), ("b", truth * math.nan, truth)], background=(0.0, 0.0, 0.0))
-    assert found.metrics["psnr"] is found.metrics["ssim"] is None
-    assert found.missing["psnr"] == found.missing["ssim"] == "not a number in b"
-    assert found.metrics["psnr_background_only"] is not None
+    scores = evaluate([("a", truth + 0.1, truth), ("b", truth * math.nan, truth)], background=(0.0, 0.0, 0.0))
+    assert scores.metrics["psnr"] is scores.metrics["ssim"] is None
+    assert scores.missing["psnr"] == scores.missing["ssim"] == "not a number in b"
+    assert scores.metrics["psnr_background_only"] is not None
 
 
 def test_regions_are_named_where_the_view_is_not_exact() -> None:
@@ -150,12 +150,12 @@ def test_an_empty_test_view_is_counted_and_named(
     """Catches "PSNR inf dB", an empty metric, and a mean of which nobody can tell that a view is at the cap."""
     record, folder = run_here(*overrides(with_away(square, tmp_path / "d", "test"), tmp_path, *RUN))
     plain, _ = run_here(*overrides(square, tmp_path / "plain", *RUN))
-    found, before = ok(record), ok(plain)
+    scores, before = ok(record), ok(plain)
     of_others = [view.psnr for view in plain.per_view]
-    assert found["psnr"] == fmean([100.0, *(one for one in of_others if one is not None)])
-    assert before["psnr"] == fmean(one for one in of_others if one is not None)
-    assert found["psnr_best_on_val"] is not None
-    assert found["psnr_float32"] is not None
+    assert scores["psnr"] == fmean([100.0, *(item for item in of_others if item is not None)])
+    assert before["psnr"] == fmean(item for item in of_others if item is not None)
+    assert scores["psnr_best_on_val"] is not None
+    assert scores["psnr_float32"] is not None
     assert (record.exact, plain.exact) == (["test/away"], [])
     assert records.read(folder / records.FILE_NAME).exact == ["test/away"]
     assert "PSNR of test/away is infinite or nearly so and counts as 100 dB" in capsys.readouterr().out
@@ -169,7 +169,7 @@ def test_an_empty_val_view_changes_no_choice(words: tuple[str, ...], square: Pat
     assert ok(record) == ok(plain)
     assert record.stop == plain.stop
     assert record.averaged == plain.averaged
-    choices = [one.length_choice and (one.length_choice.kept, len(one.length_choice.tried)) for one in (record, plain)]
+    choices = [run.length_choice and (run.length_choice.kept, len(run.length_choice.tried)) for run in (record, plain)]
     assert choices[0] == choices[1]
     assert record.exact == ["val/away"]
     shifted = [(100.0 + 2 * (p.psnr_val or math.nan)) / 3 for p in plain.curve]

@@ -59,10 +59,10 @@ def test_the_scale_of_the_error_is_what_the_header_says():
 def test_the_error_is_the_mean_over_channels():
     """Would catch a maximum: an error in one channel is a third of the same error in all."""
     truth = np.zeros((4, 300, 3))
-    one, every = truth.copy(), truth + 0.05
-    one[..., 0] = 0.15
+    image, every = truth.copy(), truth + 0.05
+    image[..., 0] = 0.15
     assert (
-        cells(pictures.strip([(one, truth)]), 4, 300)[2] == cells(pictures.strip([(every, truth)]), 4, 300)[2]
+        cells(pictures.strip([(image, truth)]), 4, 300)[2] == cells(pictures.strip([(every, truth)]), 4, 300)[2]
     ).all()
 
 

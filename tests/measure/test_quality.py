@@ -144,11 +144,11 @@ def test_a_missing_backbone_leaves_its_column_empty_with_the_reason():
         with pytest.raises(BackboneMissing, match=f"needs weights: `python -m gsbench.fetch lpips-{backbone}`"):
             perceptual.load(backbone)
     truth = image(0)
-    found = quality.evaluate([("a", image(1), truth)], background=(0.0, 0.0, 0.0))
-    assert found.metrics["lpips_alex"] is None
-    assert "gsbench.fetch lpips-alex" in found.missing["lpips_alex"]
-    assert "gsbench.fetch lpips-vgg" in found.missing["lpips_vgg"]
-    assert found.metrics["ssim"] == quality.ssim(image(1), truth)
+    measured = quality.evaluate([("a", image(1), truth)], background=(0.0, 0.0, 0.0))
+    assert measured.metrics["lpips_alex"] is None
+    assert "gsbench.fetch lpips-alex" in measured.missing["lpips_alex"]
+    assert "gsbench.fetch lpips-vgg" in measured.missing["lpips_vgg"]
+    assert measured.metrics["ssim"] == quality.ssim(image(1), truth)
 
 
 def test_wrong_weights_are_never_used(no_weights):
@@ -157,9 +157,9 @@ def test_wrong_weights_are_never_used(no_weights):
     np.savez(named, **{"features.0.weight": np.zeros((64, 3, 11, 11), np.float32)})
     with pytest.raises(InputError, match=r"mine\.npz: expected SHA-256 7be5be79"):
         perceptual.load("alex", named)
-    found = no_weights / "hub" / "checkpoints" / "vgg16-397923af.pth"
-    found.parent.mkdir(parents=True)
-    torch.save({}, found)
+    measured = no_weights / "hub" / "checkpoints" / "vgg16-397923af.pth"
+    measured.parent.mkdir(parents=True)
+    torch.save({}, measured)
     with pytest.raises(InputError, match="SHA-256 397923af"):
         quality.evaluate([("a", image(0), image(1))], background=(0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="no such file"):
@@ -189,25 +189,25 @@ def test_evaluate_means_over_views_and_quantises_on_request():
     """Would catch a mean over pixels instead of views, truth that is quantised too, a wrong background."""
     truth = [torch.full((16, 16, 3), 0.5), torch.full((16, 16, 3), 0.25)]
     render = [t + 0.0019 for t in truth]
-    found = quality.evaluate(zip("ab", render, truth, strict=True), background=(1.0, 1.0, 1.0))
-    assert [view.name for view in found.per_view] == ["a", "b"]
-    assert found.metrics["psnr"] == pytest.approx(sum(v.psnr for v in found.per_view) / 2)
-    assert found.metrics["psnr"] == pytest.approx(-20 * math.log10(0.0019), abs=1e-3)
+    measured = quality.evaluate(zip("ab", render, truth, strict=True), background=(1.0, 1.0, 1.0))
+    assert [view.name for view in measured.per_view] == ["a", "b"]
+    assert measured.metrics["psnr"] == pytest.approx(sum(v.psnr for v in measured.per_view) / 2)
+    assert measured.metrics["psnr"] == pytest.approx(-20 * math.log10(0.0019), abs=1e-3)
     expected = (quality.psnr(torch.ones(16, 16, 3), truth[0]) + quality.psnr(torch.ones(16, 16, 3), truth[1])) / 2
-    assert found.metrics["psnr_background_only"] == pytest.approx(expected)
+    assert measured.metrics["psnr_background_only"] == pytest.approx(expected)
     eight = quality.evaluate(zip("ab", render, truth, strict=True), background=(1.0, 1.0, 1.0), quantised=True)
     assert eight.per_view[0].psnr == quality.psnr(quality.quantise(render[0]), truth[0])
-    assert eight.metrics["psnr"] != found.metrics["psnr"]
+    assert eight.metrics["psnr"] != measured.metrics["psnr"]
 
 
 @pytest.mark.usefixtures("no_weights")
 def test_a_picture_too_small_for_a_metric_leaves_it_empty():
     """Would catch a run at a strong downscale that ends in an exception of scikit-image or of a pooling layer."""
-    found = quality.evaluate([("tiny", image(0, 10, 40), image(1, 10, 40))], background=(0.0, 0.0, 0.0))
-    assert found.metrics["psnr"] is not None
+    measured = quality.evaluate([("tiny", image(0, 10, 40), image(1, 10, 40))], background=(0.0, 0.0, 0.0))
+    assert measured.metrics["psnr"] is not None
     for metric, side in (("ssim", 11), ("lpips_alex", 31), ("lpips_vgg", 16)):
-        assert found.metrics[metric] is None
-        assert found.missing[metric] == f"needs {side} pixels a side, tiny has 10"
+        assert measured.metrics[metric] is None
+        assert measured.missing[metric] == f"needs {side} pixels a side, tiny has 10"
     for backbone in perceptual.BACKBONES.values():
         backbone.trunk()(torch.zeros(1, 3, backbone.least_side, backbone.least_side))
         with pytest.raises(RuntimeError, match="too small"):

@@ -31,13 +31,13 @@ def test_what_moves_is_found_at_one_camera() -> None:
     """Catches a region of the median instead of the image, a lost opening or dilation, one by the width of the image,
     and blue that is ignored."""
     views = [view(str(i), (5 + 25 * i, 30)) for i in range(3)]
-    found = moving(views)
-    assert found.source == "images of one camera"
+    measured = moving(views)
+    assert measured.source == "images of one camera"
     for i in range(3):
-        rows, columns = found.masks[str(i)].nonzero()
+        rows, columns = measured.masks[str(i)].nonzero()
         assert (columns.min(), columns.max()) == (3 + 25 * i, 18 + 25 * i)  # the 3 x 3 mean reaches a pixel out
         assert (rows.min(), rows.max()) == (28, 43)
-    assert found.share == pytest.approx(16 * 16 / (HEIGHT * WIDTH), rel=0.05)
+    assert measured.share == pytest.approx(16 * 16 / (HEIGHT * WIDTH), rel=0.05)
 
 
 def test_single_pixels_do_not_move() -> None:
@@ -45,9 +45,9 @@ def test_single_pixels_do_not_move() -> None:
     views = [view(str(i), None) for i in range(3)]
     views[0].pixels[10:20, 10:20] += 15 / 255
     views[1].pixels[50, 50] = 1.0
-    found = moving(views)
-    assert not found.masks
-    assert "64 pixels" in found.missing
+    measured = moving(views)
+    assert not measured.masks
+    assert "64 pixels" in measured.missing
 
 
 def test_views_of_other_cameras_are_not_compared() -> None:
@@ -104,12 +104,12 @@ def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     assert metrics["psnr_object"] == pytest.approx(20.0, abs=1e-3)
     assert metrics["psnr_moving"] is None
     assert set(scores.missing()) == {"psnr_moving"}
-    found = scores.found()
-    assert set(found) == {"object"}
-    assert (found["object"].views, found["object"].source) == (1, "alpha")
-    assert math.isclose(found["object"].share, 144 / (HEIGHT * WIDTH))
+    measured = scores.found()
+    assert set(measured) == {"object"}
+    assert (measured["object"].views, measured["object"].source) == (1, "alpha")
+    assert math.isclose(measured["object"].share, 144 / (HEIGHT * WIDTH))
     assert set(find_regions(views)) == {"moving", "object"}
-    one, other = scores.with_scores([ViewScore("0", 30.0), ViewScore("1", 31.0)])
-    assert (one.name, one.psnr, one.psnr_moving) == ("0", 30.0, None)
-    assert one.psnr_object == pytest.approx(20.0, abs=1e-3)
+    region, other = scores.with_scores([ViewScore("0", 30.0), ViewScore("1", 31.0)])
+    assert (region.name, region.psnr, region.psnr_moving) == ("0", 30.0, None)
+    assert region.psnr_object == pytest.approx(20.0, abs=1e-3)
     assert other == ViewScore("1", 31.0)

@@ -29,15 +29,17 @@ def test_a_full_disk_that_takes_no_output_is_told_in_one_line(unbuffered: list[s
 def test_a_reader_that_has_gone_is_not_told() -> None:
     """Catches a stack trace of `python -m gsbench.report ... | head`."""
     code = [sys.executable, "-c", f"input(); {PRINTS.format(status=0)}"]
-    with subprocess.Popen(code, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT) as one:
-        assert one.stdin
-        assert one.stdout
-        assert one.stderr
-        one.stdout.close()
-        one.stdin.write(b"\n")
-        one.stdin.flush()
-        assert one.stderr.read() == b""
-    assert one.returncode == 0
+    with subprocess.Popen(
+        code, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT
+    ) as child:
+        assert child.stdin
+        assert child.stdout
+        assert child.stderr
+        child.stdout.close()
+        child.stdin.write(b"\n")
+        child.stdin.flush()
+        assert child.stderr.read() == b""
+    assert child.returncode == 0
 
 
 def test_the_status_is_that_of_the_command() -> None:

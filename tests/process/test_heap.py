@@ -38,12 +38,11 @@ def page_faults(imports: str, before: int, rounds: int, **variables: str) -> flo
     return int(done.stdout) / rounds
 
 
-@pytest.mark.parametrize("imports", ["gsbench, torch", "torch, gsbench"])
-def test_workers_get_the_memory_they_freed(imports: str) -> None:
+def test_workers_get_the_memory_they_freed() -> None:
     """Catches gradients that are mapped anew in every step: a third of a training at 517,000 Gaussians."""
-    assert page_faults(imports, 20, 10) < 0.01 * ALL_ANEW
+    assert page_faults("torch, gsbench", 20, 5) < 0.01 * ALL_ANEW  # gsbench second, which is harder
 
 
 def test_the_environment_has_the_last_word() -> None:
     """Catches settings of malloc that a user has chosen and that an import overrules."""
-    assert page_faults("gsbench, torch", 1, 3, **dict.fromkeys(OPTIONS, "4")) > 0.9 * ALL_ANEW
+    assert page_faults("gsbench, torch", 1, 2, **dict.fromkeys(OPTIONS, "4")) > 0.9 * ALL_ANEW

@@ -18,12 +18,12 @@ def test_results_come_in_the_order_of_the_items(workers: int) -> None:
     """Catches results out of order, and workers that compute gradients for a caller without them."""
     torch.set_num_threads(4)
     with torch.no_grad():
-        found = list(side_by_side(slowly, range(40), workers))
-    assert [one[0] for one in found] == list(range(40))
-    assert {one[1] for one in found} == {{1: 4, 2: 2, 5: 1}[workers]}, "workers with too many threads"
-    assert not any(one[2] for one in found)
+        results = list(side_by_side(slowly, range(40), workers))
+    assert [result[0] for result in results] == list(range(40))
+    assert {result[1] for result in results} == {{1: 4, 2: 2, 5: 1}[workers]}, "workers with too many threads"
+    assert not any(result[2] for result in results)
     assert torch.get_num_threads() == 4
-    assert all(one[2] for one in side_by_side(slowly, range(2), workers))
+    assert all(result[2] for result in side_by_side(slowly, range(2), workers))
 
 
 def test_an_error_in_a_worker_is_the_caller_s() -> None:

@@ -11,38 +11,30 @@ from tiny_run import ROOT
 
 from gsbench.process import vectors
 
-ASK = "import torch; print(torch.backends.cpu.get_cpu_capability())"
-PRODUCT = "import torch; torch.ones(64, 64) @ torch.ones(64, 64)"
+ASK = "import torch; print(torch.backends.cpu.get_cpu_capability()); torch.ones(64, 64) @ torch.ones(64, 64)"
+HAS_MKL = "mkl" in torch.__config__.show().lower()
 
 
-def said(code: str, **variables: str) -> str:
-    """What a new process prints, whose environment chooses no arithmetic but by `variables`."""
+def printed(imports: str, **variables: str) -> str:
+    """What torch and MKL print of their vectors in a new process, whose environment chooses none but by `variables`."""
     plain = {name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=plain | variables, check=True)
-    return done.stdout
+    command = [sys.executable, "-c", f"{imports}; {ASK}"]
+    environment = plain | {"MKL_VERBOSE": "1"} | variables
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True).stdout
 
 
-def capability(imports: str, **variables: str) -> str:
-    """The vectors that torch uses in a new process."""
-    return said(f"{imports}; {ASK}", **variables).strip()
-
-
-@pytest.mark.skipif(not vectors._has_avx512(), reason="needs a processor with AVX-512")
-@pytest.mark.parametrize("imports", ["import gsbench", "import torch; import gsbench"])
-def test_torch_uses_avx2_where_there_is_avx512(imports: str) -> None:
-    """Catches a setting that comes after torch has read it."""
-    assert capability("import torch") == "AVX512"
-    assert capability(imports) == "AVX2"
-    assert capability(imports, ATEN_CPU_CAPABILITY="avx512") == "AVX512"
-
-
-@pytest.mark.skipif("mkl" not in torch.__config__.show().lower(), reason="needs a torch with MKL")
-@pytest.mark.parametrize("imports", ["import gsbench", "import torch; import gsbench"])
-def test_mkl_uses_its_compatible_code(imports: str) -> None:
-    """Catches a variable that MKL does not know, or one that is set too late."""
-    for wanted, first in (("CNR:OFF", "import torch"), ("CNR:COMPATIBLE", imports)):
-        assert wanted in said(f"{first}; {PRODUCT}", MKL_VERBOSE="1")
+@pytest.mark.skipif(not vectors._has_avx512() and not HAS_MKL, reason="needs a processor with AVX-512, or MKL")
+def test_vectors_are_chosen_as_gsbench_is_imported() -> None:
+    """Catches a setting that comes after torch or MKL has read it, a variable that they do not know, and one that is
+    set over the user's."""
+    for imports, capability, code, variables in (
+        ("import torch", "AVX512", "CNR:OFF", {}),
+        ("import torch; import gsbench", "AVX2", "CNR:COMPATIBLE", {}),
+        ("import gsbench", "AVX512", "CNR:COMPATIBLE", {"ATEN_CPU_CAPABILITY": "avx512"}),
+    ):
+        text = printed(imports, **variables)
+        assert not vectors._has_avx512() or capability in text.splitlines()
+        assert not HAS_MKL or code in text
 
 
 @pytest.mark.parametrize(
