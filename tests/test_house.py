@@ -30,7 +30,7 @@ VAGUE = {"found", "one", "own", "said", "told", "seen", "theirs", "mine", "given
 VAGUE_NAMES: dict[str, int] = {
     "benchmarks": 30,
     "docs/site": 109,
-    "gsbench": 20,
+    "gsbench": 6,
     "gsbench/effects": 34,
     "gsbench/fetch": 5,
     "gsbench/kernels": 40,
@@ -41,9 +41,7 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/report": 124,
     "gsbench/report/page": 72,
     "gsbench/run": 54,
-    "gsbench/scenes": 27,
     "gsbench/train": 29,
-    "gsbench/view": 28,
     "tests": 100,
     "tests/effects": 37,
     "tests/fetch": 5,
@@ -55,10 +53,8 @@ VAGUE_NAMES: dict[str, int] = {
     "tests/raster": 4,
     "tests/report": 96,
     "tests/run": 66,
-    "tests/scenes": 66,
     "tests/slurm": 13,
     "tests/train": 31,
-    "tests/view": 55,
 }
 
 

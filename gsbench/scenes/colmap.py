@@ -165,31 +165,31 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
     """Return the cameras of a model by their numbers."""
     rows = _text_cameras(file) if file.path.suffix == ".txt" else _binary_cameras(file)
-    found = {}
+    by_name = {}
     for number, model, width, height, values in rows:
-        if number in found:
+        if number in by_name:
             raise InputError(f"{file.path}: camera {number} appears twice: write the model again")
-        found[number] = _lens(model, width, height, values, f"{file.path}: camera {number}")
-    return found
+        by_name[number] = _lens(model, width, height, values, f"{file.path}: camera {number}")
+    return by_name
 
 
 def read_images(file: ModelFile) -> list[PosedImage]:
     """Return the registered images of a model."""
     rows = _text_images(file) if file.path.suffix == ".txt" else _binary_images(file)
-    found: dict[str, PosedImage] = {}
+    by_name: dict[str, PosedImage] = {}
     for name, pose, camera in rows:
         where = f"{file.path}: image {name[:80]!a}"
-        if name in found:
+        if name in by_name:
             raise InputError(f"{where} appears twice: write the model again")
         if not all(abs(value) < _LARGEST for value in pose) or abs(math.hypot(*pose[:4]) - 1) > _UNIT:
             raise InputError(f"{where}: expected a unit quaternion qw qx qy qz and a translation, got {pose}")
         viewmat = np.eye(4)
         viewmat[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()  # scipy has w last
         viewmat[:3, 3] = pose[4:]
-        found[name] = PosedImage(name, viewmat, camera)
-    if not found:
+        by_name[name] = PosedImage(name, viewmat, camera)
+    if not by_name:
         raise InputError(f"{file.path}: expected at least one image")
-    return list(found.values())
+    return list(by_name.values())
 
 
 def read_points(file: ModelFile) -> Points:
@@ -212,12 +212,12 @@ def _lens(model: str, width: int, height: int, values: tuple[float, ...], where:
     names = _PARAMETERS[model]
     if len(values) != len(names) or not all(abs(value) < _LARGEST for value in values):
         raise InputError(f"{where}: expected {model} with {' '.join(names)}, got {values}")
-    given = dict(zip(names, values, strict=True))
-    fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
+    parameters = dict(zip(names, values, strict=True))
+    fx, fy = (parameters.get(name, parameters.get("f", 0.0)) for name in ("fx", "fy"))
     if not (min(fx, fy) > _SMALLEST and min(width, height) > 0):
         raise InputError(f"{where}: expected positive focal lengths and sizes, got {fx} {fy} for {width}x{height}")
-    K = np.array([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]])
-    k1, k2, p1, p2 = (given.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
+    K = np.array([[fx, 0, parameters["cx"]], [0, fy, parameters["cy"]], [0, 0, 1]])
+    k1, k2, p1, p2 = (parameters.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
     return Lens(width, height, K, (k1, k2, p1, p2))
 
 
@@ -253,12 +253,12 @@ def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
         words = line.split()
         where = f"{file.path}: line {number}"
         try:
-            one, width, height = int(words[0]), int(words[2]), int(words[3])
+            identifier, width, height = int(words[0]), int(words[2]), int(words[3])
             values = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             raise InputError(f"{where}: expected a camera's id, model, width, height and parameters, "
                              f"got {line[:60]!a}") from None  # fmt: skip
-        yield one, _known(words[1], where), width, height, values
+        yield identifier, _known(words[1], where), width, height, values
 
 
 def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:

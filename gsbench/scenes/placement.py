@@ -47,8 +47,8 @@ def standard_scene(
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
     centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
     axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
-    seen, share = _seen_points(name, train, points)
-    middle, size = place_and_size(centers, axes, seen)
+    visible, share = _seen_points(name, train, points)
+    middle, size = place_and_size(centers, axes, visible)
     placement = _placement(middle, size)
     train, val, test = ([_placed(view, placement) for view in views] for views in (train, val, test))
     moved = torch.stack([view.camera.viewmat for view in train])
@@ -82,7 +82,7 @@ def _placed(view: View, placement: Placement) -> View:
 def place_and_size(
     centers: NDArray[np.float64],  # [C, 3] positions of the cameras
     axes: NDArray[np.float64],  # [C, 3] unit vectors in which they look
-    seen: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,  # [S, 3] points that they see, [S] depths
+    visible: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,  # [S, 3] points that they see, [S] depths
 ) -> tuple[NDArray[np.float64], float]:
     """Return the point that cameras look at, [3], and the median distance of the cameras from it.
 
@@ -108,8 +108,8 @@ def place_and_size(
     ahead = ((target - centers) * axes).sum(1)
     if np.median(ahead) > _AHEAD * np.median(distances) > 0:
         return target, float(np.median(distances))
-    if seen is not None and len(seen[0]):
-        return np.median(seen[0], axis=0), float(np.median(seen[1]))
+    if visible is not None and len(visible[0]):
+        return np.median(visible[0], axis=0), float(np.median(visible[1]))
     return middle + STANDARD * spread * axes.mean(0), STANDARD * spread
 
 
@@ -179,18 +179,18 @@ def _seen_points(
     if points is None:
         return None, 1.0
     means = points.means.double()[:: max(1, math.ceil(len(points.means) * len(views) / _MOST_PAIRS))]
-    seen, depths, is_any = [], [], torch.zeros(len(means), dtype=torch.bool)
+    visible, depths, is_any = [], [], torch.zeros(len(means), dtype=torch.bool)
     for camera in (view.camera for view in views):
         is_inside = is_seen(means, camera)
         is_any |= is_inside
         inside = means[is_inside]
-        seen.append(inside.numpy())
+        visible.append(inside.numpy())
         depths.append((inside @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).numpy())
     if not is_any.any():
         raise InputError(f"{name}: expected initial points that a training camera sees, they see none of the "
                          f"{len(points.means)}: are points and poses of one capture, and in the same coordinates and "
                          f"units?", docs="data.md#where-a-scene-lies")  # fmt: skip
-    return (np.concatenate(seen), np.concatenate(depths)), float(is_any.double().mean())
+    return (np.concatenate(visible), np.concatenate(depths)), float(is_any.double().mean())
 
 
 def _are_near(centers: NDArray[np.float64], size: float) -> NDArray[np.bool_]:  # [C]

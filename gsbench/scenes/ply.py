@@ -72,10 +72,10 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     if encoding == "ascii":
         return _read_ascii(data[end.end() :], sum(element.values for element in before), vertices, path)
     start = end.end() + sum(element.size for element in before)
-    found = max(len(data) - start, 0)
-    if vertices.size > found:
+    available = max(len(data) - start, 0)
+    if vertices.size > available:
         raise InputError(f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
-                         f"{found}: truncated")  # fmt: skip
+                         f"{available}: truncated")  # fmt: skip
     return np.frombuffer(data, vertices.dtype, vertices.rows, start)
 
 

@@ -54,7 +54,7 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
     """
     K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]
-    found = torch.zeros(0, 3)
+    drawn = torch.zeros(0, 3)
     for _ in range(ROUNDS):
         chosen = torch.randint(len(cameras), (count,), generator=generator)
         draws = torch.rand(count, 3, generator=generator)
@@ -63,12 +63,12 @@ def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generat
         inside = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3] in the camera
         rotation, translation = viewmats[chosen, :3, :3], viewmats[chosen, :3, 3]
         points = (rotation.mT @ (inside - translation)[:, :, None])[..., 0]
-        seen = torch.stack([is_seen(points, camera) for camera in cameras]).all(0)
-        found = torch.cat([found, points[seen]])
-        if len(found) >= count:
+        visible = torch.stack([is_seen(points, camera) for camera in cameras]).all(0)
+        drawn = torch.cat([drawn, points[visible]])
+        if len(drawn) >= count:
             colors = 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255
-            return Points(found[:count].contiguous(), colors)
-    raise InputError(f"initial points: expected training cameras that see something in common, {len(found)} of "
+            return Points(drawn[:count].contiguous(), colors)
+    raise InputError(f"initial points: expected training cameras that see something in common, {len(drawn)} of "
                      f"{ROUNDS * count} random points are seen by all: set data.initial_half_width")  # fmt: skip
 
 
@@ -81,10 +81,10 @@ def is_seen(points: Tensor, camera: Camera) -> Tensor:  # [P, 3] in the dtype of
 
 def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
     """Return the share of points that are inside the image of at least one camera."""
-    seen = torch.zeros(len(points.means), dtype=torch.bool)
+    visible = torch.zeros(len(points.means), dtype=torch.bool)
     for camera in cameras:
-        seen |= is_seen(points.means, camera)
-    return float(seen.float().mean())
+        visible |= is_seen(points.means, camera)
+    return float(visible.float().mean())
 
 
 def read_ply(path: Path) -> Points:

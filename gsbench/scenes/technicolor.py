@@ -127,7 +127,7 @@ def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
     """List the image files, sorted by frame and then camera; raise InputError if an image is missing."""
-    found: dict[tuple[int, int], Path] = {}
+    by_number: dict[tuple[int, int], Path] = {}
     scenes = set()
     for path in sorted(root.glob("*.png")):
         name = IMAGE.fullmatch(path.name)
@@ -136,23 +136,23 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
         scenes.add(name["scene"])
         key = int(name["frame"]), int(name["camera"])
         if frames is None or frames[0] <= key[0] <= frames[1]:
-            found[key] = files.find_inside(root, path.name, str(root))
+            by_number[key] = files.find_inside(root, path.name, str(root))
     if len(scenes) > 1:
         raise InputError(f"{root}: expected images of one scene, got those of {', '.join(sorted(scenes))[:120]}")
-    numbers = sorted({frame for frame, _ in found}) if frames is None else range(frames[0], frames[1] + 1)
+    numbers = sorted({frame for frame, _ in by_number}) if frames is None else range(frames[0], frames[1] + 1)
     if not numbers:
         raise InputError(f"{root}: expected images <Scene>_undist_<frame>_<camera>.png, found none")
     for frame in numbers:
         for camera in range(cameras):
-            if (frame, camera) not in found:
+            if (frame, camera) not in by_number:
                 raise InputError(f"{root}: expected an image *_undist_{frame:05d}_{camera:02d}.png of every camera in "
                                  f"{CAMERAS}, it is missing: copy it, or choose other scene.frames")  # fmt: skip
-    return [_Image(found[frame, camera], frame, camera) for frame in numbers for camera in range(cameras)]
+    return [_Image(by_number[frame, camera], frame, camera) for frame in numbers for camera in range(cameras)]
 
 
 def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, _Image]:
     """Return the image that replaces each named image of this scene: that of the same camera, one frame before."""
-    found = {(image.frame, image.camera): image for image in listed}
+    by_number = {(image.frame, image.camera): image for image in listed}
     scene = IMAGE.fullmatch(listed[0].path.name)
     replaced = {}
     for name in names:
@@ -162,15 +162,15 @@ def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, 
         if scene is None or parts["scene"] != scene["scene"]:
             continue
         frame, camera = int(parts["frame"]), int(parts["camera"])
-        if (frame, camera) not in found:
+        if (frame, camera) not in by_number:
             raise InputError(f"data.repair: expected an image that is loaded, got {name!a:.80}: leave it out")
         if camera == TEST_CAMERA:
             raise InputError(f"data.repair: expected a training image, {name} is a test image, and a test needs the "
                              "true one: choose other scene.frames")  # fmt: skip
-        if (frame - 1, camera) not in found:
+        if (frame - 1, camera) not in by_number:
             raise InputError(f"data.repair: {name}: expected the image of its camera in frame {frame - 1}, it is not "
                              "loaded: choose other scene.frames")  # fmt: skip
-        replaced[found[frame, camera]] = found[frame - 1, camera]
+        replaced[by_number[frame, camera]] = by_number[frame - 1, camera]
     return replaced
 
 

@@ -330,18 +330,18 @@ def _check_all_or_none(splits: Iterable[Split]) -> None:
 
 def _shared_views(views: dict[str, list[View]], digests: dict[str, list[str]]) -> list[str]:
     """Return sentences on images that two splits share, with the same pose and time."""
-    seen = {
+    keys_of = {
         split: [(digest, view.camera.viewmat.numpy().tobytes(), view.time) for view, digest in
                 zip(views[split], digests[split], strict=True)]
         for split in views
     }  # fmt: skip
     notes = []
-    for one, other in (("test", "train"), ("test", "val"), ("val", "train")):
-        if one in seen and other in seen:
-            shared = set(seen[other])
-            if count := sum(key in shared for key in seen[one]):
-                notes.append(f"{count} of {len(seen[one])} views of {one} are views of {other} too (image, pose and "
-                             f"time are equal): PSNR on {one} is not that of unseen views")  # fmt: skip
+    for part, other in (("test", "train"), ("test", "val"), ("val", "train")):
+        if part in keys_of and other in keys_of:
+            shared = set(keys_of[other])
+            if count := sum(key in shared for key in keys_of[part]):
+                notes.append(f"{count} of {len(keys_of[part])} views of {part} are views of {other} too (image, pose "
+                             f"and time are equal): PSNR on {part} is not that of unseen views")  # fmt: skip
     return notes
 
 

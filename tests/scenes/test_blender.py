@@ -114,10 +114,10 @@ def test_a_large_scene_stays_in_8_bits_and_looks_the_same(
     floats = scenes.load(tiny, background=background)
     monkeypatch.setattr(images, "_MOST_FLOATS", 0)
     small, reduced = scenes.load(tiny, background=background), scenes.load(tiny, background=background, downscale=2)
-    for one, other in zip(floats.train + floats.val + floats.test, small.train + small.val + small.test, strict=True):
-        assert one.pixels.dtype == torch.float32
+    for plain, other in zip(floats.train + floats.val + floats.test, small.train + small.val + small.test, strict=True):
+        assert plain.pixels.dtype == torch.float32
         assert other.pixels.element_size() == (1 if dtype == np.uint8 else 4)
-        assert torch.equal(one.image, other.to("cpu").image)
+        assert torch.equal(plain.image, other.to("cpu").image)
     assert floats.fingerprint == small.fingerprint
     assert reduced.train[0].pixels.dtype == torch.float32  # a quarter of the pixels: fewer bytes than 8 bits of all
 

@@ -60,14 +60,14 @@ def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kin
     assert last is not None
     assert scene.name == "own"
     assert [len(scene.train), len(scene.val), len(scene.test)] == [21, 0, 3]
-    found = {view.name: view for view in (*scene.train, *scene.test)}
+    loaded = {view.name: view for view in (*scene.train, *scene.test)}
     assert [view.name for view in scene.test] == ["shot 7", "shot 15", "shot 23"]
     for i, view in enumerate(views):
-        own = found[f"shot {i}"]
-        torch.testing.assert_close(own.camera.viewmat, view.camera.viewmat, rtol=0, atol=1e-6)
-        assert torch.equal(own.camera.K, view.camera.K)
-        assert torch.equal(own.image, view.image)
-        assert own.time == pytest.approx((view.time - first) / (last - first))  # type: ignore[operator]
+        taken = loaded[f"shot {i}"]
+        torch.testing.assert_close(taken.camera.viewmat, view.camera.viewmat, rtol=0, atol=1e-6)
+        assert torch.equal(taken.camera.K, view.camera.K)
+        assert torch.equal(taken.image, view.image)
+        assert taken.time == pytest.approx((view.time - first) / (last - first))  # type: ignore[operator]
     assert scene.points is not None
     means = np.random.default_rng(0).uniform(-1, 1, (1000, 3)).astype(np.float32)
     torch.testing.assert_close(scene.points.means, torch.from_numpy(means))
@@ -81,9 +81,9 @@ def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
         "+exp=colmap", "model=4dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=own", "scene.downscale=4",
         "train.iterations=50", "train.curve_points=1", f"results={tmp_path / 'results'}",
     )  # fmt: skip
-    (found,) = map(record.read, record.find(tmp_path / "results"))
-    assert found.dataset == "colmap"
-    assert found.metrics["psnr"] > 12.6  # 13.4; 11.8 where cameras have the images of others
+    (loaded,) = map(record.read, record.find(tmp_path / "results"))
+    assert loaded.dataset == "colmap"
+    assert loaded.metrics["psnr"] > 12.6  # 13.4; 11.8 where cameras have the images of others
 
 
 def rays(K: np.ndarray) -> np.ndarray:  # [H, W, 2]
@@ -94,14 +94,14 @@ def rays(K: np.ndarray) -> np.ndarray:  # [H, W, 2]
 
 def ray_seen(points: np.ndarray, k1: float, k2: float, p1: float, p2: float) -> np.ndarray:
     """The ray that a distorted pixel sees, by the fixed point of Brown's formula (OpenCV, calib3d)."""
-    found = points.copy()
+    loaded = points.copy()
     for _ in range(100):
-        x, y = found[..., 0], found[..., 1]
+        x, y = loaded[..., 0], loaded[..., 1]
         r2 = x * x + y * y
         radial = 1 + k1 * r2 + k2 * r2 * r2
         moved = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
-        found = (points - moved) / radial[..., None]
-    return found
+        loaded = (points - moved) / radial[..., None]
+    return loaded
 
 
 def picture(ray: np.ndarray) -> np.ndarray:
@@ -124,10 +124,10 @@ def test_distortion_is_undone(
     """Catches coefficients in a wrong order, K that is not the image's, blank pixels, and half a pixel of an offset."""
     width, height = WIDTH * 4, HEIGHT * 4
     K = np.array([[lens[0], 0, lens[-2]], [0, lens[-3], lens[-1]], [0, 0, 1]])
-    seen = ray_seen(rays(K), *distortion, *[0.0] * (4 - len(distortion)))
+    visible = ray_seen(rays(K), *distortion, *[0.0] * (4 - len(distortion)))
     for name in NAMES:
-        write_image(tmp_path / "images" / name, np.rint(picture(seen) * 255).astype(np.uint8))
-        write_image(tmp_path / "masks" / name, np.where(seen[..., 0] > 0.1, 9, 0).astype(np.uint8))
+        write_image(tmp_path / "images" / name, np.rint(picture(visible) * 255).astype(np.uint8))
+        write_image(tmp_path / "masks" / name, np.where(visible[..., 0] > 0.1, 9, 0).astype(np.uint8))
     Capture(model, width, height, (*lens, *distortion), NAMES, circle(COUNT)).write(tmp_path, "bin")
     view = scenes.load(tmp_path).train[0]
     expected = rays(view.camera.K.double().numpy())
@@ -143,66 +143,66 @@ def test_distortion_is_undone(
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Path:
+def taken(tmp_path: Path) -> Path:
     """A capture of nine images of 16 x 12, as text, with the principal point off the centre."""
     for i, name in enumerate(NAMES):
         write_image(tmp_path / "images" / name, np.full((HEIGHT, WIDTH, 3), 20 * i, np.uint8))
     return Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES, circle(COUNT)).write(tmp_path, "txt")
 
 
-def test_a_pinhole_stays_exact(own: Path) -> None:
+def test_a_pinhole_stays_exact(taken: Path) -> None:
     """Catches a principal point that is moved to the centre, and pixels that are resampled without a reason."""
-    view = scenes.load(own).train[3]
+    view = scenes.load(taken).train[3]
     assert view.camera.K.tolist() == [[20, 0, 3.25], [0, 21, 9.5], [0, 0, 1]]
     assert (view.image * 255).unique().tolist() == [60]
 
 
-def rename(own: Path, names: list[str]) -> None:
+def rename(taken: Path, names: list[str]) -> None:
     """Give the images other names, in the model and in the folder."""
     for old, new in zip(NAMES, names, strict=True):
-        (own / "images" / new).parent.mkdir(exist_ok=True)
-        (own / "images" / old).rename((own / "images" / new).with_suffix(".png"))
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(own, "txt")
+        (taken / "images" / new).parent.mkdir(exist_ok=True)
+        (taken / "images" / old).rename((taken / "images" / new).with_suffix(".png"))
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(taken, "txt")
 
 
-def test_times_of_names(own: Path) -> None:
+def test_times_of_names(taken: Path) -> None:
     """Catches a number of the folder or the camera taken for the time, order by text, and JPEGs that are not found."""
-    rename(own, [f"cam9/take2_{100 - 10 * i}.jpg" for i in range(COUNT)])
-    scene = scenes.load(own)
+    rename(taken, [f"cam9/take2_{100 - 10 * i}.jpg" for i in range(COUNT)])
+    scene = scenes.load(taken)
     assert [view.time for view in scene.train] == [i / 8 for i in (0, 1, 2, 3, 4, 5, 6, 8)]
     assert [view.name for view in scene.test] == ["cam9/take2_90"]
 
 
-def test_an_exif_orientation_is_told(own: Path) -> None:
+def test_an_exif_orientation_is_told(taken: Path) -> None:
     """Catches pixels that other programs turn, and gsbench does not, in silence."""
     exif = Image.Exif()
     exif[274] = 6
-    for i, path in enumerate(sorted((own / "images").rglob("*.png"))):
+    for i, path in enumerate(sorted((taken / "images").rglob("*.png"))):
         with Image.open(path) as image:
             pixels = image.convert("RGB")
         pixels.save(path, "JPEG", **({"exif": exif} if i < 3 else {}))
-    assert any(f"3 of {COUNT} images have an EXIF orientation" in note for note in scenes.load(own).notes)
+    assert any(f"3 of {COUNT} images have an EXIF orientation" in note for note in scenes.load(taken).notes)
 
 
 JPEG = ["jpg", "jpeg", "JPG", "JPEG"]
 
 
-def write_jpegs(own: Path) -> list[str]:
+def write_jpegs(taken: Path) -> list[str]:
     """Write the images of a capture as JPEGs of every suffix, beside PNGs of another picture; return their names."""
     names = [f"frame_{i:03d}.{JPEG[i % len(JPEG)]}" for i in range(COUNT)]
     across, down = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     for i, name in enumerate(names):
-        write_image(own / "images" / name, np.stack([10 * across, 20 * down, 0 * down + 20 * i], -1).astype(np.uint8))
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(own, "txt")
+        write_image(taken / "images" / name, np.stack([10 * across, 20 * down, 0 * down + 20 * i], -1).astype(np.uint8))
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(taken, "txt")
     return names
 
 
-def test_jpegs_are_read(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jpegs_are_read(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a suffix that is not known, blue in place of red, the PNG of that name, and a scene kept in 8 bits."""
-    write_jpegs(own)
+    write_jpegs(taken)
     for most in (images._MOST_FLOATS, 0):  # as floats, and in 8 bits
         monkeypatch.setattr(images, "_MOST_FLOATS", most)
-        scene = scenes.load(own)
+        scene = scenes.load(taken)
         assert len(scene.train) + len(scene.test) == COUNT
         for view in (*scene.train, *scene.test):
             red, green, blue = (view.image * 255).unbind(-1)
@@ -213,40 +213,51 @@ def test_jpegs_are_read(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             ]
             assert torch.stack(error).mean() < 6  # JPEG halves the resolution of colours; measured: 3.3
         assert [view.name for view in scene.test] == ["frame_007"]
-    scene = scenes.load(own, downscale=2)
+    scene = scenes.load(taken, downscale=2)
     assert scene.train[0].image.shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def grey(own: Path, name: str) -> None:
-    write_image(own / "images" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
+def grey(taken: Path, name: str) -> None:
+    write_image(taken / "images" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
 
 
 @pytest.mark.parametrize(
-    ("break_it", "said"),
+    ("break_it", "message"),
     [
         (
-            lambda own, name: os.truncate(path := own / "images" / name, path.stat().st_size - 40),
+            lambda taken, name: os.truncate(path := taken / "images" / name, path.stat().st_size - 40),
             "damaged JPEG.*truncated",
         ),
-        (lambda own, name: os.truncate(own / "images" / name, 20), "frame_001.jpeg.*damaged JPEG"),
-        (lambda own, name: (own / "images" / name).write_bytes(b"GIF89a"), "frame_001.jpeg.*expected a PNG"),
+        (
+            lambda taken, name: os.truncate(taken / "images" / name, 20),
+            "frame_001.jpeg.*damaged JPEG",
+        ),
+        (
+            lambda taken, name: (taken / "images" / name).write_bytes(b"GIF89a"),
+            "frame_001.jpeg.*expected a PNG",
+        ),
         (grey, "expected a JPEG of RGB, got one of L"),
         (
-            lambda own, name: write_image(own / "images" / name, np.zeros((9, 9, 3), np.uint8)),
+            lambda taken, name: write_image(taken / "images" / name, np.zeros((9, 9, 3), np.uint8)),
             "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
         ),
         (
-            lambda own, name: [(own / "images" / name).unlink(), (own / "images" / name).symlink_to("/etc/passwd")],
+            lambda taken, name: [
+                (taken / "images" / name).unlink(),
+                (taken / "images" / name).symlink_to("/etc/passwd"),
+            ],
             "expected a PNG or a JPEG",
         ),
     ],
 )
-def test_a_jpeg_that_is_not_whole_is_refused(own: Path, break_it: Callable[[Path, str], object], said: str) -> None:
+def test_a_jpeg_that_is_not_whole_is_refused(
+    taken: Path, break_it: Callable[[Path, str], object], message: str
+) -> None:
     """Catches missing rows that are read as grey, and a stack trace of the decoder."""
-    names = write_jpegs(own)
-    break_it(own, names[1])
-    with pytest.raises(InputError, match=said) as caught:
-        scenes.load(own)
+    names = write_jpegs(taken)
+    break_it(taken, names[1])
+    with pytest.raises(InputError, match=message) as caught:
+        scenes.load(taken)
     assert "\n" not in str(caught.value)
 
 
@@ -313,17 +324,17 @@ def test_cameras_that_stand_every_way_have_no_up() -> None:
     assert up_of(torch.from_numpy(viewmats)) == (0, 0, 1)
 
 
-def test_names_without_numbers_have_no_times(own: Path) -> None:
+def test_names_without_numbers_have_no_times(taken: Path) -> None:
     """Catches times that come from nowhere."""
-    rename(own, [f"{letter}.png" for letter in "abcdefghi"])
-    assert not scenes.load(own).has_time
+    rename(taken, [f"{letter}.png" for letter in "abcdefghi"])
+    assert not scenes.load(taken).has_time
 
 
 def text(part: str, old: str, new: str, count: int = 1) -> Callable[[Path], object]:
     """Replace words of a file of the model."""
 
-    def change(own: Path) -> None:
-        path = own / "sparse" / "0" / f"{part}.txt"
+    def change(taken: Path) -> None:
+        path = taken / "sparse" / "0" / f"{part}.txt"
         assert old in path.read_text()
         path.write_text(path.read_text().replace(old, new, count))
 
@@ -331,13 +342,13 @@ def text(part: str, old: str, new: str, count: int = 1) -> Callable[[Path], obje
 
 
 def table(content: str) -> Callable[[Path], object]:
-    return lambda own: (own / "times.csv").write_text(content)
+    return lambda taken: (taken / "times.csv").write_text(content)
 
 
 ROWS = "".join(f"{name},{i}\n" for i, name in enumerate(NAMES))
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no cameras": (lambda own: (own / "sparse/0/cameras.txt").unlink(), r"cameras\.bin or cameras\.txt"),
-    "no points": (lambda own: (own / "sparse/0/points3D.txt").write_text("# none\n"), "at least one point"),
+    "no cameras": (lambda taken: (taken / "sparse/0/cameras.txt").unlink(), r"cameras\.bin or cameras\.txt"),
+    "no points": (lambda taken: (taken / "sparse/0/points3D.txt").write_text("# none\n"), "at least one point"),
     "fisheye": (text("cameras", "PINHOLE", "OPENCV_FISHEYE"), "OPENCV_FISHEYE.*colmap image_undistorter"),
     "unknown model": (text("cameras", "PINHOLE", "LENS\t"), "got 'LENS'"),
     "too few parameters": (text("cameras", " 9.5", ""), "PINHOLE with fx fy cx cy"),
@@ -355,14 +366,14 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "name of a folder": (text("images", "frame_001.png", "."), "expected a number in its name"),
     "no number": (text("images", "frame_001.png", "x.png"), "expected a number in its name"),
     "endless number": (text("images", "frame_001", "9" * 5000), "expected a time"),
-    "image missing": (lambda own: (own / "images/frame_001.png").unlink(), "frame_001.png.*found none"),
+    "image missing": (lambda taken: (taken / "images/frame_001.png").unlink(), "frame_001.png.*found none"),
     "image is a link to a device": (
-        lambda own: [(own / "images/frame_001.png").unlink(), (own / "images/frame_001.png").symlink_to("/dev/zero")],
+        lambda taken: [(file := taken / "images/frame_001.png").unlink(), file.symlink_to("/dev/zero")],
         "expected a file, found a device",
     ),
-    "image truncated": (lambda own: os.truncate(own / "images/frame_001.png", 40), "truncated PNG"),
+    "image truncated": (lambda taken: os.truncate(taken / "images/frame_001.png", 40), "truncated PNG"),
     "another size": (
-        lambda own: write_image(own / "images/frame_001.png", np.zeros((9, 9, 3), np.uint8)),
+        lambda taken: write_image(taken / "images/frame_001.png", np.zeros((9, 9, 3), np.uint8)),
         "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
     ),
     "folded": (text("cameras", "PINHOLE 16 12 20.0 21.0", "RADIAL 16 12 5 5 5 -9 9"), "PINHOLE|RADIAL with"),
@@ -370,40 +381,40 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
         text("cameras", "PINHOLE 16 12 20.0 21.0 3.25 9.5", "RADIAL 16 12 5.0 8 6 -9.0 1.0"),
         "cannot undo the distortion",
     ),
-    "mask missing": (lambda own: (own / "masks").mkdir(), "the mask of frame_00"),
+    "mask missing": (lambda taken: (taken / "masks").mkdir(), "the mask of frame_00"),
     "table without header": (table(ROWS), "first line name,time"),
     "table empty": (table(""), "first line name,time"),
     "table with another column": (table("name,time\nframe_000.png,1,2\n"), "line 2: expected a name"),
     "name in the table twice": (table(f"name,time\n{ROWS}frame_000.png,1\n"), "line 11: expected a name, once"),
     "time NaN": (table("name,time\nframe_000.png,nan\n"), "line 2: expected a time"),
     "time missing": (table("name,time\nframe_000.png,1\n"), "got none of 'frame_001.png'"),
-    "table is binary": (lambda own: (own / "times.csv").write_bytes(b"\xff\x00"), "expected a table"),
+    "table is binary": (lambda taken: (taken / "times.csv").write_bytes(b"\xff\x00"), "expected a table"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_fault_is_one_line_that_says_what_is_wrong(own: Path, fault: str) -> None:
+def test_fault_is_one_line_that_says_what_is_wrong(taken: Path, fault: str) -> None:
     """Catches a fault let through, and a stack trace from the depths."""
-    apply, said = FAULTS[fault]
-    apply(own)
-    with pytest.raises(InputError, match=said) as caught:
-        scenes.load(own)
+    apply, message = FAULTS[fault]
+    apply(taken)
+    with pytest.raises(InputError, match=message) as caught:
+        scenes.load(taken)
     assert "\n" not in str(caught.value)
 
 
-def test_fewer_images_than_the_split_needs(own: Path) -> None:
+def test_fewer_images_than_the_split_needs(taken: Path) -> None:
     """Catches a scene without a test view."""
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 8.0, 6.0), NAMES[:7], circle(7)).write(own, "txt")
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 8.0, 6.0), NAMES[:7], circle(7)).write(taken, "txt")
     with pytest.raises(InputError, match="at least 8 images"):
-        scenes.load(own)
+        scenes.load(taken)
 
 
-def model(own: Path, where: str, count: int) -> None:
+def model(taken: Path, where: str, count: int) -> None:
     """Write a model of the first `count` images into another folder of the capture."""
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES[:count], circle(COUNT)[:count]).write(own, "txt")
-    target = own / where
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES[:count], circle(COUNT)[:count]).write(taken, "txt")
+    target = taken / where
     target.mkdir(parents=True, exist_ok=True)
-    for path in (own / "sparse" / "0").iterdir():
+    for path in (taken / "sparse" / "0").iterdir():
         if target != path.parent:
             shutil.copy(path, target / path.name)
 
@@ -418,25 +429,25 @@ def model(own: Path, where: str, count: int) -> None:
     ],
 )
 def test_the_largest_model_is_read(
-    own: Path, models: dict[str, int], words: str, capsys: pytest.CaptureFixture[str]
+    taken: Path, models: dict[str, int], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches sparse/0 read in silence where COLMAP could not join the images, and another is larger."""
-    for where, count in sorted(models.items(), key=lambda one: one[0] == "sparse/0"):  # the others are copies of it
-        model(own, where, count)
-    scene = scenes.load(own)
+    for where, count in sorted(models.items(), key=lambda item: item[0] == "sparse/0"):  # the others are copies of it
+        model(taken, where, count)
+    scene = scenes.load(taken)
     assert len(scene.train) + len(scene.test) == max(models.values())
     assert words in capsys.readouterr().err
 
 
-def test_one_model_needs_no_words(own: Path) -> None:
+def test_one_model_needs_no_words(taken: Path) -> None:
     """Catches a line for every capture, and sparse/ itself or a folder 1 alone refused."""
     for where in ("1", "."):
-        shutil.move(own / "sparse" / "0", own / "moved")
-        shutil.rmtree(own / "sparse")
-        shutil.copytree(own / "moved", own / "sparse" / where)
-        assert [note[:6] for note in scenes.load(own).notes] == ["times:"]
-        shutil.move(own / "moved", own / "sparse" / "0")
-        for path in (own / "sparse").glob("*.txt"):
+        shutil.move(taken / "sparse" / "0", taken / "moved")
+        shutil.rmtree(taken / "sparse")
+        shutil.copytree(taken / "moved", taken / "sparse" / where)
+        assert [note[:6] for note in scenes.load(taken).notes] == ["times:"]
+        shutil.move(taken / "moved", taken / "sparse" / "0")
+        for path in (taken / "sparse").glob("*.txt"):
             path.unlink()
 
 
@@ -450,22 +461,22 @@ LINES: dict[str, Callable[[str], str]] = {
 
 
 @pytest.mark.parametrize("change", LINES)
-def test_images_txt_as_programs_write_it(own: Path, change: str) -> None:
+def test_images_txt_as_programs_write_it(taken: Path, change: str) -> None:
     """Catches what an editor on Windows adds, which changes no number."""
-    expected = scenes.load(own)
+    expected = scenes.load(taken)
     for part in ("images", "cameras", "points3D"):
-        path = own / "sparse/0" / f"{part}.txt"
+        path = taken / "sparse/0" / f"{part}.txt"
         if part == "images" or change in ("carriage returns", "byte order mark"):
             path.write_bytes(LINES[change](path.read_text()).encode())
-    scene = scenes.load(own)
+    scene = scenes.load(taken)
     assert [view.name for view in scene.train] == [view.name for view in expected.train]
     assert all((a.camera.viewmat == b.camera.viewmat).all() for a, b in zip(scene.train, expected.train, strict=True))
 
 
 @pytest.mark.parametrize("which", ["all", "second", "last but one", "numbers for a name", "name with spaces"])
-def test_images_txt_without_second_lines_is_refused(own: Path, which: str) -> None:
+def test_images_txt_without_second_lines_is_refused(taken: Path, which: str) -> None:
     """Catches every second image dropped in silence."""
-    path = own / "sparse/0/images.txt"
+    path = taken / "sparse/0/images.txt"
     head, *lines = path.read_text().split("\n")
     pairs = [[lines[2 * i], lines[2 * i + 1]] for i in range(COUNT)]
     if which == "numbers for a name":
@@ -476,20 +487,20 @@ def test_images_txt_without_second_lines_is_refused(own: Path, which: str) -> No
         pairs[i].pop()
     path.write_text("\n".join([head, *(line for pair in pairs for line in pair)]))
     with pytest.raises(InputError, match=r"expected the keypoints .* or an empty line, got .*after each image"):
-        scenes.load(own)
+        scenes.load(taken)
 
 
-def test_names_with_spaces(own: Path) -> None:
+def test_names_with_spaces(taken: Path) -> None:
     """Catches a name that is cut at its first space."""
-    rename(own, [f"my shot {i}.png" for i in range(COUNT)])
-    assert scenes.load(own).train[2].name == "my shot 2"
+    rename(taken, [f"my shot {i}.png" for i in range(COUNT)])
+    assert scenes.load(taken).train[2].name == "my shot 2"
 
 
-def test_images_of_half_the_size(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_half_the_size(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a folder images_2 refused with advice that does not help, or read with the full size's intrinsics."""
-    for path in (own / "images").iterdir():
+    for path in (taken / "images").iterdir():
         write_image(path, np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
-    view = scenes.load(own).train[0]
+    view = scenes.load(taken).train[0]
     assert view.camera.K.tolist() == [[10, 0, 1.625], [0, 10.5, 4.75], [0, 0, 1]]
     assert "images of 8x6 are resized from those of their camera, 16x12" in capsys.readouterr().err
 
@@ -498,8 +509,11 @@ def test_images_of_half_the_size_are_undistorted(tmp_path: Path) -> None:
     """Catches the lens of the full size used for a reduced image: both show the same rays in the middle."""
     lens, names = (50.0, 54.0, 33.0, 23.0, -0.2, 0.03, 0.01, -0.02), NAMES
     big = rays(np.array([[50.0, 0, 33], [0, 54, 23], [0, 0, 1]]))
-    seen = picture(ray_seen(big, *lens[4:]))
-    for root, pixels in ((tmp_path / "whole", seen), (tmp_path / "half", cv2.resize(seen, (32, 24), None, 0, 0, 3))):
+    visible = picture(ray_seen(big, *lens[4:]))
+    for root, pixels in (
+        (tmp_path / "whole", visible),
+        (tmp_path / "half", cv2.resize(visible, (32, 24), None, 0, 0, 3)),
+    ):
         for name in names:
             write_image(root / "images" / name, np.rint(pixels * 255).astype(np.uint8))
         Capture("OPENCV", WIDTH * 4, HEIGHT * 4, lens, names, circle(COUNT)).write(root, "bin")
@@ -511,31 +525,31 @@ def test_images_of_half_the_size_are_undistorted(tmp_path: Path) -> None:
     assert np.abs(half.train[0].image.numpy() - expected)[2:-2, 2:-2].max() < 0.02
 
 
-def test_a_rig_named_by_frames_first(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_named_by_frames_first(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches the number of the camera taken for the time, and a choice that is not printed."""
     names = [f"frame_{i // 3:04d}/cam{i % 3:02d}.png" for i in range(COUNT)]
     for old, new in zip(NAMES, names, strict=True):
-        (own / "images" / new).parent.mkdir(exist_ok=True)
-        (own / "images" / old).rename(own / "images" / new)
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, np.tile(circle(3), (3, 1, 1))).write(own, "txt")
-    scene = scenes.load(own)
+        (taken / "images" / new).parent.mkdir(exist_ok=True)
+        (taken / "images" / old).rename(taken / "images" / new)
+    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, np.tile(circle(3), (3, 1, 1))).write(taken, "txt")
+    scene = scenes.load(taken)
     assert {view.name: view.time for view in scene.train}["frame_0001/cam02"] == 0.5
-    line = f"{own.name}: times: number 1 of 2 in each name, 0 to 2 (whole numbers), scaled to [0, 1]"
+    line = f"{taken.name}: times: number 1 of 2 in each name, 0 to 2 (whole numbers), scaled to [0, 1]"
     assert line in capsys.readouterr().err
 
 
-def test_notes_are_in_the_record(own: Path) -> None:
+def test_notes_are_in_the_record(taken: Path) -> None:
     """Catches a choice that is printed and then forgotten, and a record of before that is refused."""
-    (own / "capture").mkdir()
+    (taken / "capture").mkdir()
     for name in ("images", "sparse"):
-        shutil.move(own / name, own / "capture" / name)
+        shutil.move(taken / name, taken / "capture" / name)
     assert main_here(
-        "+exp=colmap", "model=3dgs", f"data.root={own}", "scene=custom", "scene.name=capture",
-        "train.iterations=1", f"results={own / 'results'}",
+        "+exp=colmap", "model=3dgs", f"data.root={taken}", "scene=custom", "scene.name=capture",
+        "train.iterations=1", f"results={taken / 'results'}",
     ) == 0  # fmt: skip
-    (path,) = record.find(own / "results")
+    (path,) = record.find(taken / "results")
     provenance = record.read(path).provenance
-    assert provenance.data_notes == list(scenes.load(own / "capture").notes)
+    assert provenance.data_notes == list(scenes.load(taken / "capture").notes)
     assert "times: the number in each name, 0 to 8" in provenance.data_notes[0]
 
 
@@ -565,11 +579,11 @@ def test_changed_bytes_are_an_input_error_or_finite(part: str, at: int, value: b
     start = at % len(data)
     data[start : start + len(value)] = value[: len(data) - start]
     try:
-        found = READERS[part](colmap.ModelFile(Path(f"{part}.bin"), bytes(data)))
+        loaded = READERS[part](colmap.ModelFile(Path(f"{part}.bin"), bytes(data)))
     except InputError:
         return
-    values = [found.means, found.colors] if part == "points3D" else []
-    values += [torch.tensor(lens.K) for lens in found.values()] if part == "cameras" else []
-    values += [torch.tensor(image.viewmat) for image in found] if part == "images" else []
+    values = [loaded.means, loaded.colors] if part == "points3D" else []
+    values += [torch.tensor(lens.K) for lens in loaded.values()] if part == "cameras" else []
+    values += [torch.tensor(image.viewmat) for image in loaded] if part == "images" else []
     assert values
     assert all(value.isfinite().all() for value in values)

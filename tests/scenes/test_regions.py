@@ -107,7 +107,7 @@ def written(image: np.ndarray) -> Callable[[Path], bool]:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         (Path.unlink, "r_1.png"),
         (written(NUMBERS[:, :7].copy()), "expected 8x6 as the image of this mask, got 7x6"),
@@ -117,14 +117,14 @@ def written(image: np.ndarray) -> Callable[[Path], bool]:
         (lambda path: path.write_bytes(b"no PNG"), "expected a PNG"),
     ],
 )
-def test_a_damaged_mask_is_refused(change: Callable[[Path], object], said: str, tiny: Path) -> None:
+def test_a_damaged_mask_is_refused(change: Callable[[Path], object], reason: str, tiny: Path) -> None:
     """Catches a mask that is left out, of another size, of colours or cut off, and is found when it is measured by."""
     write_masks(tiny)
     change(tiny / "train" / "masks" / "r_1.png")
     with pytest.raises(InputError) as caught:
         scenes.load(tiny)
     message = str(caught.value)
-    assert said in message
+    assert reason in message
     assert "the mask of train/r_1.png" in message
     assert "\n" not in message
 

@@ -66,8 +66,8 @@ def test_frames_can_be_chosen(root: Path) -> None:
     scene = scenes.load(root, frames=(101, 102))
     assert [view.name for view in scene.test] == ["Tiny_undist_00101_10", "Tiny_undist_00102_10"]
     assert [view.time for view in scene.test] == [0.0, 1.0]
-    for frames, said in (((100, 103), "00103_00"), ((102, 101), "first <= last"), ((1.5, 2), "frames")):
-        with pytest.raises(InputError, match=said):
+    for frames, message in (((100, 103), "00103_00"), ((102, 101), "first <= last"), ((1.5, 2), "frames")):
+        with pytest.raises(InputError, match=message):
             scenes.load(root, frames=frames)  # type: ignore[arg-type]
 
 
@@ -82,7 +82,7 @@ def test_columns_are_read_by_name(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda text: text.replace(HEADER, HEADER.replace(" qw", "")), "expected a header with"),
         (lambda text: text.replace(" sk ", " sk d1 d2 ").replace("1.5 0.0 ", "1.5 0.0 0.1 0.0 "), "d1: expected 0"),
@@ -96,11 +96,11 @@ def test_columns_are_read_by_name(root: Path) -> None:
         (lambda text: text + row(16), "16.png of every camera"),
     ],
 )
-def test_faulty_parameters_are_told(root: Path, change: Callable[[str], str], said: str) -> None:
+def test_faulty_parameters_are_told(root: Path, change: Callable[[str], str], message: str) -> None:
     """Catches distorted originals taken for undistorted ones, and tables that are read askew."""
     path = root / CAMERAS
     path.write_text(change(path.read_text()))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         scenes.load(root)
 
 
@@ -136,8 +136,8 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
     ):
         scenes.load(root)
     repaired = scenes.load(root, repair=["Tiny_undist_00101_09", "Other_undist_00101_03"])
-    said = capsys.readouterr().err.splitlines()
-    assert f"{root}/Tiny_undist_00101_09.png: damaged, replaced by Tiny_undist_00100_09.png (data.repair)" in said
+    message = capsys.readouterr().err.splitlines()
+    assert f"{root}/Tiny_undist_00101_09.png: damaged, replaced by Tiny_undist_00100_09.png (data.repair)" in message
     views = {view.name: view for view in repaired.train}
     replaced = views["Tiny_undist_00101_09"]
     torch.testing.assert_close(replaced.image[0, 0] * 255, torch.tensor([9.0, 100.0, 7.0]))
@@ -153,7 +153,7 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("damaged", "name", "said"),
+    ("damaged", "name", "message"),
     [
         ([], "Tiny_undist_00101_09", "is whole: leave it out"),
         (["Tiny_undist_00100_09"], "Tiny_undist_00100_09", "frame 99, it is not loaded"),
@@ -163,11 +163,11 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
         (["Tiny_undist_00101_09"], "00101_09", "expected names such as"),
     ],
 )
-def test_what_cannot_be_replaced_is_refused(root: Path, damaged: list[str], name: str, said: str) -> None:
+def test_what_cannot_be_replaced_is_refused(root: Path, damaged: list[str], name: str, message: str) -> None:
     """Catches a whole image that is thrown away, a test on another frame's image, and an image made of nothing."""
-    for one in damaged:
-        damage(root, one)
-    with pytest.raises(InputError, match=said):
+    for single in damaged:
+        damage(root, single)
+    with pytest.raises(InputError, match=message):
         scenes.load(root, repair=[name])
 
 

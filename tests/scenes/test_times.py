@@ -21,7 +21,7 @@ def fixed(names: Callable[[int, int], str], seed: int = 0) -> tuple[list[str], n
     listed = [listed[i] for i in np.random.default_rng(seed).permutation(len(listed))]
     poses = circle(CAMERAS)
     return (
-        [names(*one) for one in listed],
+        [names(*single) for single in listed],
         np.stack([poses[camera] for camera, _ in listed]),
         [f / (FRAMES - 1) for _, f in listed],
     )
@@ -62,9 +62,9 @@ FORMS: dict[str, Callable[[int, int], str]] = {
 def test_the_time_of_a_rig(form: str, moves: bool) -> None:
     """Catches the number of the camera taken for the time, in any order of folders, where poses repeat or nearly do."""
     names, viewmats, expected = fixed(FORMS[form])
-    found = of_names(names, nudged(viewmats) if moves else viewmats)
-    assert found.values == pytest.approx(expected)
-    (note,) = found.notes
+    timed = of_names(names, nudged(viewmats) if moves else viewmats)
+    assert timed.values == pytest.approx(expected)
+    (note,) = timed.notes
     assert note.startswith("times: ")
     assert "scaled to [0, 1]" in note
 
@@ -114,8 +114,8 @@ def test_the_time_of_a_moving_camera(form: str) -> None:
     names = [MOVING[form](i) for i in range(count)]
     assert len(set(names)) == count
     order = np.random.default_rng(0).permutation(count)
-    found = of_names([names[i] for i in order], circle(count)[order])
-    assert found.values == pytest.approx([i / (count - 1) for i in order])
+    timed = of_names([names[i] for i in order], circle(count)[order])
+    assert timed.values == pytest.approx([i / (count - 1) for i in order])
 
 
 @pytest.mark.parametrize("form", ["frame_0003/cam01", "0003/1"])
@@ -125,15 +125,15 @@ def test_two_cameras_that_move(form: str) -> None:
     path = circle(200)
     viewmats = np.stack([path[f + 100 * c] for f, c in listed])
     write = (lambda f, c: f"frame_{f:04d}/cam{c:02d}.png") if "cam" in form else (lambda f, c: f"{f:04d}/{c}.png")
-    assert of_names([write(*one) for one in listed], viewmats).values == pytest.approx([f / 7 for f, _ in listed])
+    assert of_names([write(*single) for single in listed], viewmats).values == pytest.approx([f / 7 for f, _ in listed])
 
 
 def test_no_time() -> None:
     """Catches times from numbers that do not change, from those of a still rig, and from nowhere."""
     for names in ([f"{letter}_1080p.png" for letter in "abcde"], [*"abcde"], [f"cam{i:02d}.png" for i in range(5)]):
-        found = of_names(names, circle(5))
-        assert found.values == [None] * 5
-        assert "times: none" in found.notes[0]
+        timed = of_names(names, circle(5))
+        assert timed.values == [None] * 5
+        assert "times: none" in timed.notes[0]
 
 
 def stereo(count: int) -> np.ndarray:
@@ -201,10 +201,10 @@ TABLES = {
 def test_tables_as_programs_write_them(kind: str) -> None:
     """Catches a table that is refused for what a spreadsheet adds to it."""
     names = ["a.png", "b.png", "c.png"]
-    found = times.of_table(TABLES[kind].encode(), Path("times.csv"), names, names)
-    assert found.values == pytest.approx([0, 1 / 3, 1])
-    assert ("left out" in found.notes[0]) == (kind == "rows of others")
-    assert ("'frame, note'" in found.notes[0]) == (kind == "another column")
+    timed = times.of_table(TABLES[kind].encode(), Path("times.csv"), names, names)
+    assert timed.values == pytest.approx([0, 1 / 3, 1])
+    assert ("left out" in timed.notes[0]) == (kind == "rows of others")
+    assert ("'frame, note'" in timed.notes[0]) == (kind == "another column")
 
 
 @pytest.mark.parametrize(
@@ -226,25 +226,25 @@ def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) ->
 def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) -> None:
     """Catches Times.CSV that is left out in silence, and a number whose exact value has a hundred million digits."""
     (tmp_path / "Times.CSV").write_text("name,time\na,1e-99999999\nb,1\n")
-    found, digests = times.of_images(tmp_path, ["a", "b"], circle(2), [0, 1], Path("images.txt"))
-    assert found.values == [0, 1]
+    timed, digests = times.of_images(tmp_path, ["a", "b"], circle(2), [0, 1], Path("images.txt"))
+    assert timed.values == [0, 1]
     assert list(digests) == ["Times.CSV"]
 
 
 def test_a_table_of_equal_times_is_a_still_scene() -> None:
     """Catches a division by zero, and a scene of many cameras at one moment that is called moving."""
-    found = times.of_table(b"name,time\na,3\nb,3\n", Path("times.csv"), ["a", "b"], [0, 1])
-    assert found.values == [None, None]
+    timed = times.of_table(b"name,time\na,3\nb,3\n", Path("times.csv"), ["a", "b"], [0, 1])
+    assert timed.values == [None, None]
 
 
 def test_fields_are_scaled_over_all_files() -> None:
     """Catches splits that are scaled apart, times in [0, 1] that are changed, and seconds beside shares of the clip."""
     assert times.of_fields({"a": [0.0, 0.7], "b": [0.1]}) == ({"a": [0.0, 0.7], "b": [0.1]}, [])
-    found, (note,) = times.of_fields({"a": [0.0, 0.3], "b": [0.1]})
-    assert found == {"a": [0.0, 0.3], "b": [0.1]}
+    timed, (note,) = times.of_fields({"a": [0.0, 0.3], "b": [0.1]})
+    assert timed == {"a": [0.0, 0.3], "b": [0.1]}
     assert "0 to 0.3, as written" in note
-    found, (note,) = times.of_fields({"a": [0.0, 30.0], "b": [15.0, 40.0]})
-    assert found == {"a": [0, 0.75], "b": [0.375, 1]}
+    timed, (note,) = times.of_fields({"a": [0.0, 30.0], "b": [15.0, 40.0]})
+    assert timed == {"a": [0, 0.75], "b": [0.375, 1]}
     assert "0 to 40" in note
     assert times.of_fields({"a": [-1.0, 1.0]})[0] == {"a": [0, 1]}
     assert times.of_fields({"a": [0.5, 0.5], "b": [0.5]})[0] == {"a": [None, None], "b": [None]}

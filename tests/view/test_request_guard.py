@@ -213,7 +213,7 @@ def test_large_or_many_messages_are_not_kept(viewer: Viewer) -> None:
             browser.send(packed({"type": "GuiFormDirtyMessage", "uuid": f"{i}"}))
         browser.send(packed(CAMERA))
         until(lambda: rests(viewer))
-    assert not [one for one in gc.get_objects() if type(one) is _messages.GuiFormDirtyMessage]
+    assert not [thing for thing in gc.get_objects() if type(thing) is _messages.GuiFormDirtyMessage]
 
 
 def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,10 +247,12 @@ def test_browsers_that_do_not_read_hold_a_frame_each(viewer: Viewer, monkeypatch
             until(lambda rendered=rendered: len(threads) >= rendered)
         until(lambda: rests(viewer))
         gc.collect()
-        images = [one.rgb_data for one in gc.get_objects() if type(one) is _messages.BackgroundImageMessage]
+        images = [thing.rgb_data for thing in gc.get_objects() if type(thing) is _messages.BackgroundImageMessage]
         waiting = [len(image) for image in images if image is not None]
         sent = [
-            one.transport.get_write_buffer_size() for one in gc.get_objects() if type(one) is request_guard.Connection
+            thing.transport.get_write_buffer_size()
+            for thing in gc.get_objects()
+            if type(thing) is request_guard.Connection
         ]
         frame = max(waiting)
         assert frame > 100_000

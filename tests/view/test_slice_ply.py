@@ -39,14 +39,14 @@ def trained(variant: str) -> GaussianModel:
     return model.requires_grad_(False)
 
 
-def drawn(data: bytes, seen: Camera) -> torch.Tensor:
+def drawn(data: bytes, view: Camera) -> torch.Tensor:
     """Draw a PLY by plyfile, numpy and the rasterizer: the conventions of 3DGS, written a second time."""
     rows = PlyData.read(io.BytesIO(data))["vertex"].data
     assert rows.dtype.names == tuple(COLUMNS)
     take = {name: np.stack([rows[name + end] for end in ends], 1).astype(np.float64) for name, ends in
             (("f_dc_", "012"), ("scale_", "012"), ("rot_", "0123"), ("", "xyz"))}  # fmt: skip
     R = Rotation.from_quat(np.roll(take["rot_"], -1, axis=1)).as_matrix()
-    directions = take[""] - seen.center.double().numpy()
+    directions = take[""] - view.center.double().numpy()
     a, b, c = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     xx, yy, zz = a * a, b * b, c * c
     basis = np.stack([
@@ -61,17 +61,17 @@ def drawn(data: bytes, seen: Camera) -> torch.Tensor:
     opacities = 1 / (1 + np.exp(-rows["opacity"].astype(np.float64)))
     parts = (take[""], R * np.exp(take["scale_"])[:, None, :], opacities, colors)
     tensors = [torch.tensor(part, dtype=torch.float32) for part in parts]
-    return rasterize(*tensors, seen.viewmat[None], seen.K[None], SIZE, SIZE, background=BACKGROUND).image[0]
+    return rasterize(*tensors, view.viewmat[None], view.K[None], SIZE, SIZE, background=BACKGROUND).image[0]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_ply_is_the_image(variant: str) -> None:
     """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
-    model, seen = trained(variant), camera(0.3, -4.0, 1.0)
-    gaussians = trained_of(model, Query.of(seen, 0.4))
-    image = render(model, seen, 0.4, BACKGROUND)
+    model, view = trained(variant), camera(0.3, -4.0, 1.0)
+    gaussians = trained_of(model, Query.of(view, 0.4))
+    image = render(model, view, 0.4, BACKGROUND)
     assert (image - BACKGROUND).abs().max() > 0.1
-    assert (drawn(ply_of(gaussians), seen) - image).abs().max() < 2e-3
+    assert (drawn(ply_of(gaussians), view) - image).abs().max() < 2e-3
 
 
 @pytest.mark.parametrize("variant", ["3dgs", "3dgs_agr", "4dgs", "4dgs_agr", "4dgs_constant_colors"])
@@ -79,8 +79,8 @@ def test_harmonics_are_right_from_everywhere(variant: str) -> None:
     """Catches f_rest in the wrong order, waves of time that are left out, or mean times that AGR has not moved."""
     model = trained(variant)
     data = ply_of(trained_of(model, Query.at(torch.zeros(3), 0.4), keep_harmonics=True))
-    for seen in (camera(0.3, -4.0, 1.0), camera(3.0, 2.0, -2.0)):
-        assert (drawn(data, seen) - render(model, seen, 0.4, BACKGROUND)).abs().max() < 2e-3
+    for view in (camera(0.3, -4.0, 1.0), camera(3.0, 2.0, -2.0)):
+        assert (drawn(data, view) - render(model, view, 0.4, BACKGROUND)).abs().max() < 2e-3
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -32,7 +32,7 @@ def camera(x: float, *, towards: float = 0.0) -> Camera:
 
 def scene(*cameras_and_times: tuple[Camera, float | None]) -> Scene:
     """A scene with these training views, called by their number."""
-    views = [View(str(i), one, time, torch.zeros(8, 8, 3)) for i, (one, time) in enumerate(cameras_and_times)]
+    views = [View(str(i), placed, time, torch.zeros(8, 8, 3)) for i, (placed, time) in enumerate(cameras_and_times)]
     return Scene("line", views, [], [], (0.0, 0.0, 0.0), EXTENT, None, "0")
 
 

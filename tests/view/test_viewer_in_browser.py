@@ -116,8 +116,8 @@ def test_it_opens_and_stays_on_this_machine(visit, viewer):
     assert page.complaints == []
     foreign = [url for url in page.asked if not re.match(r"data:|(blob:)?(http|ws)://localhost:", url)]
     assert foreign == []
-    said = page.locator("table").first.inner_text()
-    numbers = {line.split("\t")[0].strip(): line.split("\t")[-1] for line in said.splitlines()}
+    legend = page.locator("table").first.inner_text()
+    numbers = {line.split("\t")[0].strip(): line.split("\t")[-1] for line in legend.splitlines()}
     assert list(numbers) == ["ms", "slice", *STAGES["slice"], "raster", *STAGES["raster"], "FPS"]
     assert numbers.pop("ms") == viewer.renderers[0].name
     assert all(float(number) >= 0 for number in numbers.values())
@@ -187,10 +187,10 @@ def test_gaussians_have_the_colours_of_their_classes_or_costs(visit, viewer):
     page = visit()
     pictures = [settle(page)]
     classes, costs = (page.get_by_text(re.compile(words)) for words in ("refined by AGR", r"\d ns"))
-    for colours, said, unsaid in (("class", classes, costs), ("cost", costs, classes)):
+    for colours, legend, unsaid in (("class", classes, costs), ("cost", costs, classes)):
         choose(page, "colours", colours)
         pictures.append(settle(page))
-        assert said.count()
+        assert legend.count()
         assert not unsaid.count()
     choose(page, "colours", "image")
     assert settle(page) == pictures[0]
@@ -335,7 +335,7 @@ def test_the_image_is_saved_as_it_is_shown(visit, viewer):
     shown = cv2.imdecode(np.frombuffer(settle(page), np.uint8), cv2.IMREAD_COLOR)
     with page.expect_download() as download:
         page.get_by_role("button", name="save image").click()
-    assert download.value.suggested_filename == f"square {' '.join(one.name for one in viewer.renderers)}.png"
+    assert download.value.suggested_filename == f"square {' '.join(model.name for model in viewer.renderers)}.png"
     image = cv2.imread(str(download.value.path()))
     left, top, width, height = PICTURE.values()
     width_of_window = page.evaluate("[...document.querySelectorAll('canvas')].at(-1).clientWidth")
@@ -364,13 +364,13 @@ def test_training_cameras_are_shown_except_side_by_side(visit):
 
 def test_two_browsers_have_controls_of_their_own_and_one_may_leave(visit, viewer):
     """Catches a slider that moves everybody's picture, and frames for a browser that is gone."""
-    one, two = visit(), visit()
+    first, two = visit(), visit()
     assert len(viewer.browsers) == 2
     start = settle(two)
-    slide(one, "time", 1)
-    assert settle(one) != start
+    slide(first, "time", 1)
+    assert settle(first) != start
     assert settle(two) == start
-    one.close()
+    first.close()
     deadline = time.monotonic() + 40
     while len(viewer.browsers) > 1:
         assert time.monotonic() < deadline, "the browser that left is still served"
@@ -383,12 +383,12 @@ def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(fo
     """Catches a viewer that needs the data set, and models of two scenes under one camera."""
     run, other = load_run(folder), load_run(other_folder)
     run.config.data.root = "/nowhere"
-    made = Viewer([run], "localhost", free_port())
-    page = visit(made)
+    alone = Viewer([run], "localhost", free_port())
+    page = visit(alone)
     for label in ("training cameras", "nearest training view"):
         assert control(page, label, "checkbox").is_disabled()
-    made.stop()
-    assert "--data-root" in made.scene
+    alone.stop()
+    assert "--data-root" in alone.scene
     elsewhere = replace(other, scene=replace(other.scene, fingerprint="0"), folder=Path("elsewhere"))
     with pytest.raises(InputError, match="elsewhere"):
         Viewer([run, elsewhere], "localhost", free_port())

@@ -106,7 +106,7 @@ def spoilt(name: str, value: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "message"),
     [
         (np.ones(N, [(name, "f4") for name in columns(0) if name != "rot_3"]), "'rot_3'"),
         (np.ones(N, [(name, "f4") for name in columns(0) if name != "scale_2"]), r"two scales, of surfels \(2DGS\)"),
@@ -119,10 +119,10 @@ def spoilt(name: str, value: float) -> np.ndarray:
         (np.zeros(N, [(name, "f4") for name in columns(0)]), "quaternions"),
     ],
 )
-def test_what_is_not_trained_gaussians_is_refused(rows: np.ndarray, said: str, tmp_path: Path) -> None:
+def test_what_is_not_trained_gaussians_is_refused(rows: np.ndarray, message: str, tmp_path: Path) -> None:
     """Catches a KeyError, and values that would be drawn as NaN."""
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_trained(tmp_path / "a.ply")
     assert "a.ply" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -134,7 +134,7 @@ def with_columns(*more: str, kind: str = "f4") -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (("trbf_center", "trbf_scale"), "trbf_center, trbf_scale are of Spacetime Gaussians"),
         (tuple(f"motion_{i}" for i in range(9)), "motion_0..8 are of Spacetime Gaussians"),
@@ -149,10 +149,10 @@ def with_columns(*more: str, kind: str = "f4") -> np.ndarray:
         (("velocity_" + 6000 * "1",), "found velocity_1"),
     ],
 )
-def test_columns_that_change_the_look_are_refused_by_name(more: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_columns_that_change_the_look_are_refused_by_name(more: tuple[str, ...], message: str, tmp_path: Path) -> None:
     """Catches Gaussians that look different from the file's, because a column of another method was dropped."""
     PlyData([PlyElement.describe(with_columns(*more), "vertex")]).write(str(tmp_path / "a.ply"))
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_trained(tmp_path / "a.ply")
     assert len(str(caught.value)) < 600
 
