@@ -6,19 +6,20 @@ python -m gsbench.effects --picture RUN_FOLDER --out FILE.png [--camera 0] [--ti
 """
 
 import argparse
-import math
 import sys
 from pathlib import Path
 from typing import Any
 
 from gsbench import scenes
 from gsbench.as_json import as_json
+from gsbench.config_roles import facts
 from gsbench.effects import messages
 from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 
+BUDGET = facts("effects.budget_db")
 Answer = tuple[dict[str, Any], list[str]]  # the result of a command for JSON, and as lines
 
 
@@ -29,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
     parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
-    parser.add_argument("--budget-db", type=float, default=0.05, help="PSNR on val that the gate may cost")
+    parser.add_argument("--budget-db", type=float, default=BUDGET.default, help=BUDGET.help)
     parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by effect set")
     parser.add_argument("--camera", type=int, default=0, help="of --picture: the number of the evaluated view")
     parser.add_argument("--time", type=float, help="of --picture: in [0, 1]; that of the view by default")
@@ -50,8 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise InputError(f"--out: expected a file such as effect_sets.png, got {str(asked.out)!a:.200}")
         if not 0 <= asked.seed < 2**63:
             raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(asked.seed)[:30]}")
-        if not math.isfinite(asked.budget_db) or not 0 <= asked.budget_db <= 10:
-            raise InputError(f"--budget-db: expected 0 to 10 dB, got {asked.budget_db}")
+        BUDGET.check("--budget-db", asked.budget_db)
         import_models(asked.model_module)
         if asked.checkpoint is not None:
             result, lines = _gate(asked.checkpoint, asked.budget_db, asked.data_root)
@@ -84,10 +84,23 @@ def _gate(folder: Path, budget_db: float, data_root: str | None) -> Answer:
 
 
 def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, out: Path) -> Answer:
-    from gsbench.measure.images import write_png
-    from gsbench.run.picture import draw_run
+    """Draw the Gaussians of a run by effect set, from the camera of an evaluated view, at a time or at that view's."""
+    import torch
 
-    write_png(draw_run(folder, camera, time, data_root), out)
+    from gsbench.effects.picture import draw
+    from gsbench.measure.images import write_png
+    from gsbench.run.checks import evaluated_views
+    from gsbench.run.load import load_run, scene_of
+
+    if time is not None and not 0 <= time <= 1:
+        raise InputError(f"--time: expected 0 to 1, got {time}")
+    run = load_run(folder)
+    scene = scene_of(run, data_root)
+    views = evaluated_views(scene, run.config.scene.eval_split)
+    if not 0 <= camera < len(views):
+        raise InputError(f"--camera: expected 0 to {len(views) - 1}, the evaluated views of {scene.name}, got {camera}")
+    when, background = views[camera].time if time is None else time, torch.tensor(scene.background)
+    write_png(draw(run.model, views[camera].camera, when, background, run.config.raster.antialias), out)
     return {"written": out}, [f"Written: {out}"]
 
 
