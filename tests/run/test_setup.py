@@ -1,0 +1,166 @@
+"""The scene, the images and the Gaussians that a run starts from are those of its settings, and its record says so."""
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import hydra
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from scenes.test_technicolor import COUNT, HEADER, damage, row
+from scenes.tiny_scene import edit, write_tiny
+from tiny_run import overrides, run_here, write_moving_square
+
+from gsbench.config import CONF, Config, register_schema
+from gsbench.errors import InputError
+from gsbench.run.checks import scene_folder
+from gsbench.run.load import load_run
+from gsbench.run.setup import load_scene
+from gsbench.scenes.technicolor import CAMERAS
+from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
+
+
+def config(root: Path, scene: str) -> Config:
+    """The config of `python -m gsbench +exp=pbr scene=SCENE data.root=ROOT`."""
+    register_schema()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = hydra.compose("config", ["+exp=pbr", f"scene={scene}", f"data.root={root}"])
+    return OmegaConf.to_object(composed)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("scene", "folder"),
+    [("heart1", "heart"), ("heart1", "heart1"), ("heart2", "heart_1600"), ("heart2", "heart2"), ("cloud", "cloud")],
+)
+def test_the_scene_has_the_name_of_the_paper_or_of_the_release(scene: str, folder: str, tmp_path: Path) -> None:
+    """Catches a downloaded release that has to be renamed first, and heart1 taken for the larger heart."""
+    for other in ("dust", "heart_800"):
+        write_tiny(tmp_path / other)
+    write_tiny(tmp_path / folder)
+    edit(tmp_path / folder, lambda content: content.update(camera_angle_x=0.5))  # unlike the others
+    loaded = load_scene(config(tmp_path, scene))
+    assert loaded.name == folder
+    assert (loaded.train[0].camera.width, loaded.train[0].camera.height) == (4, 3)  # half resolution
+    assert float(loaded.train[0].camera.K[0, 0]) == pytest.approx(2 / 0.25534, rel=1e-4)  # tan(0.25)
+    pillow = config(tmp_path, scene)
+    pillow.scene.resize = "pillow"
+    assert not torch.equal(load_scene(pillow).train[0].image, loaded.train[0].image)
+
+
+@pytest.mark.parametrize(
+    ("scene", "names", "tried"),
+    [("heart1", "'heart1' or 'heart'", "{0}/heart1 and {0}/heart"), ("dust", "'dust'", "{0}/dust")],
+)
+def test_a_missing_scene_is_named_as_in_paper_and_release(scene: str, names: str, tried: str, tmp_path: Path) -> None:
+    """Catches a message that sends a reader of the paper, or of the release, after a folder that is not there."""
+    with pytest.raises(InputError) as caught:
+        scene_folder(config(tmp_path, scene))
+    message = str(caught.value)
+    assert f"expected a folder {names} with a scene" in message
+    assert f"looked for {tried.format(tmp_path)};" in message
+    assert "gaozhongpai.github.io/7dgs" in message
+    assert "\n" not in message
+
+
+def test_the_record_has_the_protocol(tmp_path: Path) -> None:
+    """Catches images of another filter under a record that is silent about it, and a best on test that is left out."""
+    data = write_moving_square(tmp_path / "data")
+    words = [*overrides(data, tmp_path / "r", "model=dgs", "train.iterations=2"), "protocol.pictures=0"]
+    record, folder = run_here(*words, "protocol=dgs2026")
+    assert record.status == "ok", record.reason
+    assert record.protocol["resize"] == "pillow"
+    assert (record.protocol["name"], record.protocol["quantise"]) == ("dgs2026", True)
+    assert record.metrics is not None
+    assert record.metrics["psnr_best_on_test"] is not None
+    assert "protocol=dgs2026" in folder.parent.name
+    plain, other = run_here(*words)
+    assert "resize" not in plain.protocol
+    assert other != folder
+    assert "scene.resize" in (run_here(*words, "scene.resize=pilow")[0].reason or "")
+
+
+def test_the_record_names_a_replaced_image(tmp_path: Path) -> None:
+    """Catches an option that the run does not pass on, and numbers of a repaired scene that look like any other's."""
+    folder = tmp_path / "Tiny"
+    folder.mkdir()
+    (folder / CAMERAS).write_text("\n".join([HEADER, *map(row, range(COUNT))]))
+    image = np.random.default_rng(0).integers(0, 256, (12, 12, 3), np.uint8)
+    for frame in (3, 4):
+        for camera in range(COUNT):
+            assert cv2.imwrite(str(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png"), image)
+    words = ["+exp=technicolor", "model=3dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=Tiny",
+             "data.initial_points=20", "train.iterations=1", "protocol.pictures=0", f"results={tmp_path}"]  # fmt: skip
+    assert "repaired" not in run_here(*words)[0].protocol
+    damage(folder, "Tiny_undist_00004_09")
+    assert "data.repair=[Tiny_undist_00004_09]" in (run_here(*words)[0].reason or "")
+    record, results = run_here(*words, "data.repair=[Tiny_undist_00004_09]")
+    assert record.status == "ok", record.reason
+    assert record.protocol["repaired"] == "Tiny_undist_00004_09"
+    assert record.provenance.config["data"]["repair"] == ["Tiny_undist_00004_09"]
+    assert "repair" in results.parent.name
+
+
+def write_trained(path: Path, count: int = 8, away: int = 0) -> TrainedGaussians:
+    """Write Gaussians around the origin, the last `away` of them 500 units above it; return them."""
+    g = torch.Generator().manual_seed(0)
+    draws = [torch.randn(shape, generator=g) for shape in ((count, 3), (count, 3), (count, 4), (count,), (count, 3))]
+    draws[0][count - away :, 1] += 500 / 0.3
+    trained = TrainedGaussians(0.3 * draws[0], 0.1 * draws[1] - 1, *draws[2:], torch.zeros(count, 15, 3))
+    path.write_bytes(ply_of(trained))
+    return trained
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    """The overrides of a run of one step that starts from a.ply."""
+    data = write_moving_square(tmp_path / "data")
+    return [*overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
+
+
+@pytest.mark.parametrize("model", ["3dgs", "7dgs"])
+def test_a_run_starts_from_a_ply(model: str, words: list[str], tmp_path: Path) -> None:
+    """Catches a file that is read and not used, a record that does not say which, and a run that is done again."""
+    trained = write_trained(tmp_path / "a.ply")
+    words += [f"model={model}", "model.lr.means.start=1e-6"]  # one step moves means by 1e-6 x extent x sqrt(30,000)
+    record, folder = run_here(*words)
+    assert record.status == "ok", record.reason
+    sha256 = hashlib.sha256((tmp_path / "a.ply").read_bytes()).hexdigest()
+    assert record.provenance.config["init"]["ply_sha256"] == sha256
+    assert sha256[:8] in folder.parent.name
+    means = load_run(folder).model.splats["means"]
+    assert len(means) == len(trained)
+    assert 0 < (means - trained.means).abs().max() < 1e-3
+    assert run_here(*words)[0].provenance.time == record.provenance.time  # finished before, kept
+
+
+@pytest.mark.parametrize(
+    ("count", "away", "more", "reason"),
+    [
+        (3, 0, [], "at least 4 Gaussians"),
+        (8, 0, ["+init.ply_sha256=" + 64 * "0"], "SHA-256"),
+        (8, 8, [], "no training camera sees one of the 8"),
+        (8, 0, ["+init.ply_sha256=0", "init.ply=null"], "init.ply_sha256"),
+    ],
+)
+def test_a_ply_that_cannot_be_the_start_is_refused(
+    count: int, away: int, more: list[str], reason: str, words: list[str], tmp_path: Path
+) -> None:
+    """Catches a refusal without a record, a hash that nothing is compared with, and a training of black images."""
+    write_trained(tmp_path / "a.ply", count, away)
+    record, _ = run_here(*words, *more)
+    assert record.status == "failed"
+    assert reason in (record.reason or "")
+
+
+def test_few_gaussians_in_sight_are_named_and_an_endless_file_is_refused(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a training of a few Gaussians without a line, and a file that is read before the run has a name."""
+    for away, is_named in ((6, True), (3, False)):
+        write_trained(tmp_path / "a.ply", 8, away)
+        assert run_here(*words)[0].status == "ok"
+        assert ("the training cameras see 25% of the Gaussians" in capsys.readouterr().err) == is_named
+    with pytest.raises(InputError, match=r"init\.ply='/dev/zero': expected a file, found a device"):
+        run_here(*words[:-1], "+init.ply=/dev/zero")
