@@ -19,7 +19,8 @@ from gsbench.config_roles import facts, flat, measuring_differences, training_di
 from gsbench.errors import InputError
 from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
-from gsbench.run.checks import BACKGROUNDS, LEAST_GAUSSIANS, check_config
+from gsbench.run.checks import check_config
+from gsbench.run.setup import BACKGROUNDS, LEAST_GAUSSIANS
 from gsbench.scenes import RESIZES
 from gsbench.train.density.control import RULES
 from gsbench.train.gating import GATES

@@ -9,8 +9,7 @@ from omegaconf import OmegaConf
 
 from gsbench.config import CONF, Config, register_schema
 from gsbench.errors import InputError
-from gsbench.run.checks import scene_folder
-from gsbench.run.setup import build
+from gsbench.run.setup import build, scene_folder
 from gsbench.scenes.points import random_points
 from gsbench.schedule import Schedule
 from gsbench.train.optim import Optimizer, rate_at

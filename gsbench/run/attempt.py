@@ -13,13 +13,23 @@ from gsbench.measure.record import Effects, OnDemand, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.run import fitting, measuring
-from gsbench.run.checks import check_config, check_scene, check_start, check_values, evaluated_views, trained_start
-from gsbench.run.comparing import best_of, check_candidates, check_compare, reporter
+from gsbench.run.auto_model import (
+    Resolved,
+    before_scene,
+    best_of,
+    check_candidates,
+    check_compare,
+    is_auto,
+    reporter,
+    resolve,
+    with_candidate,
+)
+from gsbench.run.candidates import plain
+from gsbench.run.checks import check_config, check_scene, check_values, evaluated_views
 from gsbench.run.identity import Run
 from gsbench.run.lengths import best_length
 from gsbench.run.log import RunLog
-from gsbench.run.resolve import Resolved, before_scene, is_auto, plain, resolve, with_candidate
-from gsbench.run.setup import build, load_scene
+from gsbench.run.setup import build, check_start, load_scene, trained_start
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.placement import gaussians_to_standard
@@ -72,7 +82,7 @@ class Attempt:
         """Train to the last step; for model=auto, a test of the scene first chooses a model with or without time.
 
         If the scene changes with time, `effects.compare` chooses the model by PSNR on val. It raises the same errors as
-        `gsbench.run.fitting.resume` and `fit`, `gsbench.run.comparing.best_of` and `gsbench.run.lengths.best_length`.
+        `gsbench.run.fitting.resume` and `fit`, `gsbench.run.auto_model.best_of` and `gsbench.run.lengths.best_length`.
         """
         this = self.this
         if is_auto(this.config):

@@ -5,21 +5,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.measure.exact_views import rank
-from gsbench.measure.record import Candidate
+from gsbench.measure.record import Candidate, TimeScreen
 from gsbench.measure.speed import Effort
 from gsbench.run import fitting, progress
 from gsbench.run.identity import Run
-from gsbench.run.resolve import Resolved, plain
 from gsbench.run.setup import build
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.train.finite_check import DivergedError
+from gsbench.train.hooks.choices import lengths_of
 from gsbench.train.loop import Trainer
 
 FOLDER = "candidates"  # in the run's folder; each candidate has a folder there for its checkpoint
+
+
+def plain(this: Run, config: Config) -> dict[str, Any]:
+    """Return the settings of a training of a run as plain values: the run's, with the training's model and length.
+
+    The checkpoint of a run has those of the training that is kept, so that its schedule is that of its length.
+    """
+    length = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
+    model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)
+    return this.plain | {"train": this.plain["train"] | length, "model": model, "agr": config.agr}
 
 
 @dataclass(frozen=True)
@@ -62,10 +74,13 @@ class Candidates:
         shutil.rmtree(self.this.folder / FOLDER, ignore_errors=True)
         return trainer
 
-    def trained(self, chosen: "Result", results: Sequence["Result"], resolved: Resolved) -> Trainer:
+    def trained(
+        self, chosen: "Result", results: Sequence["Result"], screen: TimeScreen | None, effort: Effort
+    ) -> Trainer:
         """Return the trainer of the chosen candidate at the step of its checkpoint.
 
-        The time screen of model=auto and the training of all other candidates count as training before its own.
+        The training of all other candidates counts as training before its own, and so do the time screen of model=auto
+        and its CPU time, `effort`.
 
         Raises:
             InputError: the checkpoint is gone or damaged.
@@ -75,15 +90,15 @@ class Candidates:
         if state is None:
             raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
         trainer.load_state_dict(state)
-        others = [one for one in results if one is not chosen]
-        seconds = sum(one.found.seconds for one in others)
+        others = [result for result in results if result is not chosen]
+        seconds = sum(other.found.seconds for other in others)
         trainer.stages.add("compare", seconds)
-        if resolved.screen:
-            trainer.stages.add("screen", resolved.screen.seconds)
-            seconds += resolved.screen.seconds
+        if screen is not None:
+            trainer.stages.add("screen", screen.seconds)
+            seconds += screen.seconds
         trainer.curve.delay(seconds)
-        for effort in (resolved.effort, *(one.effort for one in others)):
-            trainer.effort.add(effort)
+        for spent in (effort, *(other.effort for other in others)):
+            trainer.effort.add(spent)
         return trainer
 
     def train(self, name: str, until: int, before: Sequence["Result"], steps: int) -> "Result":

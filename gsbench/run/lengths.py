@@ -11,9 +11,9 @@ from typing import Any
 from gsbench.config import Config
 from gsbench.effects import messages
 from gsbench.measure.record import LengthChoice
+from gsbench.run.auto_model import Resolved
 from gsbench.run.candidates import Candidates, Result, best, highest
 from gsbench.run.identity import Run
-from gsbench.run.resolve import Resolved
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.train.hooks.choices import Choices, choices_in, lengths_of
@@ -76,6 +76,6 @@ def _best(parts: Candidates, resolved: Resolved) -> Trainer:
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [one.found for one in results])
     print(f"{parts.this.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = parts.trained(chosen, results, resolved)
+    trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
     trainer.hook(Choices).chosen.length = choice
     return trainer

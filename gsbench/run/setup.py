@@ -1,5 +1,9 @@
-"""Build the model and load the scene that the settings name."""
+"""Build the model, load the scene and read the Gaussians to start from, as the settings name them."""
 
+import importlib.resources
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -8,11 +12,19 @@ from gsbench import models, scenes
 from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.kernels.backends import resolve
+from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
-from gsbench.run.checks import BACKGROUNDS, scene_folder
+from gsbench.run.grammar import typed
+from gsbench.run.identity import hash_of
 from gsbench.scenes import Points, Scene
+from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
 from gsbench.train.hooks import hook_types
 from gsbench.train.seeding import generator
+
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+PACKAGE = "pkg://"  # in front of the module whose files data.root names
+LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
+ENOUGH_SEEN = 0.5  # share of Gaussians to start from that a camera sees; below it a line says so
 
 
 def build(config: Config) -> GaussianModel:
@@ -58,16 +70,111 @@ def load_scene(config: Config) -> Scene:
     Raises:
         InputError: the data set does not exist or is invalid.
     """
-    background = BACKGROUNDS[config.data.background]
-    chosen = config.scene
     scene = scenes.load(
         scene_folder(config),
-        downscale=chosen.downscale,
-        resize=chosen.resize,
-        background=background,
-        frames=chosen.frames,
+        downscale=config.scene.downscale,
+        resize=config.scene.resize,
+        background=BACKGROUNDS[config.data.background],
+        frames=config.scene.frames,
         repair=config.data.repair,
     )
-    if chosen.val_every is not None:
-        scene = scene.with_val(chosen.val_every)
+    if config.scene.val_every is not None:
+        scene = scene.with_val(config.scene.val_every)
     return scene.to(config.device)
+
+
+def scene_folder(config: Config) -> Path:
+    """Return the folder of the scene, found under `data.root` by the scene's name or by its name in the published data.
+
+    Raises:
+        InputError: there is no such folder, and the message lists the names that were tried; or a name leads out of
+            `data.root`.
+    """
+    data, scene = config.data, config.scene
+    check_scene_names(config)
+    names = [scene.name, *([scene.released_as] if scene.released_as else [])]
+    folders = [data_root(data.root) / name for name in names]
+    for folder in folders:
+        if folder.is_dir():
+            return folder
+    for root in _roots_nearby(data_root(data.root), names):
+        raise InputError(f"data.root={data.root}: expected the folder that holds {' or '.join(map(repr, names))}: "
+                         f"type {typed('data.root', str(root), several=False)}",
+                         docs="data.md#what-is-read")  # fmt: skip
+    published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
+    raise InputError(
+        f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with a scene, such "
+        f"as transforms_{{train,val,test}}.json and the images they name, looked for {' and '.join(map(str, folders))}"
+        f"{published}",
+        docs="data.md#what-is-read",
+    )
+
+
+def _roots_nearby(root: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield folders that hold a scene, if `root` is one or two folders above such a folder, or is the scene's own."""
+    if root.is_dir() and root.absolute().name in names:
+        yield root.absolute().parent
+    for name in names:
+        for pattern in (f"*/{name}", f"*/*/{name}"):
+            yield from (path.parents[name.count("/")] for path in sorted(root.glob(pattern)) if path.is_dir())
+
+
+def check_scene_names(config: Config) -> None:
+    """Raise InputError unless the scene's name, and every folder in its published name, is a name of a folder."""
+    for name in (config.scene.name, *(config.scene.released_as or config.scene.name).split("/")):
+        run_path(Path(), config.experiment, name, config.model.name, config.seed)
+
+
+def data_root(root: str) -> Path:
+    """Return the folder of a data set, given as a path or as `pkg://module` for data inside a Python package.
+
+    Raises:
+        InputError: the module does not exist, or the path is invalid.
+    """
+    if "\0" in root:
+        raise InputError(f"data.root: expected a path, got {root!r:.200}")
+    if not root.startswith(PACKAGE):
+        return Path(root).expanduser()
+    try:
+        return Path(str(importlib.resources.files(root.removeprefix(PACKAGE))))
+    except (ImportError, ValueError, TypeError) as error:
+        raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
+
+
+def trained_start(config: Config) -> TrainedGaussians | None:
+    """Read the trained Gaussians from which a training starts; return None if the training starts from points.
+
+    Raises:
+        InputError: the file is not a PLY file of Gaussians, holds fewer than four, or does not have the SHA-256 in the
+            settings.
+    """
+    if config.init.ply is None:
+        if config.init.ply_sha256 is not None:
+            raise InputError("init.ply_sha256: expected it beside init.ply, got no file: add +init.ply=FILE")
+        return None
+    path = Path(config.init.ply).expanduser()
+    trained = read_trained(path)
+    if len(trained) < LEAST_GAUSSIANS:
+        raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")
+    present = hash_of(config.init.ply)
+    if present != config.init.ply_sha256:
+        raise InputError(f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, got "
+                         f"{present}: another file, or one that has just changed")  # fmt: skip
+    return trained
+
+
+def check_start(trained: TrainedGaussians, scene: Scene) -> None:
+    """Print the share of trained Gaussians that the training cameras see if it is below ENOUGH_SEEN.
+
+    Raises:
+        InputError: the cameras see none of them, so that a training would move none.
+    """
+    cameras = [view.camera.to("cpu") for view in scene.train]
+    share = share_seen(trained, cameras, ENOUGH_SEEN)
+    if share == 0:
+        raise InputError(f"init.ply: expected Gaussians of {scene.name}, no training camera sees one of the "
+                         f"{len(trained)}: is the file of another scene, or in other coordinates or units?",
+                         docs="viewing.md#start-from-a-ply")  # fmt: skip
+    if share < ENOUGH_SEEN:
+        print(f"{scene.name}: the training cameras see {share:.0%} of the Gaussians of init.ply: is it of this scene?",
+              file=sys.stderr)  # fmt: skip

@@ -15,11 +15,10 @@ from tiny_run import overrides, run_here, write_moving_square
 
 from gsbench.config import CONF, Config, register_schema
 from gsbench.errors import InputError
-from gsbench.run.checks import scene_folder
 from gsbench.run.load import load_run
-from gsbench.run.setup import load_scene
-from gsbench.scenes.technicolor import CAMERAS
+from gsbench.run.setup import load_scene, scene_folder
 from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
+from gsbench.scenes.technicolor import CAMERAS
 
 
 def config(root: Path, scene: str) -> Config:
