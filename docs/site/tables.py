@@ -17,7 +17,7 @@ import readme_blocks
 import results_blocks
 import suite_blocks
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import CONF, register_schema
 from gsbench.models import find
@@ -61,7 +61,7 @@ def row_of(path: Path) -> str:
 
 def numbers(composed: DictConfig) -> int:
     """Count the raw parameters of one Gaussian, without AGR's network, which all share."""
-    model: GaussianModel = build(composed)  # type: ignore[arg-type]  # composed by the schema of Config
+    model: GaussianModel = build(OmegaConf.to_object(composed))  # type: ignore[arg-type]  # a Config, by its schema
     points = torch.eye(4, 3)
     model.initialise(Points(points, points), 1.0, torch.Generator())
     return sum(parameter[0].numel() for parameter in model.splats.values())
