@@ -94,6 +94,18 @@ def test_an_exact_region_leaves_the_mean_finite() -> None:
     assert (exact.exact, other.exact) == (["0 (object)"], [])
 
 
+def test_renders_are_rounded_where_the_protocol_rounds() -> None:
+    """Catches a region that is measured on another render than the whole image is."""
+    (truth,) = views = [view("0", (10, 10), alpha=True)]
+    psnr = []
+    for quantised in (False, True):
+        scores = RegionScores(views, quantised=quantised)
+        assert list(scores.measured([("0", truth.image + 0.001, truth.image)]))
+        psnr.append(scores.metrics()["psnr_object"])
+    assert psnr[0] == pytest.approx(60.0, abs=1e-2)
+    assert psnr[1] != psnr[0]
+
+
 def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     """Catches a view without a region that counts, a metric without a value or a reason, and another view's score."""
     views = [view("0", (10, 10), alpha=True), view("1", None, alpha=True)]
