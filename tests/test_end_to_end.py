@@ -6,7 +6,9 @@ import pytest
 from tiny_run import gsbench
 
 from gsbench.measure import record
-from gsbench.report import layout, tables
+from gsbench.report import output
+from gsbench.report.frame import load
+from gsbench.report.render.text import terminal
 
 SHORT = ("train.iterations=250", "train.densify.every=25", "train.curve_points=1", "data.initial_points=500",
          "protocol.renders=30", "protocol.pictures=0")  # fmt: skip
@@ -47,11 +49,11 @@ def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
 def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
     """Catches a table that drops runs, the average, or the paper's row beside the stand-in scene."""
     folder = results / "mini"
-    records, faults = tables.load(folder)
-    assert not faults
-    built = tables.build(records)
-    tables.write(records, folder, built)
-    text = layout.terminal(built)
+    runs = load(folder)
+    assert not runs.faults
+    shown = output.tables(runs)
+    output.write(runs, folder, shown)
+    text = terminal(shown)
     for word in ("moving-matte", "suzanne", "3dgs", "7dgs", "28.26"):
         assert word in text
         assert word in (folder / "table.md").read_text()

@@ -10,7 +10,7 @@ import matplotlib as mpl
 from matplotlib import pyplot
 from published import CASES, experiment
 
-from gsbench.report.page.palette import LIGHT, styles
+from gsbench.report.render.palette import OF_MODELS, styles
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = ROOT / "results" / "published"
@@ -18,6 +18,7 @@ PICTURE = ROOT / "docs" / "images" / "frontier.png"
 LENGTHS = ("250", "500", "1,000", "2,000", "4,000")  # iterations
 NAMES = {"auto": "7DGS on demand (auto)", "7dgs": "7DGS", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",
          "7dgs_noagr": "7DGS without AGR", "6dgs": "6DGS", "3dgs": "3DGS"}  # fmt: skip
+MARKERS = "^shoDvPX<>pd*H8"
 APART = 0.42  # dB between two labels
 TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200)  # seconds
 
@@ -58,10 +59,10 @@ def draw() -> None:
     chosen = styles(list(NAMES))
     for model, name in NAMES.items():
         seconds, psnr, half = zip(*lines[model], strict=True)
-        colour = LIGHT[chosen[model].colour]
+        colour = OF_MODELS[chosen[model]][0]
         axes.errorbar(
-            seconds, psnr, half, color=colour, marker=chosen[model].marker, markersize=5, linewidth=1.8, elinewidth=0.8,
-            capsize=2, alpha=0.95,
+            seconds, psnr, half, color=colour, marker=MARKERS[chosen[model] % 15], markersize=5, linewidth=1.8,
+            elinewidth=0.8, capsize=2, alpha=0.95,
         )  # fmt: skip
         axes.annotate(
             name, (seconds[-1], psnr[-1]), (1.25 * last, labels[model]), color=colour, va="center", fontsize=10,

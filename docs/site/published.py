@@ -9,12 +9,11 @@ from statistics import fmean
 
 from gsbench.measure.curve import FALL
 from gsbench.measure.record import Record
-from gsbench.report import compare, tables
+from gsbench.report import compare, messages, tables
 from gsbench.report.comparisons import comparisons
 from gsbench.report.configurations import Configuration, Group, Values, groups
 from gsbench.report.family import Family, Tested, Weights
 from gsbench.report.intervals import Estimate, estimate, over_seeds
-from gsbench.report.page import messages
 
 MODELS = ("3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto")
 NAMES = {"7dgs": "7DGS", "7dgs_noagr": "7DGS without AGR", "7dgs_nodir": "7DGS without direction", "4dgs": "4DGS",

@@ -28,7 +28,7 @@ from published import (
 )
 
 from gsbench.measure.curve import FALL
-from gsbench.report.page.messages import count
+from gsbench.report.messages import count
 from gsbench.report.paper import paper_row
 
 SHORT = ("250", "1,000", "4,000")  # iterations

@@ -37,7 +37,7 @@ from published import (
 from gsbench.measure.curve import FALL
 from gsbench.report import frontier
 from gsbench.report.configurations import psnr_val
-from gsbench.report.page.messages import count, listing
+from gsbench.report.messages import count, listing
 from gsbench.report.paper import paper_row
 
 ABLATIONS = {

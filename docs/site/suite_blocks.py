@@ -28,7 +28,7 @@ from scipy import stats
 from gsbench.measure.record import Record, model_folder
 from gsbench.report.configurations import QUANTITIES, Values
 from gsbench.report.intervals import estimate
-from gsbench.report.page.messages import count
+from gsbench.report.messages import count
 
 MOVING = ("monocular", "rig", "array")
 EFFECTS = {

@@ -1,28 +1,27 @@
-"""Print the result table of a folder of run records, and save it there (``python -m gsbench.report RESULTS_DIR``)."""
+"""Print the result tables of a folder of runs, and write them and a page there: ``python -m gsbench.report FOLDER``."""
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.record import Record
 from gsbench.process.ending import end_with
-from gsbench.report import frame, layout, live, paper_tables, reproduction, select, tables
-from gsbench.report.frame import Results
+from gsbench.report import layout, live, output, paper_tables, reproduction, select
+from gsbench.report.frame import Results, load
 from gsbench.report.latex import latex
-from gsbench.report.numbers import numbers
-from gsbench.report.page import build
 from gsbench.report.publish import publish
 from gsbench.report.render import page, text
+from gsbench.report.sections import built
+from gsbench.report.sections.experiment import WITH_TRAIN
 
 PRINTED = Path("-")  # the value of --json without a FILE
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print and write the result tables and ``report.html`` for a folder of run records.
+    """Print and write the result tables and ``report.html`` for a folder of runs.
 
     A record is left out, and the reason is printed, if it is damaged or if another record describes the same run.
     With the options --latex, --select, or --json without a FILE, nothing is written into the folder.
@@ -32,48 +31,47 @@ def main(arguments: list[str] | None = None) -> int:
         cannot be read or written, otherwise 0.
     """
     options = _options(arguments)
+    columns = list(WITH_TRAIN) if options.train else []
     if options.live:
-        return live.watch(options.results, train=options.train)
+        return live.watch(options.results, columns)
     differs = False
     try:
         chosen = select.parse(options.select)
-        results = frame.load(options.results)
-        records, faults = chosen.of(list(results.runs.record)), list(results.faults)
+        results = chosen.of(load(options.results))
         if options.publish:
             print(publish(options.results, options.publish))
-        elif records and options.tables:
-            _paper_tables(records, options)
-        elif records and options.against:
+        elif len(results.runs) and options.tables:
+            _paper_tables(results, options)
+        elif len(results.runs) and options.against:
             differs = _against(results, options)
-        elif records:
-            _tables(records, faults, chosen.columns, options)
-        if records and options.figures:
-            written = build.write_figures(records, options.results, options.figures)
-            print(f"Written: {len(written) // 2} figures in {options.figures}", file=sys.stderr)
+        elif len(results.runs):
+            _report(results, chosen.columns or columns, options)
+        if len(results.runs) and options.figures:
+            paths = page.figures(results, options.figures)
+            print(f"Written: {len(paths) // 2} figures in {options.figures}", file=sys.stderr)
     except (InputError, OSError) as error:
         print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
         return 2
-    for fault in faults:
-        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
-    return 1 if faults or differs else 0
+    _print_faults(results)
+    return 1 if results.faults or differs else 0
 
 
 def _options(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m gsbench.report", description=__doc__)
-    parser.add_argument("results", type=Path, metavar="RESULTS_DIR", help="a folder with records, at any depth")
+    parser.add_argument("results", type=Path, metavar="FOLDER", help="a folder with runs, at any depth")
     parser.add_argument("--train", action="store_true", help="also PSNR on training views: the gap is overfitting")
     either = parser.add_mutually_exclusive_group()
     either.add_argument("--tables", action="store_true", help="only table1.*, table2.* and table_successors.*")
     either.add_argument("--live", action="store_true", help="write again whenever a record arrives, until Ctrl-C")
-    either.add_argument("--publish", type=Path, metavar="DIR", help="copy the records to DIR, and write its table anew")
-    either.add_argument("--against", type=Path, metavar="DIR", help="compare with the records in DIR; 1 if they differ")
+    either.add_argument("--publish", type=Path, metavar="DIR", help="copy the runs to DIR, and write its table anew")
+    either.add_argument("--against", type=Path, metavar="DIR", help="compare with the runs in DIR; 1 if they differ")
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--latex", action="store_true", help="print the tables as LaTeX for a paper, and write nothing")
     form.add_argument("--json", type=Path, nargs="?", const=PRINTED, metavar="FILE",
                       help="print the numbers as JSON, and write nothing; FILE: also write them there")  # fmt: skip
-    parser.add_argument("--figures", type=Path, metavar="FOLDER", help="write the page's figures there as PDF and SVG")
+    parser.add_argument("--figures", type=Path, metavar="DIR", help="write the page's figures there as PDF and SVG")
     parser.add_argument("--select", nargs="+", default=[], metavar="KEY=A,B",
-                        help="only these: model=.. scene=.. column=..; nothing is written to RESULTS_DIR")  # fmt: skip
+                        help="only these: model=.. scene=.. column=..; nothing is written to FOLDER")  # fmt: skip
     options = parser.parse_args(arguments)
     if options.against and options.latex:
         parser.error("--against: expected no --latex beside it")
@@ -84,57 +82,61 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     return options
 
 
-def _tables(records: list[Record], faults: list[str], columns: list[str], options: argparse.Namespace) -> None:
-    """Print the result tables, and write them with the HTML report unless only a part or another form was asked for."""
-    built = tables.build(records, train=options.train, columns=columns)
-    if _is_printed(options, built, lambda: numbers(records, built, faults)):
-        return
-    print(layout.terminal(built))
-    if not options.select:
-        tables.write(records, options.results, built)
-        page = build.write(records, options.results, faults)
-        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {page}")
+def _report(results: Results, columns: Sequence[str], options: argparse.Namespace) -> None:
+    """Print the result tables, and write them with the page unless only a part or another form was asked for."""
+    shown = output.tables(results, columns)
+    if options.latex:
+        print(text.latex(shown[::2]))
+    elif not _is_json(options, lambda: _numbers(results)):
+        print(text.terminal(shown))
+        if not options.select:
+            print(f"Written: {', '.join(map(str, output.write(results, options.results, shown)))}")
 
 
-def _paper_tables(records: list[Record], options: argparse.Namespace) -> None:
+def _numbers(results: Results) -> dict[str, object]:
+    """Return all sections of a report and the facts of every run as plain values."""
+    sections = [of for chapter in results.chapters() for of in built(chapter) if of.key not in ("gallery", "runs")]
+    runs = text.rows(results.runs.drop(columns=["path", "record"]))
+    return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
+
+
+def _paper_tables(results: Results, options: argparse.Namespace) -> None:
     """Print the tables of papers, and write them unless another form was asked for."""
-    built = paper_tables.build(records)
-    shown = [table for made, _ in built.values() for table in made]
-    if _is_printed(options, shown, lambda: {name: lines for name, (_, lines) in built.items()}):
-        return
-    paper_tables.write(built, options.results)
-    print(layout.terminal(shown))
-    print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.NAMES)}")
+    tables = paper_tables.build(list(results.runs.record))
+    shown = [table for of, _ in tables.values() for table in of]
+    if options.latex:
+        print(latex(shown))
+    elif not _is_json(options, lambda: {name: lines for name, (_, lines) in tables.items()}):
+        paper_tables.write(tables, options.results)
+        print(layout.terminal(shown))
+        print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.NAMES)}")
 
 
 def _against(results: Results, options: argparse.Namespace) -> bool:
     """Print and write the comparison with another folder, and return whether PSNR differs."""
-    other = frame.load(options.against)
-    for fault in other.faults:
-        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
+    other = load(options.against)
+    _print_faults(other)
     compared = reproduction.compare(results, other, (str(options.results), str(options.against)))
-    made = [reproduction.section(compared)]
-    if not _is_printed(options, [], lambda: reproduction.content(compared, results.runs, other.runs)):
-        records = list(results.runs.record)
-        built = tables.build(records, train=options.train)
-        print(layout.terminal(built))
-        tables.write(records, options.results, built)
-        written = page.write(results, options.results, more=made)
-        print(f"Written: {options.results / 'table.md'}, {options.results / 'table.csv'}, {written}")
-        print(f"\n{text.terminal(made)}")
+    if not _is_json(options, lambda: reproduction.content(compared, results.runs, other.runs)):
+        section, shown = reproduction.section(compared), output.tables(results)
+        *_, written = output.write(results, options.results, shown, more=[section])
+        print(text.terminal([*shown, section]))
         print("\n".join(reproduction.lines(compared, results.runs, written)))
     return compared.verdict == reproduction.DIFFERS
 
 
-def _is_printed(options: argparse.Namespace, built: list[layout.Table], content: Callable[[], object]) -> bool:
-    """Print tables as LaTeX or JSON if that was asked for, and return whether it was; write JSON to a given FILE."""
-    if options.latex:
-        print(latex(built))
-    elif options.json == PRINTED:
+def _is_json(options: argparse.Namespace, content: Callable[[], object]) -> bool:
+    """Write JSON to the FILE of --json, or print it, and return whether that is all that was asked for."""
+    if options.json == PRINTED:
         print(as_json(content()))
     elif options.json:
         write_atomically(options.json, f"{as_json(content())}\n".encode())
-    return bool(options.latex or options.json == PRINTED)
+    return bool(options.json == PRINTED)
+
+
+def _print_faults(results: Results) -> None:
+    for fault in results.faults:
+        print(f"gsbench.report: left out: {fault}", file=sys.stderr)
 
 
 if __name__ == "__main__":

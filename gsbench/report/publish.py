@@ -4,7 +4,8 @@ from pathlib import Path
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
-from gsbench.report import frame, layout, study, tables
+from gsbench.report import frame, output, study
+from gsbench.report.render import text
 
 
 def publish(folder: Path, to: Path) -> str:
@@ -33,5 +34,5 @@ def publish(folder: Path, to: Path) -> str:
     runs = {frame.name(record): record for part in (earlier, results) if part for record in part.runs.record}
     records = [runs[name] for name in sorted(runs)]
     study.write(records, to)
-    write_atomically(to / "table.md", layout.markdown(tables.build(records)).encode())
+    write_atomically(to / "table.md", text.markdown(output.tables(frame.load(to))).encode())
     return f"Published: {len(results.runs)} runs in {to}, which has {len(records)}; {to / study.RUNS_FILE}"

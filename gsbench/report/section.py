@@ -28,6 +28,14 @@ class Column:
     better: str = ""  # "higher" or "lower"; empty if models are not ranked by it
     signed: bool = False
 
+    def show(self, value: float) -> str:
+        """Format a number of this column."""
+        return number(value, self.digits_of(value), signed=self.signed)
+
+    def digits_of(self, value: float) -> int:
+        """Return the decimals with which a value is shown."""
+        return self.digits if self.digits is not None else 1 if abs(value) >= 10 else 2
+
 
 COLUMNS = {
     "psnr_db": Column("PSNR", 2, "higher"),
@@ -120,7 +128,7 @@ class Section:
             return EMPTY
         column = self.column(name)
         whole = name not in self.columns and name not in COLUMNS and float(value).is_integer()
-        digits = 0 if whole else column.digits if column.digits is not None else 1 if abs(value) >= 10 else 2
+        digits = 0 if whole else column.digits_of(value)
         return number(value, digits, signed=column.signed) + ("" if math.isnan(half) else f" ± {number(half, digits)}")
 
 

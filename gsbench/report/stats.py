@@ -4,7 +4,7 @@ The intervals themselves are those of gsbench.report.intervals, which takes arra
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -146,7 +146,7 @@ def is_dominated(points: pd.DataFrame, cost: str, quality: str = "psnr_db") -> p
     return pd.Series((as_good & better).any(axis=1), points.index)
 
 
-def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, digits: int) -> dict[str, int]:
+def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, show: Callable[[float], str]) -> dict[str, int]:
     """Rank groups of runs: 1 for the best mean and those that do not differ from it, 2 for the next, else 0.
 
     Two means differ if the 95 % interval over seeds of their paired difference excludes zero; with one seed, if they
@@ -157,7 +157,7 @@ def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, digits: int)
         by: the column that names a group.
         quantity: the column to rank by; a group that lacks it in a run has rank 0.
         higher: whether higher values are better.
-        digits: the decimals that are shown.
+        show: formats a number as the table does.
     """
     whole = runs[quantity].notna().groupby(runs[by]).all()
     wide = runs.set_index([by, "scene", "seed"])[quantity].unstack("seed")
@@ -172,7 +172,7 @@ def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, digits: int)
             for key in list(mean):
                 pairs = [row[~np.isnan(row)][:, None] for row in arrays[best] - arrays[key]]
                 gap = estimate(pairs, generalise=False) if all(map(len, pairs)) else NOTHING
-                if f"{mean[best]:.{digits}f}" == f"{mean[key]:.{digits}f}" or abs(gap.mean) <= gap.half:
+                if show(mean[best]) == show(mean[key]) or abs(gap.mean) <= gap.half:
                     places[key] = place
                     if key != best:
                         del mean[key]

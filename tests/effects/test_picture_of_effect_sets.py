@@ -18,7 +18,7 @@ from gsbench.models import GaussianModel, build
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.simplifications import STATIC
 from gsbench.models.sliced import Gaussians3D
-from gsbench.report.page.palette import EFFECT_SET_LIKE, LIGHT, MODELS
+from gsbench.report.render.palette import SETS, THEMES
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents
 
@@ -117,7 +117,7 @@ def test_large_images_are_made_smaller() -> None:
 
 def test_the_page_has_the_same_colours() -> None:
     """Catches an effect set that has one colour in the picture and another in the figure above it."""
-    page = {name: LIGHT[MODELS.index(like)] for name, like in EFFECT_SET_LIKE.items()}
+    page = dict(zip(EFFECT_SETS, (THEMES[variable][0] for variable in SETS), strict=False))
     assert {name: f"#{r:02x}{g:02x}{b:02x}" for name, (r, g, b) in picture.COLOURS.items()} == page
     assert tuple(page) == tuple(EFFECT_SETS) == NAMES
 

@@ -10,7 +10,6 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import hydra
 import tables as site
@@ -21,14 +20,11 @@ from tiny_run import run_here
 from gsbench.config import CONF, register_schema
 from gsbench.config_roles import training_hash
 from gsbench.measure.record import Record
-from gsbench.report import frame, frontier, paper_tables, reproduction
-from gsbench.report.comparisons import comparisons
-from gsbench.report.configurations import groups
-from gsbench.report.numbers import numbers
-from gsbench.report.page import build
-from gsbench.report.page.content import Canvas, DataTable, Runs
-from gsbench.report.page.palette import styles
-from gsbench.report.tables import build as build_tables
+from gsbench.report import frame, paper_tables, reproduction
+from gsbench.report.frame import Results
+from gsbench.report.section import Section
+from gsbench.report.sections import built, experiment
+from gsbench.report.sections.budgets import BUDGETS
 from gsbench.report.tables import load
 from gsbench.run.identity import identify
 from gsbench.train import checkpoint
@@ -37,34 +33,28 @@ PUBLISHED = Path(__file__).resolve().parents[2] / "results" / "published"
 Numbers = dict[str, float]  # by "what/scene/model/metric"
 UNITS = {"psnr": "psnr_db", "seconds": "train_s", "ms": "frame_ms", "mb": "model_mb"}
 VERDICTS = {"agrees": 1.0, "undecided": 0.0, "differs": -1.0}
-WORDS = {"yes": 1.0, "no": 0.0, "not known": math.nan}
-# Files behind the page: the columns that name a row, and the name of every number in it.
-PAGE: dict[str, tuple[list[str], dict[str, str]]] = {
-    "frontier.csv": (["scene", "model", "variant"], {
-        "seeds": "seeds", "PSNR dB": "psnr_db", "95 % low": "psnr_db low", "95 % high": "psnr_db high",
-        "PSNR val dB": "psnr_val_db", "training s": "train_s", "ms a frame": "frame_ms", "MB": "model_mb",
-        "slower and worse than another": "dominated"}),
-    "time_to_quality.csv": (["scene", "target"], {}),
-    "effects.csv": (["effect"], {
-        name if not more else f"{name}: {more}": f"{unit} {word}".strip()
-        for name, unit in (("dB", "psnr_db"), ("training s", "train_s"), ("ms a frame", "frame_ms"), ("MB", "model_mb"))
-        for more, word in (("", ""), ("95 % low", "low"), ("high", "high"), ("significant", "significant"))
-    } | {"dB: half width over scenes like these": "psnr_db ± over scenes", "scenes that gain": "scenes gaining",
-         "scenes that lose": "scenes losing"}),
-    "effects_on_demand.csv": (["scene", "model", "variant"], {
-        "seeds": "seeds", "largest p": "largest p", "seeds gated": "seeds gated",
-        "Gaussians before": "gaussians before",
-        "refined by AGR": "refined", "conditioned": "conditioned", "time frozen": "time frozen",
-        "direction frozen": "direction frozen", "static": "static", "removed": "removed", "degree 0": "degree 0",
-        "degree 1": "degree 1", "degree 2": "degree 2", "degree 3": "degree 3",
-        "% of AGR left out of a frame": "agr left out %", "predicted dB": "predicted_db", "PSNR dB": "psnr_db",
-        "95 % low": "psnr_db low", "95 % high": "psnr_db high", "ms a frame before": "frame_ms before",
-        "change in ms": "frame_ms change", "low": "frame_ms low", "high": "frame_ms high",
-        "MB before": "model_mb before", "MB": "model_mb"}),
-    "stages.csv": (["model"], {}),
-    "pairs.csv": (["pair"], {
-        "dB": "psnr_db", "95 % low": "psnr_db low", "95 % high": "psnr_db high", "better on % of views": "better %",
-        "significant": "significant"}),
+WORDS = {"yes": 1.0, "no": 0.0, "unknown": math.nan}
+OLD_NAMES = {"gaussians": "num_gaussians", "psnr_db": "psnr", "psnr_moving_db": "psnr_moving",
+             "psnr_object_db": "psnr_object", "psnr_best_on_test_db": "psnr_best_on_test"}  # fmt: skip
+COSTS = {"dB": "psnr_db", "training s": "train_s", "ms a frame": "frame_ms", "MB": "model_mb"}
+SAME = ("refined", "conditioned", "static", "removed", "degree 0", "degree 1", "degree 2", "degree 3", "seeds")
+# By section: the name of its numbers, the columns that name a row, and the name of every other column.
+PAGE: dict[str, tuple[str, list[str], dict[str, str]]] = {
+    "budgets": ("budgets", [], {}),
+    "frontier": ("frontier", ["scene", "model", "variant"], {
+        name: name for name in ("seeds", "psnr_db", "psnr_val_db", "train_s", "frame_ms", "model_mb", "dominated")}),
+    "quality": ("time_to_quality", ["scene", "target"], {}),
+    "effects": ("effects", ["effect"], COSTS | {f"{unit}: significant": f"{name} significant" for unit, name in
+        COSTS.items()} | {"± over scenes": "psnr_db ± over scenes", "scenes that gain": "scenes gaining",
+        "scenes that lose": "scenes losing"}),
+    "on_demand": ("effects_on_demand", ["scene", "model", "variant"], {name: name for name in SAME} | {
+        "p": "largest p", "gated": "seeds gated", "before": "gaussians before", "time": "time frozen",
+        "direction": "direction frozen", "asleep": "agr left out %", "predicted": "predicted_db", "dB": "psnr_db",
+        "ms_before": "frame_ms before", "ms": "frame_ms change", "mb_before": "model_mb before", "mb": "model_mb"}),
+    "stages": ("stages", ["model"], {}),
+    "pairs": ("pairs", ["pair"], {"dB": "psnr_db", "low": "psnr_db low", "high": "psnr_db high", "ahead": "better %",
+                                  "significant": "significant"}),
+    "curves": ("anytime", [], {}),
 }  # fmt: skip
 
 
@@ -76,24 +66,33 @@ def records(study: str) -> list[Record]:
     return read
 
 
+@cache
+def chapters(study: str) -> list[Results]:
+    """The experiments of a study."""
+    results = frame.load(PUBLISHED / study)
+    assert not results.faults
+    return list(results.chapters())
+
+
 def table(study: str) -> Numbers:
-    """What `--json` has of the result table: means, intervals over seeds and ranks; the paper's rows as shown."""
-    runs = records(study)
-    built = numbers(runs, build_tables(runs), [])["tables"]
+    """The result table: means, intervals over seeds and ranks; the paper's rows as shown."""
     values: Numbers = {}
-    for group, of in zip(groups(runs), built, strict=True):
-        for section in of["sections"]:
-            scene = "average" if section["title"].startswith("average") else section["title"]
-            label = ""
-            for row in section["rows"]:
-                label = label if row["of_the_paper"] else row["label"]
-                key = f"{group.dataset}/{scene}/{label}"
-                for name, number in row["numbers"].items():
-                    for part in ("mean", "high", "rank"):
-                        values[f"{key}/{name} {part}"] = number[part]
-                if row["of_the_paper"]:
-                    for name, text in row["shown"].items():
-                        values[f"{key}/{name} paper"] = first_number(text)
+    for chapter in chapters(study):
+        section = experiment.table(chapter, [])
+        names = [name for name in section.shown_columns if name not in ("scene", "model", "seeds")]
+        shown = section.shown().to_dict("records")
+        dataset, label = chapter.runs.dataset.iloc[0], ""
+        for row, texts in zip(section.table.to_dict("records"), shown, strict=True):
+            is_paper = row["model"].startswith("paper")
+            label = label if is_paper else row["model"]
+            scene = "average" if row["scene"].startswith("average") else row["scene"]
+            for name in names:
+                key = f"{dataset}/{scene}/{label}/{OLD_NAMES.get(name, name)}"
+                if is_paper:
+                    values[f"{key} paper"] = first_number(texts[section.column(name).title])
+                else:
+                    values[f"{key} mean"], values[f"{key} high"] = row[name], row[name] + row[f"{name} ±"]
+                    values[f"{key} rank"] = row.get(f"{name} rank", 0)
     return values
 
 
@@ -125,44 +124,41 @@ def against(study: str, seeds: Sequence[int], others: Sequence[int]) -> Numbers:
 
 
 def page(study: str) -> Numbers:
-    """The CSV files behind the figures of report.html, and the model that it names for each budget."""
+    """The tables behind the figures of report.html, and the model that it names for each budget."""
     values: Numbers = {}
-    runs = records(study)
-    for i, group in enumerate(groups(runs)):
-        canvas = Canvas(f"g{i}", Runs(), styles(group.series), 0)
-        family = comparisons(group)
-        for section in build._sections(group, family, PUBLISHED / study, canvas):
-            if section.table is not None:
-                values |= {f"{group.dataset}/{key}": value for key, value in _of_file(section.table)}
-        points = frontier.points(group, group.basis)
-        for cost, budget in frontier.BUDGETS:
-            if choice := frontier.choose(points, cost, budget, family):
-                chosen = choice.point.configuration
-                key = f"{group.dataset}/budgets/{UNITS[cost]} {budget:g}/{chosen.model} {chosen.variant}"
-                values[f"{key}/psnr_db"] = choice.point.psnr.mean
+    for chapter in chapters(study):
+        dataset = chapter.runs.dataset.iloc[0]
+        for section in built(chapter):
+            if section.key in PAGE:
+                values |= {f"{dataset}/{key}": value for key, value in _of_section(section)}
     return values
 
 
-def _of_file(of: DataTable) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of a file behind the page; curves as the sums of their points."""
-    titles = [column.title for column in of.columns]
-    rows: list[dict[str, Any]] = [dict(zip(titles, row, strict=True)) for row in of.rows]
-    what = of.name.removesuffix(".csv")
-    if what == "anytime":
-        sums: Numbers = {}
-        for row in rows:
-            for column, name in (("PSNR val dB", "psnr_val_db"), ("seconds", "train_s")):
-                key = f"anytime/{row['scene']}/{row['model']}/{name} sum"
-                sums[key] = sums.get(key, 0.0) + row[column]
-        yield from sums.items()
-    elif of.name in PAGE:
-        named, columns = PAGE[of.name]
-        for row in rows:
-            key = "/".join([what, *(str(row[column]) for column in named)])
-            for column in columns or [title for title in titles if title.endswith(" s")]:
-                value = row[column]
-                number = WORDS[value] if isinstance(value, str) else math.nan if value is None else float(value)
-                yield f"{key}/{columns.get(column, column)}", number
+def _of_section(section: Section) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of a table behind the page; curves as the sums of their points."""
+    what, named, columns = PAGE[section.key]
+    if section.key == "curves":
+        sums = section.table.groupby(["scene", "model"])[["psnr_val_db", "train_s"]].sum()
+        for (scene, model), row in sums.iterrows():
+            yield from ((f"anytime/{scene}/{model}/{name} sum", row[name]) for name in row.index)
+        return
+    for row in section.table.to_dict("records"):
+        if section.key == "budgets":
+            if isinstance(row["model"], str):
+                cost, budget = BUDGETS[row["budget"]]
+                yield f"budgets/{cost} {budget:g}/{row['model']} {row['variant']}/psnr_db", row["psnr_db"]
+            continue
+        key = "/".join([what, *(str(row[name] or "none") for name in named)])
+        for name in columns or [name for name in section.shown_columns if name not in named]:
+            value = row[name]
+            number = WORDS[value] if isinstance(value, str) else float(value)
+            title = {"quality": f"{name.removesuffix(', s')} s", "stages": f"{name} s"}.get(
+                section.key, columns.get(name, name)
+            )
+            yield f"{key}/{title}", number
+            if f"{name} ±" in row:
+                for end, sign in (("low", -1), ("high", 1)):
+                    yield f"{key}/{title.removesuffix(' change')} {end}", number + sign * row[f"{name} ±"]
 
 
 def blocks() -> dict[str, list[float]]:

@@ -1,9 +1,4 @@
-"""Makes the golden pages: run it after a change that is meant, and read the difference before committing it.
-
-    python tests/report/make_golden.py
-
-The records are invented; they put every kind of row and footnote of a table into one page.
-"""
+"""Invented records that put every kind of row and footnote of a table into one report."""
 
 import dataclasses
 from pathlib import Path
@@ -11,12 +6,8 @@ from pathlib import Path
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Cost, Effects, Provenance, Record, Region, ViewScore
 from gsbench.measure.speed import RenderTimes
-from gsbench.report import layout, tables
-from gsbench.report.latex import latex
 
 GOLDEN = Path(__file__).parent / "golden" / "table.md"
-GOLDEN_TERMINAL = GOLDEN.with_suffix(".txt")
-GOLDEN_LATEX = GOLDEN.with_suffix(".tex")
 NO_REGIONS = {
     "psnr_moving": "needs 3 evaluated views with the same camera",
     "psnr_object": "needs masks, or images with alpha",
@@ -115,10 +106,3 @@ def records() -> list[Record]:
         moving(make("4dgs", "moving-matte", psnr=27.0), 21.5),
         moving(make("7dgs", "moving-matte", psnr=26.998), 22.0),
     ]
-
-
-if __name__ == "__main__":
-    GOLDEN.parent.mkdir(exist_ok=True)
-    GOLDEN.write_text(layout.markdown(tables.build(records())))
-    GOLDEN_TERMINAL.write_text(layout.terminal(tables.build(records())))
-    GOLDEN_LATEX.write_text(latex(tables.build(records())))

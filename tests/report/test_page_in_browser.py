@@ -3,10 +3,12 @@
 import re
 
 import pytest
+from chapters import results
 from chromium import launched
 from many_records import frontier, hostile, on_demand, write_all
 
-from gsbench.report.page import build
+from gsbench.report.frame import load
+from gsbench.report.render import page as of_report
 
 pytestmark = pytest.mark.slow
 WIDTHS = (375, 820, 1440)
@@ -24,9 +26,9 @@ def pages(tmp_path_factory):
     records = frontier(lengths=(500, 1000))
     whole = [r for r in records if r.model == "7dgs"]
     records += on_demand(whole) + on_demand(whole, label="7dgs")
-    good = build.write(records, write_all(records, root, pictures=2))
+    good = of_report.write(load(write_all(records, root, pictures=2)), root)
     (root / "bad").mkdir()
-    return {"good": good, "hostile": build.write(hostile(), root / "bad")}
+    return {"good": good, "hostile": of_report.write(results(*hostile()), root / "bad")}
 
 
 @pytest.fixture
@@ -43,6 +45,8 @@ def visit(browser, pages):
         page.on("console", lambda message: page.complaints.append(message.text))
         page.on("pageerror", lambda error: page.complaints.append(str(error)))
         page.goto(pages[name].as_uri())
+        if options.get("java_script_enabled", True):
+            page.evaluate("Promise.all([...document.querySelectorAll('.chart')].map(draw))")
         return page
 
     yield open_page
@@ -78,71 +82,6 @@ def test_nothing_is_wider_than_the_screen(visit, name, width):
     assert page.evaluate(loose) == 0
 
 
-def test_no_table_is_cut_on_a_wide_screen(visit):
-    """Catches a last column that must be scrolled for at 1,440 pixels, and a phone on which a row loses its name."""
-    page = visit(width=1440)
-    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
-    boxes = page.locator(".scroll").evaluate_all("all => all.map(s => [s.ariaLabel, s.scrollWidth - s.clientWidth])")
-    assert len(boxes) > 5
-    assert [name for name, more in boxes if more > 0] == []
-    narrow = visit(width=390).locator('[aria-label="stages.csv"]')
-    narrow.evaluate("box => { box.scrollLeft = 1000; }")
-    edge = narrow.bounding_box()["x"]
-    assert narrow.locator("tbody td:first-child").first.bounding_box()["x"] == pytest.approx(edge, abs=1)
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-def test_the_first_screen_holds_the_answers(visit, width):
-    """Catches an answer that one must scroll for: four budgets with their models and intervals."""
-    page = visit(width=width)
-    answers = page.locator(".answer")
-    assert answers.count() == 4
-    bottom = answers.last.bounding_box()
-    assert bottom["y"] + bottom["height"] <= 900
-    assert "95 %" in answers.first.inner_text()
-
-
-def test_tabs_by_mouse_and_keyboard(visit):
-    """Catches tabs that only one of the two can turn, and panels that do not follow."""
-    page = visit()
-    tabs = page.locator("#g0-frontier [role=tab]")
-    panels = page.locator("#g0-frontier [role=tabpanel]")
-    assert tabs.count() == panels.count() == 3
-    assert [panels.nth(i).is_visible() for i in range(3)] == [True, False, False]
-    tabs.nth(1).click()
-    assert [panels.nth(i).is_visible() for i in range(3)] == [False, True, False]
-    page.keyboard.press("ArrowRight")
-    assert [panels.nth(i).is_visible() for i in range(3)] == [False, False, True]
-    assert tabs.nth(2).get_attribute("aria-selected") == "true"
-    page.keyboard.press("ArrowRight")
-    assert panels.nth(0).is_visible()
-    page.keyboard.press("End")
-    assert panels.nth(2).is_visible()
-    page.reload()
-    assert panels.nth(2).is_visible(), "a page that loads itself again forgets its tab"
-
-
-def test_the_legend_hides_a_model(visit):
-    """Catches a name that hides nothing, hides it in one section only, or leaves its points to the pointer."""
-    page = visit()
-    entry = page.locator("#g0-frontier button.model", has_text=re.compile("^7dgs$"))
-    colour = entry.get_attribute("data-colour")
-    hits = page.locator(f'#g0-frontier [role=tabpanel]:not([hidden]) .hit[data-colour="{colour}"]')
-    shade = "(id) => getComputedStyle(document.getElementById(id)).getPropertyValue('--model-' + " + colour + ")"
-    before = page.evaluate(shade, "g0-frontier")
-    assert hits.first.is_visible()
-    entry.focus()
-    page.keyboard.press("Enter")
-    assert entry.get_attribute("aria-pressed") == "false"
-    assert [page.evaluate(shade, f"g0-{key}") for key in ("frontier", "quality", "anytime")] == ["transparent"] * 3
-    assert page.evaluate(shade, "g0-on-demand") == before, "an effect set has the colour of its model"
-    assert not hits.first.is_visible()
-    assert page.locator("#g0-frontier button.model[aria-pressed=true]").count() > 0
-    page.locator("#g0-anytime button.model", has_text=re.compile("^7dgs$")).click()
-    assert page.evaluate(shade, "g0-frontier") == before
-    assert hits.first.is_visible()
-
-
 def test_the_slider_by_mouse_and_keyboard(visit):
     """Catches a slider that does not move the edge between the images, and choices that do not change them."""
     page = visit()
@@ -169,33 +108,6 @@ def test_the_slider_by_mouse_and_keyboard(visit):
     assert page.locator(".stage .under").get_attribute("src") != under
     assert page.locator(".left").input_value() == "error:3dgs"
     assert over.evaluate("i => i.naturalWidth") == 60
-
-
-def test_pointing_at_a_point_names_its_run(visit):
-    """Catches points without a name or the command, a card that leaves the screen, and one that cannot be kept."""
-    page = visit(width=375)
-    page.locator("#g0-frontier [role=tab]").nth(1).click()
-    card = page.locator("#card")
-    assert card.is_hidden()
-    hits = page.locator("#g0-frontier [role=tabpanel]:not([hidden]) .hit")
-    lefts = hits.evaluate_all("all => all.map((hit) => hit.getBoundingClientRect().left)")
-    for end in (min(lefts), max(lefts)):
-        hit = hits.nth(lefts.index(end))
-        hit.scroll_into_view_if_needed()
-        hit.hover(force=True)
-        assert card.is_visible()
-        assert "seed" in card.locator(".name").inner_text()
-        assert card.locator("code").inner_text().startswith("python -m gsbench ")
-        box = card.bounding_box()
-        assert box["x"] >= 0
-        assert box["x"] + box["width"] <= 375
-        page.mouse.move(0, 0)
-        assert card.is_hidden()
-    hit.click(force=True)
-    page.mouse.move(0, 0)
-    assert card.is_visible()
-    page.keyboard.press("Escape")
-    assert card.is_hidden()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -234,52 +146,77 @@ def ratio(a, b):
     return (light[1] + 0.05) / (light[0] + 0.05)
 
 
-def test_texts_of_a_drawing_do_not_overlap(visit):
-    """Catches ticks and labels that run into each other at any width."""
-    for width in WIDTHS:
-        page = visit(width=width)
-        clashes = page.evaluate(
-            """() => [...document.querySelectorAll("figure svg")].filter((s) => s.clientWidth).flatMap((svg) => {
-                const boxes = [...svg.querySelectorAll('text')].map((t) => [t.textContent, t.getBoundingClientRect()]);
-                const hits = [];
-                boxes.forEach(([a, p], i) => boxes.slice(i + 1).forEach(([b, q]) => {
-                    const wide = Math.min(p.right, q.right) - Math.max(p.left, q.left);
-                    const high = Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top);
-                    if (wide > 1 && high > 3) hits.push(`${svg.ariaLabel.slice(0, 40)}: ${a} / ${b}`);
-                }));
-                return hits;
-            })"""
-        )
-        assert clashes == [], width
+MARKS = "#g0-frontier .chart >> nth=0 >> .mark-symbol path[aria-label]"
 
 
-def test_it_prints(visit):
-    """Catches a page that cannot be printed: hidden scenes are shown, controls are not."""
+def test_the_legend_hides_a_model_in_every_figure(visit):
+    """Catches a name that hides nothing, by mouse or by keyboard, and one that hides in one section only."""
+    page = visit()
+
+    def lines(key):
+        return page.locator(f"#g0-{key} .mark-line path").count()
+
+    before = page.locator(MARKS).count(), lines("curves")
+    entry = page.locator("#g0-frontier button.model", has_text=re.compile("^7dgs_noagr$"))
+    entry.focus()
+    page.keyboard.press("Enter")
+    page.wait_for_timeout(300)
+    assert entry.get_attribute("aria-pressed") == "false"
+    assert page.locator(MARKS).count() < before[0]
+    assert lines("curves") < before[1]
+    page.locator("#g0-curves button.model", has_text=re.compile("^7dgs_noagr$")).click()
+    page.wait_for_timeout(300)
+    assert (page.locator(MARKS).count(), lines("curves")) == before
+
+
+def test_a_scene_is_chosen_and_remembered(visit):
+    """Catches a choice that draws nothing else, and a page that loads itself again and forgets it."""
+    page = visit()
+    labels = lambda: page.locator(MARKS).evaluate_all("all => all.map((mark) => mark.ariaLabel)")  # noqa: E731
+    before = labels()
+    page.locator("#g0-frontier select.scene").select_option("suzanne")
+    page.wait_for_timeout(300)
+    assert labels()
+    assert labels() != before
+    page.reload()
+    assert page.locator("#g0-frontier select.scene").input_value() == "suzanne"
+
+
+def test_a_point_names_its_model_and_numbers(visit):
+    """Catches points without a tooltip, and a tooltip that leaves the screen."""
+    page = visit(width=390)
+    page.locator(MARKS).first.scroll_into_view_if_needed()
+    page.locator(MARKS).last.hover(force=True)
+    tip = page.locator("#vg-tooltip-element.visible")
+    tip.wait_for()
+    assert "PSNR, dB" in tip.inner_text()
+    box = tip.bounding_box()
+    assert 0 <= box["x"] <= box["x"] + box["width"] <= 390
+
+
+def test_it_prints_and_has_its_tables_without_script(visit):
+    """Catches a page that cannot be printed, and numbers that only a script shows."""
     page = visit()
     page.emulate_media(media="print")
-    assert all(page.locator("[role=tabpanel]").nth(i).is_visible() for i in range(3))
-    assert page.locator("[role=tablist]").first.is_hidden()
+    assert page.locator(".controls").first.is_hidden()
     assert len(page.pdf()) > 10_000
-
-
-def test_it_reads_without_script(visit):
-    """Catches text and figures that only a script makes."""
-    page = visit(java_script_enabled=False)
-    assert page.locator("#g0-frontier svg").first.is_visible()
-    assert page.locator("[role=tabpanel]").nth(2).is_visible()
+    plain = visit(java_script_enabled=False)
+    assert plain.locator("#g0-experiment table").is_visible()
+    assert "Figures need JavaScript" in plain.locator("noscript").inner_text()
 
 
 def test_a_live_page_loads_itself_again(browser, tmp_path):
     """Catches a page that stays old while runs arrive, and one that takes the slider out of a reader's hand."""
-    records = frontier(("3dgs", "4dgs"), ("suzanne",), 2, (1000,))
-    folder = write_all(records, tmp_path, pictures=1)
+    runs = frontier(("3dgs", "4dgs"), ("suzanne",), 2, (1000,))
+    folder = write_all(runs[:2], tmp_path, pictures=1)
     page = browser.new_page()
-    page.goto(build.write(records[:2], folder, reload=1).as_uri())
+    page.goto(of_report.write(load(folder), folder, reload=1).as_uri())
     assert "2 runs" in page.locator(".summary").inner_text()
     page.locator(".stage input").focus()
-    build.write(records, folder, reload=1)
+    write_all(runs, tmp_path, pictures=1)
+    of_report.write(load(folder), folder, reload=1)
     page.wait_for_timeout(2500)
     assert "2 runs" in page.locator(".summary").inner_text()
     page.locator(".stage input").evaluate("input => input.blur()")
-    page.get_by_text("4 runs").first.wait_for(timeout=10_000)
+    page.get_by_text("4 runs").first.wait_for(timeout=15_000)
     page.close()

@@ -14,7 +14,7 @@ from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, LengthChoice, Record, TimeScreen
 from gsbench.models import GaussianModel
-from gsbench.report.page import events
+from gsbench.report.sections.curves import events
 from gsbench.run import checks, load
 from gsbench.run.candidates import FOLDER
 from gsbench.run.lengths import lengths
@@ -90,7 +90,7 @@ def test_the_schedule_is_that_of_the_kept_length(square: Path, tmp_path: Path) -
     alone, _ = run_here(*overrides(square, tmp_path / "alone", *OTHERS, *words, "train.iterations=20"))
     assert record.metrics == alone.metrics
     assert load.load_run(folder).model.active.sh_degree == 2
-    assert events.of(record)[0][0] < 20
+    assert events(record)[0][0] < 20
 
 
 def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pandas as pd
@@ -10,6 +10,7 @@ import pandas as pd
 from gsbench.errors import printable
 from gsbench.report.section import EMPTY, Section
 
+WIDEST = 44  # characters of a cell in a terminal
 ARROWS = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
 STYLES = {0: "{}", 1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"}
 TEX = {
@@ -22,35 +23,38 @@ TEX = {
 def terminal(sections: Sequence[Section], width: int = 120) -> str:
     """Return sections as plain text of at most `width` characters a line, with a star at the best numbers.
 
-    Columns that do not fit are left out, and a line names them.
+    The rows of a scene stand below its name. Columns that do not fit are left out, and a line names them.
     """
-    lines = []
-    for section in sections:
-        table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text)
-        numeric = dict(zip(table, map(section.is_number, section.shown_columns), strict=True))
-        widths = {name: min(60, max(map(len, [name, *table[name]]), default=0)) for name in table}
-        fitting = [n for n in range(1, len(widths) + 1) if sum(list(widths.values())[:n]) + 2 * n <= width]
-        names = list(table)[: max(fitting, default=1)]
-        rows = [names, *table[names].to_numpy().tolist()]
-        lines += [section.title.upper(), ""]
-        for row in rows if names else []:
-            cells = [
-                text[:60].rjust(widths[n]) if numeric[n] else text[:60].ljust(widths[n])
-                for n, text in zip(names, row, strict=True)
-            ]
-            lines.append("  ".join(cells).rstrip()[:width])
-        left_out = ", ".join(list(table)[len(names) :])
-        words = [
-            section.text,
-            *(f"- {note}" for note in section.notes),
-            f"- for lack of width: {left_out}" if left_out else "",
-        ]
-        lines += [
-            "",
-            *(line for text in words for line in textwrap.wrap(printable(text), width, subsequent_indent="  ")),
-            "",
-        ]
-    return "\n".join(lines)
+    return "\n".join(line for section in sections for line in _terminal(section, width))
+
+
+def _terminal(section: Section, width: int) -> Iterator[str]:
+    table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text).map(lambda text: text[:WIDEST])
+    has_scenes = "scene" in table.columns[:1]
+    scenes = list(dict.fromkeys(table.scene)) if has_scenes else [""]
+    names = list(table)[has_scenes:]
+    widths = {name: max(map(len, [name, *table[name]])) for name in names}
+    fitting = [n for n in range(1, len(names) + 1) if sum(widths[name] + 2 for name in names[:n]) <= width]
+    shown = names[: max(fitting, default=1)]
+    numeric = dict(zip(table, map(section.is_number, section.shown_columns), strict=True))
+
+    def line(cells: Sequence[str]) -> str:
+        texts = zip(shown, cells, strict=True)
+        padded = (text.rjust(widths[name]) if numeric[name] else text.ljust(widths[name]) for name, text in texts)
+        return f"  {'  '.join(padded)}"[:width].rstrip()
+
+    yield from (*_wrapped(section.title, width), "", line(shown))
+    for scene in scenes:
+        rows = table[table.scene == scene] if has_scenes else table
+        yield from [scene[:width]] if scene else []
+        yield from map(line, rows[shown].to_numpy().tolist())
+    words = [section.text, *(f"- {note}" for note in section.notes)]
+    words += [f"- for lack of width: {', '.join(names[len(shown) :])}"] if len(shown) < len(names) else []
+    yield from ("", *(part for text in words for part in _wrapped(text, width)), "")
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(printable(text), width, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def markdown(sections: Sequence[Section]) -> str:

@@ -100,7 +100,7 @@ def quality(chapter: Results, tests: pd.DataFrame) -> Section | None:
         "performance profiles of Dolan and Moré (2002)."
     )
     drawn = profiles(table[[f"{name}, s" for name in models]].set_axis(models, axis=1))
-    caption = f"% of {drawn.attrs['targets']} targets reached within a factor of the fastest model's seconds"
+    caption = f"% of {drawn.attrs.get('targets')} targets reached within a factor of the fastest model's seconds"
     figures = (Figure(caption, "profile", drawn),) if len(drawn) else ()
     columns = {f"{name}, s": Column(f"{name}, s", 1) for name in models} | {"dB": Column("dB", 2)}
     return Section("quality", "Time to quality", text, table, columns, figures)
@@ -112,6 +112,8 @@ def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
     Only targets that some model reaches count; a model without a run on a scene does not reach its targets.
     """
     solved = seconds[np.isfinite(seconds.min(axis=1))].fillna(math.inf)
+    if solved.empty:
+        return pd.DataFrame()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = solved.div(solved.min(axis=1), axis=0)
     ratios = ratios.mask(solved.eq(solved.min(axis=1), axis=0), 1.0)
@@ -125,7 +127,7 @@ def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
         rows += [{"series": name, "factor": x, "share": y} for x, y in zip(at, share, strict=True)]
     table = pd.DataFrame(rows, columns=["series", "factor", "share"])
     table.attrs["targets"] = len(solved)
-    return table if len(solved) else table.iloc[:0]
+    return table
 
 
 @section()

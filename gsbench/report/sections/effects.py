@@ -47,9 +47,8 @@ def is_single(name: str) -> bool:
 @section(asked)
 def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table of prices, with their intervals in dB, seconds, milliseconds and MB."""
-    by_unit = {
-        quantity: tests[tests.quantity == quantity].set_index("name", verify_integrity=True) for quantity in UNITS
-    }
+    by_unit = {quantity: tests[tests.quantity == quantity].set_index("name") for quantity in UNITS}
+    assert all(table.index.is_unique for table in by_unit.values())
     gains = by_unit["psnr_db"]
     is_shown = gains.index.map(lambda name: is_single(name) or not name.endswith("nested"))
     gains = gains[(gains.scenes > 0) & is_shown.to_numpy(bool)]

@@ -7,10 +7,11 @@ import pandas as pd
 from gsbench.errors import printable
 from gsbench.report import paper, stats
 from gsbench.report.frame import Results, covered
-from gsbench.report.section import COLUMNS, Section, number, section
+from gsbench.report.section import COLUMNS, Section, number, section, text
 
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_object_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians",
          "lpips_vgg", "psnr_best_on_test_db")  # fmt: skip
+WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
 IF_MEASURED = ("psnr_moving_db", "psnr_object_db", "lpips_vgg", "psnr_best_on_test_db")
 TEXT = (
     "Mean over seeds ± half the width of the 95 % interval over seeds. Bold: the best mean of a scene and every mean "
@@ -27,10 +28,11 @@ def experiment(chapter: Results, tests: pd.DataFrame) -> Section:
     return table(chapter, [])
 
 
-def table(chapter: Results, columns: Sequence[str]) -> Section:
+def table(chapter: Results, asked: Sequence[str]) -> Section:
     """Make the table with the given columns of `runs`, or with those that the runs have if none is given."""
     runs, ok = chapter.runs, chapter.finished.runs
-    names = list(columns) or [name for name in SHOWN if name not in IF_MEASURED or ok[name].notna().any()]
+    is_all = set(asked) in (set(), set(WITH_TRAIN))
+    names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
     parts = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
     failed = runs[runs.status != "ok"]
     labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
@@ -38,13 +40,17 @@ def table(chapter: Results, columns: Sequence[str]) -> Section:
     scenes = covered(runs)
     if runs.scene.nunique() > 1 and scenes:
         where = f"average over {len(scenes)} of {runs.scene.nunique()} scenes"
-        average = _means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where)
-        parts.append(average[[name for name in average if not name.endswith(" ±")]])
+        parts.append(_means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
     rows = pd.concat(parts, ignore_index=True)
     rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
-    order = ["scene", "label", *(c for name in names for c in (name, f"{name} ±", f"{name} rank")), "seeds"]
+    order = [
+        "scene",
+        "label",
+        *(c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows),
+        "seeds",
+    ]
     rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
-    title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])}"
+    title = f"experiment {runs.experiment.iloc[0]}, data {text(runs.dataset.iloc[0])[:60]}"
     return Section("experiment", f"Results: {title}", TEXT, rows, notes=tuple(_notes(chapter)))
 
 
@@ -53,9 +59,9 @@ def _means(runs: pd.DataFrame, names: list[str]) -> pd.DataFrame:
     rows = stats.means(runs, ["label"], names)
     for name in names:
         if better := COLUMNS[name].better:
-            digits = COLUMNS[name].digits
-            ranks = stats.ranks(runs, "label", name, better == "higher", 1 if digits is None else digits)
-            rows[f"{name} rank"] = rows.label.map(ranks)
+            rows[f"{name} rank"] = rows.label.map(
+                stats.ranks(runs, "label", name, better == "higher", COLUMNS[name].show)
+            )
     return rows
 
 

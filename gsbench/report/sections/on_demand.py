@@ -76,7 +76,7 @@ def _mean(runs: pd.DataFrame) -> dict[str, Any]:
     split = of.split if evaluated else of.checked_on
     texts = {
         "seeds": len(runs),
-        "time": ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())),
+        "screen": ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())),
         "why": reason(screens[0]) if screens else "",
         "compared": of_comparison(comparison) if comparison else "",
         "gated": int(of.before.notna().sum()),

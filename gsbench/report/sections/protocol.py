@@ -11,7 +11,7 @@ from gsbench.measure.record import Record
 from gsbench.report.frame import Results, without
 from gsbench.report.section import Section, number, section
 
-WARNING = "WARNING: compared runs differ"
+WARNING = "WARNING"
 SILENT = {"resize": "area", "repaired": "none", "val_every": "none"}  # what a record means that lacks it
 OF_ALL = {"machine": "machine", "commit": "git_commit", "versions": "versions"}  # the same for all scenes
 # The scenes on which gsbench's own settings were chosen; what holds on them may not hold on others.
@@ -23,7 +23,8 @@ TUNED = frozenset((
 TEXT = (
     "PSNR is over all pixels and channels of a view, after the final iteration, averaged over views; SSIM is that of "
     "scikit-image (Gaussian window, data_range 1). FPS is 1000 / the median milliseconds of a frame, with slicing and "
-    "AGR. Minutes of training are without evaluation. Times of other machines than that of most runs are left out."
+    "AGR. Minutes of training are without evaluation. WARNING: runs that are compared differ in this. Times of other "
+    "machines than that of most runs are left out."
 )
 
 
@@ -40,8 +41,8 @@ def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
     named.pop("paper_dataset", None)
     named |= {"iterations": "iterations", "data": "data_hash"} | OF_ALL
     rows = [row for setting, column in named.items() for row in _setting(runs, setting, column, warn=len(ok) > 0)]
-    rows += [[*fact, ""] for fact in _facts(runs)]
-    table = pd.DataFrame(rows, columns=["setting", "value", "scenes", "runs", "note"])
+    rows += [["", *fact] for fact in _facts(runs)]
+    table = pd.DataFrame(rows, columns=["note", "setting", "value", "scenes", "runs"])
     table = table.sort_values("note", ascending=False, kind="stable").reset_index(drop=True)
     return Section("protocol", "Protocol, machine, seeds", TEXT, table, notes=tuple(_notes(runs)))
 
@@ -55,7 +56,7 @@ def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> It
     is_mixed = (by_scene > 1).any() or (setting in OF_ALL and values.nunique() > 1)
     for value, of in runs.groupby(values):
         where = "all" if of.scene.nunique() == runs.scene.nunique() else ", ".join(sorted(of.scene.unique()))
-        yield [printable(setting), value, where, len(of), WARNING if is_mixed and warn else ""]
+        yield [WARNING if is_mixed and warn else "", printable(setting), value, where, len(of)]
 
 
 def _short(setting: str, value: object) -> str:
