@@ -80,7 +80,9 @@ def _mean(runs: pd.DataFrame) -> dict[str, Any]:
         "why": reason(screens[0]) if screens else "",
         "compared": of_comparison(comparison) if comparison else "",
         "gated": int(of.before.notna().sum()),
-        "measured on": next((str(value) for value, ends in zip(split, of.ends, strict=True) if ends), ""),
+        "measured on": next(
+            (value for value, ends in zip(split, of.ends, strict=True) if ends and isinstance(value, str)), ""
+        ),
     }
     order = [*texts, *(c for name in SHOWN for c in (name, f"{name} ±") if c in numbers or c in halves)]
     return {name: (texts | numbers | halves)[name] for name in order} | {"p": of.p.max()}
