@@ -3,9 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gsbench.process.heap import keep_freed_memory
-from gsbench.process.threads import sleep_when_idle
-from gsbench.process.vectors import compute_the_same_bits
+from gsbench.process.start import compute_the_same_bits, keep_freed_memory, sleep_when_idle
 from gsbench.version import __version__ as __version__
 
 keep_freed_memory()  # these three calls must come before the import of torch or the kernels

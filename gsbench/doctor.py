@@ -17,8 +17,7 @@ from importlib import metadata
 from pathlib import Path
 
 from gsbench.as_json import as_json
-from gsbench.errors import one_line, printable
-from gsbench.extras import how_to_install, requirements
+from gsbench.errors import how_to_install, one_line, printable
 from gsbench.measure.machine import hardware
 from gsbench.measure.provenance import git_commit
 from gsbench.version import __version__
@@ -27,6 +26,7 @@ OK, ABSENT, BROKEN = "ok", "absent", "broken"  # absent: an optional part that i
 LEAST_DISK = 1 << 30  # bytes; a run of D-NeRF writes less than a tenth of this
 LEAST_MEMORY = 1 << 30
 TIMEOUT = 10  # seconds for the compiler to say its version
+COMMAND = "gsbench.__main__:main"  # that of this project in the metadata of its distribution
 COMPILERS = ("c++", "g++", "clang++")
 INSTALL = "pip install -c constraints.txt . (docs/install.md)"
 LARGEST_ERROR = 1e-4  # between the images of two backends, as in docs/adding_a_kernel.md
@@ -99,6 +99,14 @@ def _requirements() -> tuple[list[str], dict[str, list[str]]]:
         elif extra[1] not in ("dev", "docs"):
             extras.setdefault(extra[1], []).append(name)
     return core, extras
+
+
+def requirements() -> list[str]:
+    """Return what the installed distribution of gsbench requires, whatever its name is; [] if it is not installed."""
+    for command in metadata.entry_points(group="console_scripts", name="gsbench"):
+        if command.value == COMMAND and command.dist is not None:
+            return command.dist.requires or []
+    return []
 
 
 def _version(package: str) -> str | None:

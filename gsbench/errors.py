@@ -30,6 +30,13 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f"{guess}Valid: {', '.join(choices)}."
 
 
+def how_to_install(
+    extra: str,  # such as view
+) -> str:
+    """Return the command that installs an extra; in PyPI the name `gsbench` is another project's."""
+    return f"pip install '.[{extra}]' in a checkout of gsbench, or 'WHEEL.whl[{extra}]'"
+
+
 def one_line(error: BaseException) -> str:
     """Return the first line of an error's message, or the name of the error's type if it has no message.
 

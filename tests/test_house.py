@@ -36,7 +36,6 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/kernels": 40,
     "gsbench/measure": 14,
     "gsbench/models": 20,
-    "gsbench/process": 3,
     "gsbench/raster": 1,
     "gsbench/report": 103,
     "gsbench/report/page": 69,

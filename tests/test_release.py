@@ -13,8 +13,8 @@ from packaging.specifiers import SpecifierSet
 from tiny_run import ROOT
 
 import gsbench
-from gsbench import extras
-from gsbench.extras import how_to_install
+from gsbench import doctor
+from gsbench.errors import how_to_install
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PYTHONS = [f"3.{n}" for n in range(30) if f"3.{n}" in SpecifierSet(PYPROJECT["project"]["requires-python"])]
@@ -85,7 +85,7 @@ def test_nobody_is_told_to_install_a_strangers_package() -> None:
     assert len(texts) > 300
     assert {path: match[0] for path, text in texts.items() if (match := STRANGERS.search(text))} == {}
     assert PYPROJECT["project"]["name"] != "gsbench"
-    assert PYPROJECT["project"]["scripts"] == {"gsbench": extras.COMMAND}
+    assert PYPROJECT["project"]["scripts"] == {"gsbench": doctor.COMMAND}
 
 
 def test_every_python_is_tested() -> None:

@@ -4,12 +4,14 @@ The module does not import torch.
 """
 
 import errno
+import os
 import re
 import sys
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from gsbench.errors import TooLargeError
-from gsbench.process import control_group
 
 # Messages of the library loader, torch, C++, system threads and OpenCV if memory runs out.
 WITHOUT_MEMORY = re.compile(r"memory|bad_alloc|bad alloc|failed to map segment|can't start new thread", re.IGNORECASE)
@@ -37,12 +39,8 @@ def require(size: int, what: str, instead: str) -> None:
 
 def too_little_address_space() -> str | None:
     """Return an error message if the address space (`ulimit -v`) is too small to load torch, otherwise None."""
-    if sys.platform == "win32":  # it has no such limit
-        return None
-    import resource
-
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY or limit >= LEAST_ADDRESS_SPACE:
+    limit = _address_space_limit()
+    if limit is None or limit >= LEAST_ADDRESS_SPACE:
         return None
     return (f"this process is limited to {limit >> 20} MiB of address space (ulimit -v), and torch needs "
             f"{LEAST_ADDRESS_SPACE >> 20} MiB to start: raise the limit")  # fmt: skip
@@ -52,35 +50,105 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Return whether an exception means that memory ran out; most libraries do not raise MemoryError."""
     if isinstance(error, OSError):
         return error.errno == errno.ENOMEM
-    told = isinstance(error, RuntimeError | ImportError | SystemError) and WITHOUT_MEMORY.search(str(error)) is not None
-    return told or isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"  # torch's, of a GPU
+    if isinstance(error, RuntimeError | ImportError | SystemError) and WITHOUT_MEMORY.search(str(error)):
+        return True
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"  # torch's, of a GPU
 
 
 def available() -> int | None:
     """Return the bytes that the system, the control group and `ulimit -v` leave to this process, None if unknown."""
-    limits = [x for x in (_system(), control_group.available(), _address_space()) if x is not None]
+    limits = [x for x in (_system(), left_by_control_groups(), _address_space()) if x is not None]
     return min(limits, default=None)
 
 
 def _system() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
+    lines = _lines(Path("/proc/meminfo"))
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
-def _address_space() -> int | None:
-    """Return what the limit of the address space (`ulimit -v`) leaves; None if there is none."""
+def _address_space_limit() -> int | None:
     if sys.platform == "win32":  # it has no such limit
         return None
     import resource
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit == resource.RLIM_INFINITY:
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def _address_space() -> int | None:
+    """Return what the limit of the address space (`ulimit -v`) leaves; None if there is none."""
+    limit = _address_space_limit()
+    if limit is None:
         return None
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except OSError:
         return None
-    return max(0, limit - pages * resource.getpagesize())
+    return max(0, limit - pages * os.sysconf("SC_PAGE_SIZE"))
+
+
+class Files(NamedTuple):
+    """Name the files in which a version of Linux's control groups has its memory."""
+
+    limit: str
+    used: str
+    cache: str  # the line in memory.stat: cached files, which the system can drop at any time and which `used` counts
+
+
+VERSIONS = {
+    "cgroup2": Files("memory.max", "memory.current", "inactive_file"),
+    "cgroup": Files("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
+
+
+def left_by_control_groups(root: Path = Path("/")) -> int | None:
+    """Return the bytes that the control groups of this process leave to it; None if no limit can be read.
+
+    The limit of a container or of a batch job can be set on any group between the root and that of the process.
+
+    Args:
+        root: the folder that has proc/ and the mounted control groups.
+    """
+    left = (_left(folder, VERSIONS[version]) for version, folder in _folders(root))
+    return min((x for x in left if x is not None), default=None)
+
+
+def _folders(root: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the version and the folder of each control group that can limit this process: its own and those above."""
+    groups = {}  # the path of this process' group, by the version of control groups
+    for line in _lines(root / "proc/self/cgroup"):
+        number, controllers, path = (*line.split(":", 2), "", "")[:3]
+        if number == "0" and not controllers:
+            groups["cgroup2"] = path
+        elif "memory" in controllers.split(","):
+            groups["cgroup"] = path
+    for line in _lines(root / "proc/self/mountinfo"):
+        mount, _, filesystem = line.partition(" - ")
+        kind, _, options = filesystem.partition(" ")
+        fields = [re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), x) for x in mount.split(" ")]
+        if kind not in groups or len(fields) < 5 or (kind == "cgroup" and "memory" not in re.split("[ ,]", options)):
+            continue
+        top = root / fields[4].lstrip("/")
+        group = PurePosixPath(groups[kind])
+        inside = group.relative_to(fields[3]) if group.is_relative_to(fields[3]) else PurePosixPath()
+        if ".." in inside.parts:  # the group of this process is above what this container can see
+            inside = PurePosixPath()
+        for folder in (inside, *inside.parents):
+            yield kind, top / folder
+
+
+def _left(folder: Path, files: Files) -> int | None:
+    """Return the bytes that one control group leaves; None if it has no limit."""
+    try:
+        left = int((folder / files.limit).read_text()) - int((folder / files.used).read_text())
+        cached = [int(n) for key, n in (x.split() for x in _lines(folder / "memory.stat")) if key == files.cache]
+    except (OSError, ValueError):  # no such group, no limit ("max"), or something else than numbers
+        return None
+    return max(0, left + sum(cached))
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except (OSError, ValueError):  # ValueError: not text
+        return []

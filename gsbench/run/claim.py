@@ -28,7 +28,7 @@ ATTEMPTS, PAUSE = 100, 0.02  # attempts to claim, and seconds between two
 READS = 3  # attempts to read a claim; without hard links it may be half written, on NFS its handle may be stale
 
 
-def take(folder: Path, mine: Progress) -> Progress | None:
+def take(folder: Path, claim: Progress) -> Progress | None:
     """Claim the run in the existing `folder`; if another live process has claimed it, return that process's progress.
 
     Return None if the claim succeeds.
@@ -41,27 +41,27 @@ def take(folder: Path, mine: Progress) -> Progress | None:
     with _alone(folder):
         for _ in range(ATTEMPTS):
             content, other = _read(path)
-            if other is not None and not _may_be_taken(other, mine):
+            if other is not None and not _may_be_taken(other, claim):
                 return other
             if content is not None:
-                _remove(path, content, mine)  # its process has ended, or the file is damaged
-            if create_atomically(path, progress.encode(mine)):
+                _remove(path, content, claim)  # its process has ended, or the file is damaged
+            if create_atomically(path, progress.encode(claim)):
                 return None
             time.sleep(PAUSE)
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
 
 
-def _remove(path: Path, content: bytes, mine: Progress) -> None:
+def _remove(path: Path, content: bytes, claim: Progress) -> None:
     """Remove the claim with this content, unless another process does so or has done so.
 
     Only the process whose progress is in the file `heir` removes the claim, and only if the claim is still the one that
     was read. An heir that was killed leaves this file. It is a claim too, and is removed in the same way.
     """
     heir = path.with_name(f"{LOCK}.{hashlib.sha256(content).hexdigest()[:16]}")
-    if not create_atomically(heir, progress.encode(mine)):
+    if not create_atomically(heir, progress.encode(claim)):
         left, other = _read(heir)
-        if left is not None and (other is None or _may_be_taken(other, mine)):
-            _remove(heir, left, mine)
+        if left is not None and (other is None or _may_be_taken(other, claim)):
+            _remove(heir, left, claim)
         return
     try:
         if _content(path) == content:
@@ -70,7 +70,7 @@ def _remove(path: Path, content: bytes, mine: Progress) -> None:
         heir.unlink(missing_ok=True)
 
 
-def release(folder: Path, mine: Progress, *, is_stopped: bool = False) -> None:
+def release(folder: Path, claim: Progress, *, is_stopped: bool = False) -> None:
     """Remove this process's claim on the run in `folder`; the claim of another process is kept.
 
     If a signal has stopped the run, its progress becomes stopped.json.
@@ -79,7 +79,7 @@ def release(folder: Path, mine: Progress, *, is_stopped: bool = False) -> None:
     try:
         with _alone(folder):
             _, other = _read(path)
-            if other is not None and _is_one(other, mine):
+            if other is not None and _is_one(other, claim):
                 if is_stopped:
                     progress.write_stopped(folder, other)
                 path.unlink(missing_ok=True)
@@ -119,18 +119,18 @@ def _content(path: Path) -> bytes | None:
     raise AssertionError("the last attempt returns or raises")
 
 
-def _is_one(other: Progress, mine: Progress) -> bool:
-    return (other.host, other.pid, other.born) == (mine.host, mine.pid, mine.born)
+def _is_one(other: Progress, claim: Progress) -> bool:
+    return (other.host, other.pid, other.born) == (claim.host, claim.pid, claim.born)
 
 
-def _may_be_taken(other: Progress, mine: Progress) -> bool:
+def _may_be_taken(other: Progress, claim: Progress) -> bool:
     """Return whether this process may take an existing claim.
 
     The process may take the claim if the claim is its own, if the process of the claim has ended, or if Slurm has
     requeued the job after a node failed. Two live processes of one Slurm job on one node respect each other's claims.
     """
-    requeued = other.job is not None and other.job == mine.job and other.host != mine.host
-    return _is_one(other, mine) or requeued or not progress.is_alive(other)
+    requeued = other.job is not None and other.job == claim.job and other.host != claim.host
+    return _is_one(other, claim) or requeued or not progress.is_alive(other)
 
 
 @contextmanager

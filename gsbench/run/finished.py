@@ -52,20 +52,20 @@ def where(this: Run, record: Record) -> str:
     """Return the date and the machine of a record as text."""
     here, device = hardware(kernels.instruction_set()), this.config.device
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor
-    theirs = record.provenance.machine
-    own = theirs == named(name, torch.get_num_threads(), here)
-    return f"{record.provenance.time.partition('T')[0]:.20} on {'this machine' if own else theirs}"
+    machine = record.provenance.machine
+    is_here = machine == named(name, torch.get_num_threads(), here)
+    return f"{record.provenance.time.partition('T')[0]:.20} on {'this machine' if is_here else machine}"
 
 
 def _outdated(this: Run, scene: Scene, record: Record) -> str:
     """Return why the record of an earlier run does not match the settings and data of this run; "" if it matches."""
-    theirs = record.provenance
-    training = training_differences(theirs.config, this.plain)
+    earlier = record.provenance
+    training = training_differences(earlier.config, this.plain)
     if training:
         return f"the training is another ({listed(training)}): running again"
-    if theirs.data_hash != scene.fingerprint:
+    if earlier.data_hash != scene.fingerprint:
         return "the scene's data has changed: running again"
-    measuring = measuring_differences(theirs.config, this.plain)
+    measuring = measuring_differences(earlier.config, this.plain)
     if measuring:
         again = "measured again" if _is_trained(this, scene) else "its checkpoint is gone: running again"
         return f"what is measured is another ({listed(measuring)}): {again}"
@@ -74,9 +74,9 @@ def _outdated(this: Run, scene: Scene, record: Record) -> str:
 
 def _lacks_lpips(this: Run, scene: Scene, record: Record) -> str:
     """Return why an earlier run must be measured again for LPIPS (its weights were added); "" if its record is kept."""
-    camera, given = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
+    camera, weights = evaluated_views(scene, this.config.scene.eval_split)[0].camera, lpips_weights(this.config)
     new = [name for name, known in perceptual.BACKBONES.items()
-           if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, given.get(name))
+           if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, weights.get(name))
            and min(camera.width, camera.height) >= known.least_side]  # fmt: skip
     if not new:
         return ""

@@ -87,7 +87,7 @@ def _text(line: Line) -> str:
 
 def _read(path: Path) -> dict[Point, Line]:
     """Read the lines of a curve.jsonl by their points; lines that are no JSON of a point are left out."""
-    found = {}
+    lines_by_point = {}
     try:
         lines = read_file(path, str(path), LARGEST).splitlines()
     except InputError:  # there is none yet
@@ -96,8 +96,8 @@ def _read(path: Path) -> dict[Point, Line]:
         with contextlib.suppress(InputError, KeyError, TypeError):
             read = parse_json(text, str(path))
             point = Point(read["iteration"], read["seconds"], read["psnr_val"])
-            found[point] = _line(point, _number(read["loss"]), _number(read["gaussians"]))
-    return found
+            lines_by_point[point] = _line(point, _number(read["loss"]), _number(read["gaussians"]))
+    return lines_by_point
 
 
 def _number(value: Any) -> Any:

@@ -55,31 +55,31 @@ def run(composed: DictConfig, choices: Mapping[str, str] | None = None, override
     this = identify(composed, choices, overrides)
     check_folder(this.folder)
     trackers.check(this.config.log)
-    mine, attempt, record = Progress(this.overrides), Attempt(this), None
+    process, attempt, record = Progress(this.overrides), Attempt(this), None
     try:
-        if not _is_claimed(this, mine):
+        if not _is_claimed(this, process):
             return None
         (this.folder / progress.STOPPED).unlink(missing_ok=True)
         remove_leftovers(this.folder)
         record = _done(attempt)
     except Stopped:
-        claim.release(this.folder, mine, is_stopped=True)
+        claim.release(this.folder, process, is_stopped=True)
         raise
     finally:
-        claim.release(this.folder, mine)
+        claim.release(this.folder, process)
         if attempt.log is not None:
             attempt.log.end(record)
     return record
 
 
-def _is_claimed(this: Run, mine: Progress) -> bool:
+def _is_claimed(this: Run, process: Progress) -> bool:
     """Claim a run for this process; if another process does the run, print a message and return False.
 
     Raises:
         InputError: the claim cannot be written.
     """
     try:
-        other = claim.take(this.folder, mine)
+        other = claim.take(this.folder, process)
     except OSError as error:
         raise InputError(f"{this.folder}: the run cannot be claimed: {one_line(error)}") from None
     if other is not None:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsbench.errors import InputError, did_you_mean, one_line
-from gsbench.extras import how_to_install
+from gsbench.errors import InputError, did_you_mean, how_to_install, one_line
 from gsbench.measure.atomic import write_atomically
 
 ID_FILE = "tracker.txt"  # in the run's folder: the id that the tracker gave the run, so that a resumed run continues it
@@ -102,8 +101,8 @@ class MLflow:
         self.client: Any = mlflow.MlflowClient()
         self.id = _read_id(subject)
         if self.id is None:
-            found = self.client.get_experiment_by_name(subject.experiment)
-            experiment = found.experiment_id if found else self.client.create_experiment(subject.experiment)
+            known = self.client.get_experiment_by_name(subject.experiment)
+            experiment = known.experiment_id if known else self.client.create_experiment(subject.experiment)
             self.id = str(self.client.create_run(experiment, run_name=subject.name).info.run_id)
             values = [(key, str(value)[:LONGEST_PARAMETER]) for key, value in subject.settings.items()]
             for i in range(0, len(values), MOST_PARAMETERS):
@@ -186,5 +185,5 @@ def _read_id(subject: Subject) -> str | None:
     return text if re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) else None
 
 
-def _write_id(subject: Subject, found: str) -> None:
-    write_atomically(subject.folder / ID_FILE, found.encode(), lasting=False)
+def _write_id(subject: Subject, number: str) -> None:
+    write_atomically(subject.folder / ID_FILE, number.encode(), lasting=False)

@@ -7,8 +7,7 @@ import time
 import warnings
 from pathlib import Path
 
-from gsbench.errors import InputError, one_line
-from gsbench.extras import how_to_install
+from gsbench.errors import InputError, how_to_install, one_line
 from gsbench.process.ending import end_with
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gsbench.process import control_group, memory
+from gsbench.process import memory
 
 V2 = "30 20 0:26 {root} /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw\n"
 V1 = (
@@ -32,7 +32,7 @@ def test_a_nested_group_of_version_2_limits(tmp_path: Path) -> None:
         **{"slurm__job 7__memory_of_max": "1000\n", "slurm__job 7__memory_of_current": "600\n",
            "slurm__job 7__memory_of_stat": "anon 500\ninactive_file 50\n"},
     )  # fmt: skip
-    assert control_group.available(root) == 450
+    assert memory.left_by_control_groups(root) == 450
 
 
 def test_a_group_above_that_leaves_less_decides(tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_a_group_above_that_leaves_less_decides(tmp_path: Path) -> None:
         a__memory_of_max="1000", a__memory_of_current="1200", a__memory_of_stat="inactive_file 50\n",
         a__b__memory_of_max="5000", a__b__memory_of_current="20", a__b__memory_of_stat="",
     )  # fmt: skip
-    assert control_group.available(root) == 0
+    assert memory.left_by_control_groups(root) == 0
 
 
 @pytest.mark.parametrize("path", ["/docker/abc/job", "/docker/abc/../../job", "/elsewhere"])
@@ -50,7 +50,7 @@ def test_a_mount_of_a_part_of_the_groups(path: str, tmp_path: Path) -> None:
     """Catches a container that has its own group at the top of its mount, under the path of the host."""
     files = {"memory_of_max": "100", "memory_of_current": "40", "memory_of_stat": ""}
     root = tree(tmp_path, f"0::{path}\n", V2.format(root="/docker/abc"), **files)
-    assert control_group.available(root) == 60
+    assert memory.left_by_control_groups(root) == 60
 
 
 def test_version_1(tmp_path: Path) -> None:
@@ -62,26 +62,26 @@ def test_version_1(tmp_path: Path) -> None:
         memory__jobs__3__memory_of_limit_in_bytes="2000", memory__jobs__3__memory_of_usage_in_bytes="500",
         memory__jobs__3__memory_of_stat="inactive_file 5\ntotal_inactive_file 100\n",
     )  # fmt: skip
-    assert control_group.available(root) == 1600
+    assert memory.left_by_control_groups(root) == 1600
 
 
 @pytest.mark.parametrize("text", ["", "\n", "0", "0::", ":::::\n", "x\0y", "4:memory\n", "9" * 5000, "- - - - - -\n",
                                   "1 2 3 - cgroup2\n", "a - cgroup\n", " - \n"])  # fmt: skip
 def test_files_that_are_something_else_limit_nothing(text: str, tmp_path: Path) -> None:
     """Catches a run that ends because a system writes these files in another way."""
-    assert control_group.available(tree(tmp_path, text, V2.format(root="/") + V1.format(root="/"))) is None
+    assert memory.left_by_control_groups(tree(tmp_path, text, V2.format(root="/") + V1.format(root="/"))) is None
     files = {"memory_of_max": text, "memory_of_current": text, "memory_of_stat": text}
-    assert control_group.available(tree(tmp_path, "0::/\n", V2.format(root="/"), **files)) is None
+    assert memory.left_by_control_groups(tree(tmp_path, "0::/\n", V2.format(root="/"), **files)) is None
     limited = {"memory_of_max": "100", "memory_of_current": "40", "memory_of_stat": ""}
     for mounts in (text, text + V2.format(root="/")):
         tree(tmp_path, "0::/\n4:memory:/\n", mounts, **limited)
-        control_group.available(tmp_path)
+        memory.left_by_control_groups(tmp_path)
     (tmp_path / "proc/self/mountinfo").write_bytes(b"\xff\xfe")
-    assert control_group.available(tmp_path) is None
-    assert control_group.available(tmp_path / "nothing") is None
+    assert memory.left_by_control_groups(tmp_path) is None
+    assert memory.left_by_control_groups(tmp_path / "nothing") is None
 
 
 def test_the_group_counts_in_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a limit that is read and not used."""
-    monkeypatch.setattr(control_group, "available", lambda: 12345)
+    monkeypatch.setattr(memory, "left_by_control_groups", lambda: 12345)
     assert memory.available() == 12345

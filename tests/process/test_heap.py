@@ -7,7 +7,7 @@ import sys
 import pytest
 from tiny_run import ROOT
 
-from gsbench.process.heap import OPTIONS
+from gsbench.process.start import OPTIONS
 
 pytestmark = pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="another malloc than glibc's")
 

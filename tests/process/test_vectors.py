@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_run import ROOT
 
-from gsbench.process import vectors
+from gsbench.process import start
 
 ASK = "import torch; print(torch.backends.cpu.get_cpu_capability()); torch.ones(64, 64) @ torch.ones(64, 64)"
 HAS_MKL = "mkl" in torch.__config__.show().lower()
@@ -17,13 +17,13 @@ HAS_MKL = "mkl" in torch.__config__.show().lower()
 
 def printed(imports: str, **variables: str) -> str:
     """What torch and MKL print of their vectors in a new process, whose environment chooses none but by `variables`."""
-    plain = {name: value for name, value in os.environ.items() if name not in (vectors.TORCH, vectors.MKL)}
+    plain = {name: value for name, value in os.environ.items() if name not in (start.TORCH, start.MKL)}
     command = [sys.executable, "-c", f"{imports}; {ASK}"]
     environment = plain | {"MKL_VERBOSE": "1"} | variables
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=True).stdout
 
 
-@pytest.mark.skipif(not vectors._has_avx512() and not HAS_MKL, reason="needs a processor with AVX-512, or MKL")
+@pytest.mark.skipif(not start._has_avx512() and not HAS_MKL, reason="needs a processor with AVX-512, or MKL")
 def test_vectors_are_chosen_as_gsbench_is_imported() -> None:
     """Catches a setting that comes after torch or MKL has read it, a variable that they do not know, and one that is
     set over the user's."""
@@ -33,7 +33,7 @@ def test_vectors_are_chosen_as_gsbench_is_imported() -> None:
         ("import gsbench", "AVX512", "CNR:COMPATIBLE", {"ATEN_CPU_CAPABILITY": "avx512"}),
     ):
         text = printed(imports, **variables)
-        assert not vectors._has_avx512() or capability in text.splitlines()
+        assert not start._has_avx512() or capability in text.splitlines()
         assert not HAS_MKL or code in text
 
 
@@ -48,10 +48,10 @@ def test_nothing_is_set_without_avx512(
     info = tmp_path / "cpuinfo"
     if flags:
         info.write_text(f"processor\t: 0\nflags\t\t: {flags}\n")
-    monkeypatch.setattr(vectors, "CPUINFO", info)
-    for variable in (vectors.TORCH, vectors.MKL):
+    monkeypatch.setattr(start, "CPUINFO", info)
+    for variable in (start.TORCH, start.MKL):
         monkeypatch.setenv(variable, "of before")  # so that the end of the test undoes what it sets
         monkeypatch.delenv(variable)
-    vectors.compute_the_same_bits()
-    assert os.environ.get(vectors.TORCH) == wanted
-    assert os.environ[vectors.MKL] == "COMPATIBLE"
+    start.compute_the_same_bits()
+    assert os.environ.get(start.TORCH) == wanted
+    assert os.environ[start.MKL] == "COMPATIBLE"
