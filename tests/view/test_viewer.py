@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_frame import camera_of, renderer
+from test_viewer_frame import camera_of, renderer
 
 from gsbench.view.__main__ import main
 from gsbench.view.controls import ONE, SIDE, WIPE, _is_rgb
