@@ -24,7 +24,7 @@ for _hook in pkgutil.iter_modules([str(HERE / "train" / "hooks")]):
 
 @dataclass
 class DataConfig:
-    """Describe a data set; an experiment (`+exp=`) sets these keys."""
+    """Describe a data set, as an experiment does."""
 
     dataset: str = key(REQUIRED, "name in tables", role="measuring")
     paper_dataset: str | None = key(None, "name in the paper", role="measuring")
@@ -34,8 +34,8 @@ class DataConfig:
     repair: list[str] | None = key(None, "damaged images, replaced by the frame before")
     background: str = key("black", "background of images", choices=("black", "white"))
     initial_lambda: float = key(0.5, "initial lambda_t and lambda_d of 7DGS")
-    initial_points: int = key(100_000, "random points, where data have none", low=4)
-    initial_half_width: float | None = key(1.3, "of the cube of random points; null: what all cameras see",
+    initial_points: int = key(100_000, "random points, if needed", low=4)
+    initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see",
                                            low=1e-6, high=1e6)  # fmt: skip
 
 
@@ -76,9 +76,9 @@ class ModelConfig:
 
     name: str = key(REQUIRED, "the model's class")
     module: str | None = key(None, "Python module of your model")
-    published_with_agr: bool = key(False, "whether the published method has AGR")
+    published_with_agr: bool = key(False, "as its authors published it")
     agr: bool = key("${.published_with_agr}", "default of the key agr")
-    agr_octaves: int = key(4, "octaves of AGR's time encoding", low=0, high=32)
+    agr_octaves: int = key(4, "octaves of AGR's times", low=0, high=32)
     sh_degree: int = key(3, "SH degree", low=0, high=3)
     min_opacity: float = key(0.005, "Gaussians of lower opacity are pruned", low=0, high=0.25)  # resets: to twice it
     gate: str = key("off", "default of effects.gate", role="place", choices=("off", "end", "both"))
@@ -139,7 +139,7 @@ class ProtocolConfig:
     """Choose how results are measured."""
 
     name: str = key(REQUIRED, "gsbench, published or dgs2026")
-    quantise: bool = key(False, "round renders to 8 bits")
+    quantise: bool = key(False, "renders in 8 bits")
     best_on_test: bool = key(False, "record the best test PSNR (a leak)", role="training")  # while it trains
     lpips_alex: str | None = key(None, "AlexNet's weights; null: in $TORCH_HOME/hub/checkpoints", role="place")
     lpips_vgg: str | None = key(None, "VGG16's weights", role="place")  # checked by their hash

@@ -176,7 +176,7 @@ def _compared(parts: Candidates, resolved: Resolved) -> Trainer:
         steps = (len(parts.settings) - 1) * until + config.train.iterations
         results.append(parts.train(name, until, results, steps))
     chosen = best(results)
-    comparison = ModelComparison(chosen.steps, chosen.found.name, [result.found for result in results])
+    comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
     print(f"{parts.this.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
     trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
     trainer.hook(Choices).chosen.comparison = comparison

@@ -85,13 +85,13 @@ class Candidates:
         Raises:
             InputError: the checkpoint is gone or damaged.
         """
-        run, trainer = self._run(chosen.found.name), self.trainer(chosen.found.name)
+        run, trainer = self._run(chosen.candidate.name), self.trainer(chosen.candidate.name)
         state = fitting.saved_state(replace(run, config=replace(run.config, resume=True)), self.scene)
         if state is None:
             raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
         trainer.load_state_dict(state)
         others = [result for result in results if result is not chosen]
-        seconds = sum(other.found.seconds for other in others)
+        seconds = sum(other.candidate.seconds for other in others)
         trainer.stages.add("compare", seconds)
         if screen is not None:
             trainer.stages.add("screen", screen.seconds)
@@ -115,7 +115,7 @@ class Candidates:
             Stopped: a signal asked the process to end; the checkpoint is saved.
         """
         this, run, trainer = self.this, self._run(name), self.trainer(name)
-        done, seconds = sum(one.steps for one in before), sum(one.found.seconds for one in before)
+        done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
         error = None
         try:
             fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
@@ -140,7 +140,7 @@ class Candidates:
 class Result:
     """What the training of a candidate gave, and what it cost."""
 
-    found: Candidate
+    candidate: Candidate
     steps: int  # after which its PSNR on val is measured
     effort: Effort
     error: DivergedError | fitting.NoGaussianError | None = None  # why the training failed
@@ -148,12 +148,12 @@ class Result:
     @property
     def rank(self) -> tuple[bool, float]:
         """Return the value by which candidates are compared: none that failed is above one that did not."""
-        return self.error is None, rank(self.found.psnr_val)
+        return self.error is None, rank(self.candidate.psnr_val)
 
 
 def highest(results: Sequence[Result]) -> Result:
     """Return the result with the highest PSNR on val, the last of equal ones, which may be one that failed."""
-    return max(reversed(results), key=lambda one: one.rank)
+    return max(reversed(results), key=lambda result: result.rank)
 
 
 def best(results: Sequence[Result]) -> Result:
@@ -164,5 +164,7 @@ def best(results: Sequence[Result]) -> Result:
     """
     top, first = highest(results), results[0]
     if top.error is not None and first.error is not None:
-        raise type(first.error)(f"all {len(results)} candidates failed; {first.found.name}: {first.found.reason}")
+        raise type(first.error)(
+            f"all {len(results)} candidates failed; {first.candidate.name}: {first.candidate.reason}"
+        )
     return top

@@ -55,13 +55,13 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist. Hydra has
             already refused unknown keys and wrong types.
     """
-    for name in (one.name for one in fields(Config)):
-        if name not in composed:
-            raise _deleted(name)
+    for key in fields(Config):
+        if key.name not in composed:
+            raise _deleted(key.name)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
-    for key, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
+    for dotted, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
         if name == records.PUBLISHED:
-            raise InputError(f"{key}: expected another name than {name!r}: tables pass by a folder of this name")
+            raise InputError(f"{dotted}: expected another name than {name!r}: tables pass by a folder of this name")
     plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     if not config.results:
         raise InputError("results: expected a folder, got '': results=. is this one")
@@ -136,7 +136,7 @@ def _storable(value: Any) -> Any:
     A run with such values is refused, and its record shows the text.
     """
     if isinstance(value, dict):
-        return {key: _storable(one) for key, one in value.items()}
+        return {key: _storable(member) for key, member in value.items()}
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     return value if not isinstance(value, int) or abs(value) < 2**63 else str(value)

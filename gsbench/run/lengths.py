@@ -74,7 +74,7 @@ def _best(parts: Candidates, resolved: Resolved) -> Trainer:
         if top is not results[-1] and top.error is None:
             break
     chosen = best(results)
-    choice = LengthChoice(chosen.steps, [one.found for one in results])
+    choice = LengthChoice(chosen.steps, [one.candidate for one in results])
     print(f"{parts.this.name}: {messages.of_lengths(choice)}", file=sys.stderr)
     trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
     trainer.hook(Choices).chosen.length = choice

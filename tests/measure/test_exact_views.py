@@ -118,7 +118,7 @@ def test_the_last_of_equal_candidates_is_taken(scores: list[float | None], chose
     failed = result("failed", None, DivergedError("step 5"))
     assert highest([*results, failed]) is results[chosen]
     with pytest.raises(DivergedError, match="all 2 candidates failed; failed: step 5"):
-        best([failed, replace(failed, found=replace(failed.found, name="other"))])
+        best([failed, replace(failed, candidate=replace(failed.candidate, name="other"))])
 
 
 @pytest.fixture(scope="module")
