@@ -118,7 +118,7 @@ class Trainer:
                 self.step += 1
                 bar.update()
                 # The bar shows the seconds of the last measurement: the clock itself waits for a GPU when it is read.
-                loss = f"loss {self.finite_check.loss:.4f}"
+                loss = f"loss {self.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
                 if measured and any(hook.stops(self.step) for hook in self.hooks):
                     self.step = train.iterations
@@ -170,6 +170,11 @@ class Trainer:
         for hook in self.hooks:
             val = hook.after_measuring(self.step + 1, val)
         self.curve.add(self.step + 1, sum(self.stages.seconds.values()), val)
+
+    @property
+    def loss(self) -> float:
+        """Return the loss of the last step; on a GPU of one at most 50 steps before."""
+        return self.finite_check.loss
 
     def report(self, text: str) -> None:
         """Print a line above the progress bar."""

@@ -43,6 +43,7 @@ class Training(Protocol):
     stages: StageClock
     effort: Effort
     curve: Curve
+    loss: float  # of the present step; on a GPU of one at most 50 steps before
     step: int  # the present step, counted from 0; between steps the number of finished steps
 
     def report(self, text: str) -> None:

@@ -1,0 +1,90 @@
+"""What a model brings to a training of its own: a network, a penalty, a static first stage, and points with times."""
+
+import copy
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from test_wiring import trainer
+from tiny_training import compose, moving_square
+from torch import Tensor, nn
+
+from gsbench.config import LearningRate
+from gsbench.models import Query
+from gsbench.models.base import Raw
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.sliced import Conditioned
+from gsbench.scenes import Points
+from gsbench.schedule import Schedule
+from gsbench.train.hooks.average import Average
+from gsbench.train.loop import Trainer
+from gsbench.train.seeding import generator
+
+
+class Deformed(Gaussians3DModel):
+    """3DGS whose means a network moves over time, except in its warm-up."""
+
+    observes: ClassVar[tuple[str, ...]] = ("time",)
+    warm_up = 9_000
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.field = nn.Linear(1, 3)
+        self.started_at: Tensor | None = None
+        nn.init.zeros_(self.field.weight)
+        nn.init.zeros_(self.field.bias)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        return super().groups() | {"field": list(self.field.parameters())}
+
+    def penalties(self) -> Any:
+        return [(0.5, lambda query, index: self.field.weight.square().sum() - self.field.bias[0])]
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        self.started_at = points.times
+        return super().initial_geometry(points, distances, generator)
+
+    def condition(self, raw: Raw, query: Query) -> Conditioned:
+        assert query.time is not None
+        time = torch.as_tensor(query.time).reshape(1)
+        moved = raw if self.active.warms_up else raw | {"means": raw["means"] + self.field(time)}
+        return self.static(moved)
+
+    slice_geometry = Gaussians3DModel.__mro__[1].slice_geometry  # type: ignore[attr-defined]
+
+
+def deformed(*words: str) -> Trainer:
+    config = compose("3dgs", 100, "effects.gate=off", *words)
+    config.model.lr["field"] = LearningRate(1e-2)
+    model, square = Deformed(), moving_square()
+    assert square.points is not None
+    points = replace(square.points, times=torch.linspace(0, 1, len(square.points.means)))
+    model.initialise(points, square.extent, generator(0))
+    return Trainer(model, replace(square, val=square.train[:3]), square.train[3:5], config)
+
+
+def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times() -> None:
+    """Catches a network that never learns or that a checkpoint lacks, a penalty that no step has, and no first stage."""
+    whole = deformed()
+    model: Any = whole.model
+    assert model.started_at.shape == (len(model),)
+    whole.run(lambda _: None, "warm-up", lambda: whole.step < 30)
+    assert model.active.warms_up
+    assert not model.field.weight.any(), "the penalty alone has no gradient by a weight of zero"
+    assert model.field.bias[0] > 0.1, "the penalty has a gradient in the warm-up"
+    state = copy.deepcopy(whole.state_dict())
+    whole.run(lambda _: None, "rest")
+    assert not model.active.warms_up
+    assert model.field.weight.any()
+    resumed = deformed()
+    resumed.load_state_dict(state)
+    resumed.run(lambda _: None, "resumed")
+    assert all(torch.equal(x, resumed.model.pack()[name]) for name, x in whole.model.pack().items())
+
+
+def test_a_warm_up_is_not_an_end() -> None:
+    """Catches an early stop that keeps a static first stage."""
+    schedule = Schedule(compose("3dgs", 100, "train.sh_every=1").train, 0, False, warm_up=9_000)
+    assert [step for step in range(100) if not schedule.is_complete(step)] == list(range(30))
+    assert trainer("3dgs").hook(Average).results() == {"averaged": 0}
