@@ -1,7 +1,7 @@
 """Compute at which steps of a training something happens (densification, opacity resets, SH degree, resolution).
 
-The settings give step numbers for a training of 30,000 iterations. They are scaled to the length of the actual
-training. This module does not import torch, because reports use it too.
+The settings give steps for a training of `recipe_iterations` (30,000) iterations. They are multiplied by
+iterations / recipe_iterations. This module does not import torch, because reports use it too.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MOST_ROUNDS = 36
 
 # The step, in a run of 30,000, after which Gaussians with small blend weights are removed, if densification is over.
 THIN = 15_600
-# The step, in a run of 30,000, after which Gaussians are made independent of time, direction or AGR, if densification
-# is over and STEPS_TO_RECOVER steps are left. With 120 steps left of 300, PSNR was 0.4 dB lower.
+# The step, in a run of 30,000, after which a gate simplifies Gaussians, if densification is over and STEPS_TO_RECOVER
+# steps are left. With 120 steps left of 300, PSNR was 0.4 dB lower.
 GATE = 18_000
 STEPS_TO_RECOVER = 300
 # The share of the steps after which model=auto compares its candidates on val (effects.compare). The number of
@@ -44,20 +44,12 @@ class ActiveComponents:
 
 
 class Schedule:
-    """Tell what happens at each step of a training.
-
-    The settings give step numbers for a training of `recipe_iterations` (30,000) iterations. For a training of another
-    length, they are multiplied by iterations / recipe_iterations.
-    """
+    """Say what happens at each step of a training, counted from 0."""
 
     def __init__(self, config: TrainConfig, sh_degree: int, agr: bool, warm_up: int = 0) -> None:
-        """Convert the step numbers in the settings, given for `recipe_iterations` iterations, to steps of this run.
+        """Convert the steps in the settings, given for `recipe_iterations` iterations, to steps of this run.
 
-        Args:
-            config: the settings of the training.
-            sh_degree: the final SH degree of the model.
-            agr: whether the model has AGR, the neural refinement.
-            warm_up: the step at which the warm-up of the model ends; 0: it has none.
+        `sh_degree` is the final SH degree, and `warm_up` the step at which the model's warm-up ends; 0: it has none.
         """
         self.config = config
         self.warm_up = self.scaled(warm_up) if warm_up else 0
@@ -73,7 +65,7 @@ class Schedule:
         self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
 
     def scaled(self, step: int) -> int:
-        """Scale a step number, given for `recipe_iterations` iterations, to the length of this run; at least 1."""
+        """Scale a step of the settings to the length of this run; at least 1."""
         return max(1, round(step * self.config.iterations / self.config.recipe_iterations))
 
     def active(self, step: int) -> ActiveComponents:
@@ -91,12 +83,12 @@ class Schedule:
         return (now.sh_degree, now.refine, now.warms_up) == (last.sh_degree, last.refine, last.warms_up)
 
     def densifies(self, step: int) -> bool:
-        """Return whether Gaussians are cloned, split and pruned after a step, counted from 0."""
+        """Return whether Gaussians are cloned, split and pruned after a step."""
         done = step + 1
         return self.densify_start < done <= self.densify_stop and done % self.densify_every == 0
 
     def resets(self, step: int) -> bool:
-        """Return whether all opacities are lowered after a step, counted from 0."""
+        """Return whether all opacities are lowered after a step."""
         return step + 1 in self.resets_after
 
     def has_reset(self, step: int) -> bool:
@@ -117,11 +109,7 @@ class Schedule:
         return math.ceil(limit / self.resolution(step) ** (2 - step / self.densify_stop))
 
     def within(self, step: int, start: int, stop: int | None) -> bool:
-        """Return whether a step of this run lies between `start` and `stop`.
-
-        `start` and `stop` are given for `recipe_iterations` iterations, and are scaled to the length of this run. A
-        `stop` of None is the end of the run.
-        """
+        """Return whether a step lies between `start` and `stop` of the settings; a `stop` of None is the end."""
         return self.scaled(start) <= step + 1 and (stop is None or step + 1 <= self.scaled(stop))
 
     def thins(self, step: int) -> bool:
@@ -129,10 +117,7 @@ class Schedule:
         return self.config.densify.thin_to is not None and step + 1 == max(self.scaled(THIN), self.densify_stop)
 
     def gates(self, step: int) -> bool:
-        """Return whether Gaussians are made independent of time, direction or AGR (a network) after a step.
-
-        This is done once after densification, if at least STEPS_TO_RECOVER steps are left.
-        """
+        """Return whether Gaussians are simplified after a step: once, if at least STEPS_TO_RECOVER steps are left."""
         at = max(self.scaled(GATE), self.densify_stop)
         return step + 1 == at and self.config.iterations - at >= STEPS_TO_RECOVER
 

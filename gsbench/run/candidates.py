@@ -17,7 +17,7 @@ from gsbench.run.identity import Run
 from gsbench.run.setup import build
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.hooks.choices import lengths_of
 from gsbench.train.loop import Trainer
 

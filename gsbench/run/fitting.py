@@ -21,10 +21,10 @@ from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen
 from gsbench.scenes.scene import STANDARD
 from gsbench.train import checkpoint
+from gsbench.train.batches import generator
 from gsbench.train.checkpoint import Checkpoint
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
 
 LEAST_SEEN = 0.25  # share of random initial points that cameras must see; others are never trained
 
@@ -34,14 +34,7 @@ class NoGaussianError(InputError):
 
 
 def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None) -> Trainer:
-    """Initialise the Gaussians of a model and return the trainer at step 0.
-
-    Args:
-        model: the model, still without Gaussians.
-        scene: the scene with its views, and with initial points if the data set has some.
-        config: the settings of the run.
-        start: trained Gaussians to start from, in the coordinates of the scene; None to start from points.
-    """
+    """Initialise the Gaussians of a model, from trained ones or from points, and return the trainer at step 0."""
     random = generator(config.seed)
     if start is not None:
         start_from(model, start, scene.extent, random)
@@ -94,7 +87,7 @@ def fit(
     follow: Callable[[], None] = lambda: None,
     until: int | None = None,
 ) -> None:
-    """Train to the last step, or to the step `until`.
+    """Train to the last step, or until so many steps are finished; `follow` is called after every step.
 
     Args:
         trainer: the trainer at its first step.
@@ -102,7 +95,7 @@ def fit(
         plain: the settings as plain values, for the checkpoint.
         reporter: starts to report the progress to other processes, once signals are handled.
         follow: a function that is called after every step.
-        until: the number of finished steps at which the training stops; None for the last step.
+        until: the number of finished steps; None for all.
 
     Raises:
         NoGaussianError: no Gaussian is left.

@@ -44,12 +44,6 @@ def best_length(this: Run, scene: Scene, start: TrainedGaussians | None, resolve
     The result is bit-equal to a run of the chosen length alone. Each length is gated as such a run is, after its PSNR
     on val was measured. The seconds of the time screen and of the other lengths count as training.
 
-    Args:
-        this: the run.
-        scene: the scene, which has val views.
-        start: trained Gaussians to start from; None to start from points.
-        resolved: the settings with the chosen model, and the time screen of model=auto.
-
     Raises:
         InputError: a checkpoint is damaged.
         DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.

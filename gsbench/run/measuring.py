@@ -39,14 +39,7 @@ class Measured:
 
 
 def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
-    """Measure a trained model on the evaluated views.
-
-    Args:
-        trainer: the finished training.
-        config: the settings of the run.
-        with_effect_sets: whether to also draw an image whose colours show which Gaussians depend on time, direction and
-            AGR (a network).
-    """
+    """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
     views = trainer.views
     shown: Pairs = []
     regions = RegionScores(views, config.protocol.quantise)

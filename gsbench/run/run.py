@@ -24,8 +24,7 @@ from gsbench.run.finished import STALE, finished, where
 from gsbench.run.identity import Run, identify
 from gsbench.run.progress import Progress
 from gsbench.run.stop import Stopped
-from gsbench.train.diagnosis import explain
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError, explain
 
 TRACEBACK = "traceback.txt"
 SPARE = 1 << 25  # bytes reserved, so that a run which ends without memory can still write its record

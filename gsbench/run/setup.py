@@ -18,8 +18,8 @@ from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
+from gsbench.train.batches import generator
 from gsbench.train.hooks import hook_types
-from gsbench.train.seeding import generator
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 PACKAGE = "pkg://"  # in front of the module whose files data.root names

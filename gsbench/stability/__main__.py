@@ -22,7 +22,7 @@ from gsbench.run.load import load_run, scene_of
 from gsbench.scenes.gaussian_ply import MAX_DEGREE, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.stability.float32_error import Shot, measure
-from gsbench.train.seeding import generator
+from gsbench.train.batches import generator
 
 VIEWS = 10  # of an orbit
 SIZE = 400  # pixels a side of the images of a PLY

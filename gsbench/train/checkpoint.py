@@ -79,16 +79,7 @@ class _WithFirstError:
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
-    """Read the state of a training from the checkpoint at `path`.
-
-    Args:
-        path: the file.
-        training: the hash of the training's settings.
-        data: the hash of the data set.
-        device: the device of the loaded tensors.
-
-    Returns:
-        The state; None if there is no file, or if the file belongs to other settings or other data.
+    """Read the state of a training with these hashes of its settings and data; None if the file has none of it.
 
     Raises:
         InputError: the file is not a checkpoint, or it is damaged.
@@ -133,11 +124,7 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
 
 
 def check_plain(value: object, most: int) -> None:
-    """Check that a state loaded from a file contains only dictionaries, lists, numbers, strings and dense tensors.
-
-    Args:
-        value: the state.
-        most: the size of the file in bytes; a tensor must not be larger.
+    """Check that a state from a file of `most` bytes has only dictionaries, lists, numbers, text and dense tensors.
 
     Raises:
         InputError: the state contains another type, or a sparse, quantized or too large tensor.
@@ -153,13 +140,13 @@ def check_plain(value: object, most: int) -> None:
             raise InputError(f"checkpoint: expected tensors of at most {most} bytes, as many as the file has, "
                              f"got one of shape {list(value.shape)!s:.80}")  # fmt: skip
     elif isinstance(value, dict):
-        for key, one in value.items():
+        for key, inner in value.items():
             if not isinstance(key, str | int):
                 raise InputError(f"checkpoint: expected names as keys, got {key!r:.80}")
-            check_plain(one, most)
+            check_plain(inner, most)
     elif isinstance(value, list | tuple):
-        for one in value:
-            check_plain(one, most)
+        for inner in value:
+            check_plain(inner, most)
     elif not (value is None or isinstance(value, str | int | float)):
         raise InputError(f"checkpoint: expected containers, numbers, text and tensors, got {type(value).__name__}")
 
@@ -172,16 +159,10 @@ def without_times(state: Any) -> Any:
 
 
 def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Return a contiguous tensor from the state in a checkpoint, after checking its shape and dtype.
-
-    Args:
-        state: a dictionary from the checkpoint; any other object raises InputError.
-        name: the key of the tensor.
-        shape: the required shape.
-        dtype: the required dtype.
+    """Return `state[name]` of a checkpoint as a contiguous tensor.
 
     Raises:
-        InputError: the tensor is missing, or its shape or dtype is different.
+        InputError: it is none, or has another shape or dtype.
     """
     value = state.get(name) if isinstance(state, dict) else None
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.device.type == "meta":

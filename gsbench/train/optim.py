@@ -39,14 +39,7 @@ class Optimizer:
     def __init__(
         self, model: GaussianModel, config: ModelConfig, train: TrainConfig, extent: float, kind: str = "adam"
     ) -> None:
-        """Make an Adam parameter group with a learning rate for each group of the model's parameters.
-
-        Args:
-            model: the initialised model.
-            config: the config of the model, with the learning rates.
-            train: the config of the training, with its number of iterations.
-            extent: the radius of the scene, world units.
-            kind: `adam` or `sparse_adam`.
+        """Make an Adam parameter group for each group of an initialised model; `extent` is the radius of the scene.
 
         Raises:
             InputError: a parameter has no learning rate, or a learning rate has no parameter.
@@ -81,8 +74,8 @@ class Optimizer:
         On a GPU nothing is updated if an earlier gradient was not finite (`skip` is 1).
 
         Args:
-            step: the number of the step, counted from 0; it determines the learning rates.
-            drawn: which Gaussians are visible in the batch, [N] bool; only `sparse_adam` needs it.
+            step: the step, which determines the learning rates.
+            drawn: which Gaussians are visible in the batch; only `sparse_adam` needs it.
             factors: factors of the learning rates, by group.
         """
         rates = self.rates_at(step, factors)
@@ -152,13 +145,7 @@ class Optimizer:
         parameter.grad = None
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder Adam's moments after Gaussians were pruned, cloned or split.
-
-        Args:
-            rows: for each Gaussian after the change, the index (before the change) of the Gaussian whose moments it
-                takes, [M].
-            fresh: which Gaussians are new, [M] bool; their moments become zero.
-        """
+        """Reorder Adam's moments, see `gsbench.train.hooks.Hook.reindex`; those of new Gaussians become zero."""
         for parameter in self.model.splats.values():
             state = self.moments.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):

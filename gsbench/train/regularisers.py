@@ -14,8 +14,8 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel, Query
 from gsbench.scenes import View
+from gsbench.train.batches import generator
 from gsbench.train.checkpoint import MOST_STEPS, tensor, whole_number
-from gsbench.train.seeding import generator
 
 NEIGHBOURS = 8
 SAMPLES = 8_192  # the most Gaussians in B
@@ -59,11 +59,9 @@ class Penalty(ABC):
         return
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for the checkpoint."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state; raise InputError if it belongs to another training."""
         return
 
 
@@ -144,11 +142,9 @@ class Strain(Penalty):
         self.neighbours = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the neighbours and the step at which they were searched."""
         return {} if self.neighbours is None else {"searched": self.searched, "neighbours": self.neighbours}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the neighbours from a checkpoint; raises InputError if they belong to another training."""
         self.neighbours = None
         if state:
             self.searched = whole_number("strain", state.get("searched"), MOST_STEPS)

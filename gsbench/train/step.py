@@ -17,7 +17,7 @@ from gsbench.models import GaussianModel, Query
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.hooks import LossTerm
 from gsbench.train.losses import photometric
 from gsbench.train.step_replay import Observed, Stages, StepReplay
@@ -57,14 +57,8 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
 
     Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
     inside a half, each of the thread's views in this half has its own dictionary. `add_up` adds all dictionaries in the
-    order of the views, so the total has the same bits for any number of threads.
-
-    Args:
-        views: the number of views in the batch.
-        bounds: thread i renders the views from bounds[i] to bounds[i + 1].
-
-    Returns:
-        The dictionary of each view; views that share a sum have the same object.
+    order of the views, so the total has the same bits for any number of threads. Thread i renders the views from
+    bounds[i] to bounds[i + 1].
     """
     sums: list[Sums] = []
     begins = 0  # first view of the half, or of the thread, that view i belongs to
@@ -117,16 +111,7 @@ class Step:
     def __init__(
         self, model: GaussianModel, background: Tensor, ssim_weight: float, antialias: bool, stages: StageClock
     ) -> None:
-        """Store the settings of the training steps.
-
-        Args:
-            model: the model.
-            background: the background colour, [3].
-            ssim_weight: the weight w of 1 - SSIM in the loss.
-            antialias: whether to scale opacities by the 2D filter of Mip-Splatting.
-            stages: a clock that sums the seconds of each stage (conditional Gaussians, rasterization, loss, backward
-                pass).
-        """
+        """Store the background colour [3], the weight w of 1 - SSIM in the loss, and a clock of the stages."""
         self.model = model
         self.parameters = list(model.parameters())
         self.background = background
@@ -137,16 +122,9 @@ class Step:
         self._replay: StepReplay[ViewResult] = StepReplay()
 
     def __call__(self, views: Sequence[View], terms: Sequence[LossTerm] = ()) -> list[ViewResult]:
-        """Render `views` and store the gradient of the loss in the model's parameters.
+        """Render a batch of views and store the gradient of the loss in the model's parameters.
 
         The loss is the mean over views of the photometric loss plus weighted terms.
-
-        Args:
-            views: the views of the batch.
-            terms: pairs (weight, term) that are added to the loss of each view.
-
-        Returns:
-            The loss and the gradients of the 2D means for each view.
 
         Raises:
             DivergedError: a 3D Gaussian of a view has a value that is not finite.

@@ -115,7 +115,7 @@ class StepReplay(Generic[Result]):
             of_all: calls a function for each index of a view, and returns the results.
         """
         observed = [Observed.of(view) for view in views]
-        signature = None if signature is None else (signature, *[one.signature for one in observed])
+        signature = None if signature is None else (signature, *[view.signature for view in observed])
         is_new = signature is None or signature != self._signature
         if is_new:
             self._signature, self._recorded, self._is_repeatable = signature, {}, True
@@ -127,15 +127,15 @@ class StepReplay(Generic[Result]):
                 self._recorded = {}
         if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: see(index, observed[index], stages))
-        made: dict[int, _Recorded[Result]] = {}
+        recordings: dict[int, _Recorded[Result]] = {}
 
         def record(index: int, stages: Stages) -> Result:
-            own, work = observed[index].copy(), _StagedRecording(stages)
-            made[index] = _Recorded(own, work, see(index, own, work))
-            return made[index].result
+            copied, work = observed[index].copy(), _StagedRecording(stages)
+            recordings[index] = _Recorded(copied, work, see(index, copied, work))
+            return recordings[index].result
 
         results = of_all(record)
-        self._is_repeatable = all(one.work.is_repeatable for one in made.values())
+        self._is_repeatable = all(recorded.work.is_repeatable for recorded in recordings.values())
         if self._is_repeatable:
-            self._recorded = made
+            self._recorded = recordings
         return results

@@ -23,11 +23,11 @@ from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train import gating
+from gsbench.train.batches import generator
 from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become, shape_of
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import NO_FACTORS
 from gsbench.train.renderer import Renderer
-from gsbench.train.seeding import generator
 
 STEPS = 100
 

@@ -22,9 +22,9 @@ from gsbench.run.regate import gate_run
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
+from gsbench.train.batches import generator
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
 
 SAMPLE, ALL = 40, 500
 

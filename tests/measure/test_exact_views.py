@@ -25,7 +25,7 @@ from gsbench.measure.record import Record, ViewScore
 from gsbench.measure.speed import Effort
 from gsbench.run.candidates import Candidate, Result, best, highest
 from gsbench.run.setup import build
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
 
 AWAY = [[1, 0, 0, 0], [0, 0, -1, 9], [0, 1, 0, 0], [0, 0, 0, 1]]  # looks away from the scene: renders the background

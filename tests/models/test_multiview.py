@@ -15,6 +15,7 @@ from gsbench.models import GaussianModel, Query, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.setup import build as build_for
 from gsbench.scenes.scene import Points, View
+from gsbench.train.batches import generator
 from gsbench.train.density.multiview import LEAST_IMPORTANCE, VIEWS, ErrorScore, MultiviewDensification, drawn_once
 from gsbench.train.density.rule import Scores
 from gsbench.train.hooks.minimum_sizes import MinimumScale
@@ -22,7 +23,6 @@ from gsbench.train.loop import Trainer
 from gsbench.train.losses import photometric
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
-from gsbench.train.seeding import generator
 
 GREY = torch.tensor([0.2, 0.3, 0.4])
 NAMES = ("3dgs", "4dgs", "6dgs", "7dgs", "dgs", "freetime")

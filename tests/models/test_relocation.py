@@ -10,9 +10,9 @@ from small import CAMERA, moved, started
 
 from gsbench.config import DensifyConfig
 from gsbench.models import GaussianModel, Query, build
+from gsbench.train.batches import generator
 from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
-from gsbench.train.seeding import generator
 
 NAMES = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
          "ndgs": {"lambda_t": 0.5, "lambda_d": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip

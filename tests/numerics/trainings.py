@@ -22,10 +22,9 @@ from gsbench.run.setup import build, load_scene
 from gsbench.scenes.points import random_points
 from gsbench.scenes.scene import Points, Scene, View
 from gsbench.stability.float64_render import float64_camera
-from gsbench.train.diagnosis import explain
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.batches import generator
+from gsbench.train.divergence import DivergedError, explain
 from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
 from numerics.cases import Case, Cell, case, device_of
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs")

@@ -20,7 +20,7 @@ from gsbench.run.candidates import FOLDER
 from gsbench.run.identity import Run
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
 
 STEPS, UNTIL = 30, 21  # of a run, and until the comparison

@@ -20,7 +20,7 @@ from gsbench.run.candidates import FOLDER
 from gsbench.run.lengths import lengths
 from gsbench.run.setup import build
 from gsbench.scenes import View
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
 
 OTHERS = ("model=7dgs", "train.curve_points=2", "train.checkpoint_minutes=0", "protocol.pictures=0")

@@ -13,7 +13,7 @@ from tiny_scene import COUNTS, edit, write_png
 from gsbench import scenes
 from gsbench.errors import InputError
 from gsbench.scenes import images
-from gsbench.train.pyramid import reduced
+from gsbench.train.batches import reduced
 
 MUJOCO = Path(__file__).resolve().parents[2] / "../shared/data/mujoco"
 NUMBERS = np.arange(48, dtype=np.uint8).reshape(6, 8)  # of the tiny scene's size

@@ -13,11 +13,11 @@ from tiny_training import compose, moving_square
 
 from gsbench import models
 from gsbench.scenes import View
-from gsbench.train import checkpoint, diagnosis
+from gsbench.train import checkpoint, divergence
+from gsbench.train.batches import generator
 from gsbench.train.checkpoint import Checkpoint
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
 from gsbench.train.step import ViewResult
 
 POISONED = 7
@@ -57,7 +57,7 @@ def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> Non
     path = tmp_path / "checkpoint.pt"
     with contextlib.redirect_stderr(io.StringIO()), pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
         run.run(lambda state: checkpoint.save(path, Checkpoint("training", "data", state)), "poisoned")
-    assert diagnosis.explain(run.model) == (
+    assert divergence.explain(run.model) == (
         "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all): it resembles the stability case 'static'"
     )
     assert all(p.isfinite().all() for p in run.model.parameters())
@@ -86,20 +86,20 @@ def test_resemblance(name: str) -> None:
     parameter, at, value = CHANGES[name]
     model.splats[parameter].data[POISONED, at] = value
     assert name in audit.CASES
-    assert diagnosis.resembles(model, POISONED) == name
-    assert diagnosis.resembles(model, POISONED + 1) is None
+    assert divergence.resembles(model, POISONED) == name
+    assert divergence.resembles(model, POISONED + 1) is None
 
 
 def test_resemblance_of_the_whole_model() -> None:
     """Catches lambdas and quaternions that are not looked at, and a diagnosis without any Gaussian to blame."""
     model = trainer("7dgs").model
-    assert "networks" in diagnosis.explain(model)
+    assert "networks" in divergence.explain(model)
     for value, name in ((9.0, "oversensitive"), (-50.0, "insensitive")):
         model.log_lambda["time"].data.fill_(value)
-        assert diagnosis.resembles(model, 0) == name
+        assert divergence.resembles(model, 0) == name
     rotated = trainer("4dgs").model
     rotated.splats["left_quats"].data[0] *= 1e-6
-    assert diagnosis.resembles(rotated, 0) == "vanishing_quaternion"
+    assert divergence.resembles(rotated, 0) == "vanishing_quaternion"
 
 
 def test_resemblance_in_time_is_in_clips() -> None:
@@ -109,7 +109,7 @@ def test_resemblance_in_time_is_in_clips() -> None:
     for clips, name in ((-11.0, "instant"), (-8.0, None), (3.0, None), (11.0, "static")):
         model.splats["scales"].data[POISONED, :3] = clips / 2
         model.splats["scales"].data[POISONED, 3] = math.log(100.0) + clips
-        assert diagnosis.resembles(model, POISONED) == name, clips
+        assert divergence.resembles(model, POISONED) == name, clips
 
 
 def test_without_harmonics() -> None:
@@ -119,9 +119,9 @@ def test_without_harmonics() -> None:
     model.initialise(points, 4.4, generator(0))
     for parameter in model.splats.values():
         parameter.grad = torch.zeros_like(parameter)
-    assert "learning rates" in diagnosis.explain(model)
+    assert "learning rates" in divergence.explain(model)
     model.splats["sh0"].data[POISONED] = 1e4
     gradient = model.splats["sh0"].grad
     assert gradient is not None
     gradient[POISONED].view(-1)[-1] = math.nan
-    assert "Gaussian 7 of 80 in 'sh0' (1 in all): it resembles the stability case 'loud" in diagnosis.explain(model)
+    assert "Gaussian 7 of 80 in 'sh0' (1 in all): it resembles the stability case 'loud" in divergence.explain(model)

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from gsbench.kernels.finite import are_finite
-from gsbench.train.finite_check import DivergedError, FiniteCheck
+from gsbench.train.divergence import DivergedError, FiniteCheck
 
 
 def parameter(gradient: list[float]) -> nn.Parameter:

@@ -4,7 +4,6 @@ import copy
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import pytest
 import torch
 from test_wiring import trainer
 from tiny_training import compose, moving_square
@@ -17,9 +16,9 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.sliced import Conditioned
 from gsbench.scenes import Points
 from gsbench.schedule import Schedule
+from gsbench.train.batches import generator
 from gsbench.train.hooks.average import Average
 from gsbench.train.loop import Trainer
-from gsbench.train.seeding import generator
 
 
 class Deformed(Gaussians3DModel):
@@ -39,7 +38,7 @@ class Deformed(Gaussians3DModel):
         return super().groups() | {"field": list(self.field.parameters())}
 
     def penalties(self) -> Any:
-        return [(0.5, lambda query, index: self.field.weight.square().sum() - self.field.bias[0])]
+        return [(0.5, lambda *_: self.field.weight.square().sum() - self.field.bias[0])]
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         self.started_at = points.times
@@ -65,7 +64,7 @@ def deformed(*words: str) -> Trainer:
 
 
 def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times() -> None:
-    """Catches a network that never learns or that a checkpoint lacks, a penalty that no step has, and no first stage."""
+    """Catches a network that never learns or that a checkpoint lacks, a penalty without effect, and no warm-up."""
     whole = deformed()
     model: Any = whole.model
     assert model.started_at.shape == (len(model),)

@@ -12,7 +12,7 @@ from tiny_training import moving_square
 
 from gsbench.kernels.recording import Recording
 from gsbench.train.checkpoint import without_times
-from gsbench.train.finite_check import DivergedError
+from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
 from gsbench.train.step import Step
 

@@ -1,6 +1,6 @@
 """The order of views, and the streams of random numbers."""
 
-from gsbench.train.seeding import batch, generator
+from gsbench.train.batches import batch, generator
 
 
 def test_every_view_is_seen_once_an_epoch() -> None:

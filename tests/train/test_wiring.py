@@ -22,6 +22,7 @@ from gsbench.models.sliced import tensors_of
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
+from gsbench.train.batches import generator
 from gsbench.train.density.blend_weights import blend_weights
 from gsbench.train.hooks.average import Average
 from gsbench.train.hooks.best import Best
@@ -30,7 +31,6 @@ from gsbench.train.hooks.penalties import Penalties, PenaltiesConfig
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
 from gsbench.train.regularisers import PENALTIES
-from gsbench.train.seeding import generator
 from gsbench.train.step import ViewResult
 
 
@@ -384,7 +384,7 @@ def test_early_steps_see_small_images() -> None:
     assert list(small.image.shape[:2]) == [small.camera.height, small.camera.width]
     torch.testing.assert_close(small.camera.K[:2], full.camera.K[:2] / 2)
     torch.testing.assert_close(small.image[3, 5], full.image[6:8, 10:12].mean((0, 1)))
-    assert not fitted.pyramid._reduced, "small images that no later step needs"
+    assert not fitted.batches._reduced, "small images that no later step needs"
 
 
 def test_the_lightest_gaussians_go_and_moments_follow() -> None:

@@ -9,6 +9,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError, did_you_mean
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
+from gsbench.train.batches import generator
 from gsbench.train.density.blend_weights import blend_weights, heaviest
 from gsbench.train.density.gradient import GradientDensification
 from gsbench.train.density.mcmc import MCMCDensification
@@ -17,7 +18,6 @@ from gsbench.train.density.rule import DensificationRule
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
-from gsbench.train.seeding import generator
 from gsbench.train.step import ViewResult
 
 # The most Gaussians that a training may have, if `train.densify.max_gaussians` does not say it: one for so many pixels

@@ -122,16 +122,13 @@ class GradientDensification(DensificationRule):
         self.rows.forget("opacities")
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Set the sums of gradients to zero, and reorder the counts of views."""
         self.unseen = self.unseen[rows]
         self.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the sums of gradients and the counts of views of each Gaussian, for the checkpoint."""
         return {"gradient": self.gradient, "times_visible": self.times_visible, "unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the sums of gradients from a checkpoint; raises InputError if the number of Gaussians differs."""
         opacities = self.model.splats["opacities"]
         self.gradient, self.times_visible = (
             tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "times_visible")

@@ -43,8 +43,11 @@ class Training(Protocol):
     stages: StageClock
     effort: Effort
     curve: Curve
-    loss: float  # of the present step; on a GPU of one at most 50 steps before
     step: int  # the present step, counted from 0; between steps the number of finished steps
+
+    @property
+    def loss(self) -> float:
+        """Return the loss of the last step; on a GPU of one at most 50 steps before."""
 
     def report(self, text: str) -> None:
         """Print a line above the progress bar."""

@@ -52,7 +52,6 @@ class Average(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Raise InputError if averages begin after the last step."""
         step, length = cast(AverageKey, config.train).average_from, config.train.recipe_iterations
         if step is not None and step >= length:
             raise InputError(f"train.average_from: expected a step below train.recipe_iterations={length}, the length "
@@ -100,16 +99,13 @@ class Average(Hook):
             self.means[i] = last
 
     def reindex(self, rows: Tensor | None = None, fresh: Tensor | None = None) -> None:
-        """Delete the means."""
         self.count, self.means = 0, []
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the means of the parameters, and the numbers of averaged steps."""
         means = {str(i): mean for i, mean in enumerate(self.means)}
         return {"count": self.count, "first": self.first, "kept": self.kept, "means": means}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the means; raise InputError if they belong to another model."""
         from gsbench.train.checkpoint import MOST_STEPS, tensor, whole_number
 
         self.count, self.first, self.kept = (
@@ -121,5 +117,4 @@ class Average(Hook):
         self.means = [tensor(means, str(i), p.shape, p.dtype) for i, p in enumerate(parameters)]
 
     def results(self) -> dict[str, Any]:
-        """Return over how many last iterations parameters were averaged."""
         return {"averaged": self.kept}

@@ -43,11 +43,9 @@ class Best(Hook):
         return psnr
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the scores."""
         return vars(self.scores).copy()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the scores; raise InputError if they are not numbers."""
         self.scores = Scores(**state)
         if not all(isinstance(value, float | None) for value in vars(self.scores).values()):
             raise InputError(f"checkpoint: expected the best PSNRs, got {state!r:.80}")

@@ -44,7 +44,6 @@ class Choices(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Raise InputError if the shortest length has no step, or if models are compared too."""
         lengths, iterations = lengths_of(config), config.train.iterations
         if lengths is None:
             return
@@ -63,15 +62,12 @@ class Choices(Hook):
             check_choice_on_val("lengths", "length", scene, config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return both choices."""
         return asdict(self.chosen)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore both choices."""
         self.chosen = _parsed(state)
 
     def results(self) -> dict[str, Any]:
-        """Return the choice among lengths; that among models is a part of `Record.on_demand`."""
         return {"length_choice": self.chosen.length}
 
 

@@ -50,7 +50,6 @@ class EarlyStop(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Raise InputError if another setting chooses how the training ends."""
         others = {
             "lengths": "which chooses among whole trainings",
             "average_from": "whose average ends a training (+recipe=long)",
@@ -108,12 +107,10 @@ class EarlyStop(Hook):
                             f"with the Gaussians of that step")  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the kept state and its PSNR."""
         stop = None if self.stop is None else asdict(self.stop)
         return {"best": self._best, "kept": self._kept, "stop": stop}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the kept state, whose parts are checked when it is restored; raise InputError if it is none."""
         from gsbench.measure.record import Stop
         from gsbench.measure.schema import parse
 
@@ -126,7 +123,6 @@ class EarlyStop(Hook):
         self.stop = None if state["stop"] is None else parse(Stop, state["stop"], "checkpoint: stop")
 
     def results(self) -> dict[str, Any]:
-        """Return when the training stopped, and the iteration that is kept."""
         return {"stop": self.stop}
 
 

@@ -52,17 +52,14 @@ class MinimumScale(Hook):
                 self.update()
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the minimum scales; new Gaussians have none yet."""
         self.least = self.least[rows]
         if fresh.any():
             self.update()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the minimum scales of all Gaussians."""
         return {"least": self.least}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the minimum scales; raise InputError if the number of Gaussians differs."""
         from gsbench.train.checkpoint import tensor
 
         means = self.training.model.splats["means"]

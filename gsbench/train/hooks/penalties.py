@@ -65,7 +65,6 @@ class Penalties(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Raise InputError if the last step of a penalty is not after its first step."""
         for name, penalty in _all(config).items():
             if penalty.stop is not None and penalty.stop <= penalty.start:
                 raise InputError(
@@ -94,16 +93,13 @@ class Penalties(Hook):
         return [*terms, *self.training.model.penalties()]
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Tell the penalties that Gaussians were added, removed or reordered."""
         for penalty in self.active.values():
             penalty.reindex()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of each penalty."""
         return {name: penalty.state_dict() for name, penalty in self.active.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of each penalty."""
         for name, penalty in self.active.items():
             penalty.load_state_dict(state[name])
 
