@@ -9,9 +9,8 @@ from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.process.ending import end_with
-from gsbench.report import layout, live, output, paper_tables, reproduction, select
+from gsbench.report import live, output, paper_tables, reproduction, select
 from gsbench.report.frame import Results, load
-from gsbench.report.latex import latex
 from gsbench.report.publish import publish
 from gsbench.report.render import page, text
 from gsbench.report.sections import built
@@ -102,14 +101,13 @@ def _numbers(results: Results) -> dict[str, object]:
 
 def _paper_tables(results: Results, options: argparse.Namespace) -> None:
     """Print the tables of papers, and write them unless another form was asked for."""
-    tables = paper_tables.build(list(results.runs.record))
-    shown = [table for of, _ in tables.values() for table in of]
+    shown = [section for of in paper_tables.sections(results).values() for section in of]
     if options.latex:
-        print(latex(shown))
-    elif not _is_json(options, lambda: {name: lines for name, (_, lines) in tables.items()}):
-        paper_tables.write(tables, options.results)
-        print(layout.terminal(shown))
-        print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.NAMES)}")
+        print(text.latex(shown))
+    elif not _is_json(options, lambda: {name: text.rows(of) for name, of in paper_tables.numbers(results).items()}):
+        paper_tables.write(results, options.results)
+        print(text.terminal(shown))
+        print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.FILES)}")
 
 
 def _against(results: Results, options: argparse.Namespace) -> bool:

@@ -96,16 +96,24 @@ def table(study: str) -> Numbers:
     return values
 
 
+PAPER = {"psnr_db": "psnr", "psnr_best_on_test_db": "psnr_best_on_test", "gaussians": "num_gaussians"}
+
+
 def paper(study: str) -> Numbers:
     """The lines of the CSV files of Table 1, Table 2 and the successors."""
     values: Numbers = {}
-    for name, (_, lines) in paper_tables.build(records(study)).items():
-        for line in lines:
+    for name, table in paper_tables.numbers(frame.load(PUBLISHED / study)).items():
+        for line in table.to_dict("records"):
             words = ("table", "dataset", "row", "experiment", "scene", "model", "method", "source", "recipe")
-            key = "/".join(str(line[word]) for word in words if line.get(word))
+            key = "/".join(str(line[word]) for word in words if line.get(word) and line[word] == line[word])
+            is_measured = line.get("row") != "published" and not str(line.get("source")).startswith("paper")
             for column, value in line.items():
-                if isinstance(value, float | int) and f"{name}/{key}/{column}" not in values:  # the first of equals
-                    values[f"{name}/{key}/{column.replace(' (leaks)', '')}"] = float(value)
+                quantity, _, end = column.partition(" ")
+                known = isinstance(value, float | int) and column not in words and column != "protocol"
+                known &= is_measured or not (end or column == "seeds" or (column == "scenes" and value != value))
+                title = f"{PAPER.get(quantity, quantity)} {end}".strip()
+                if known and (f"{name}/{key}/{title}" not in values or title == "psnr_best_on_test"):  # first of equals
+                    values[f"{name}/{key}/{title}"] = float(value)
     return values
 
 

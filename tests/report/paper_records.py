@@ -1,22 +1,11 @@
-"""Makes the golden pages of Tables 1 and 2 and the successors: run it after a change that is meant, and read it.
+"""Invented records at the protocol of the 7DGS paper, and records that depart from it."""
 
-    python tests/report/make_golden_paper.py
-
-The records are invented: two models at the paper's protocol, one that failed, one size of its own, a stand-in.
-"""
-
-import tempfile
-from pathlib import Path
 from typing import Any
 
-from make_golden import EFFECTS, GOLDEN, make
+from make_golden import EFFECTS, make
 
 from gsbench.measure.record import Effects, Record
-from gsbench.report.paper_tables import build, write
 
-GOLDEN_1 = GOLDEN.with_name("table1.md")
-GOLDEN_2 = GOLDEN.with_name("table2.md")
-GOLDEN_3 = GOLDEN.with_name("table_successors.md")
 EFFECTS.setdefault("dgs", Effects(time=True, direction=True, refinement=False))
 EFFECTS.setdefault("6dgs", Effects(time=False, direction=True, refinement=False))
 
@@ -74,10 +63,3 @@ def records() -> list[Record]:
         at_paper("dgs", psnr=29.8, batch_size=1, variant="recipe=mcmc,batch_size=1"),
         make("7dgs", protocol={**make().protocol, "resolution": "80x80"}),
     ]
-
-
-if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as folder:
-        write(build(records()), Path(folder))
-        for golden in (GOLDEN_1, GOLDEN_2, GOLDEN_3):
-            golden.write_text((Path(folder) / golden.name).read_text())
