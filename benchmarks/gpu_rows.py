@@ -15,10 +15,9 @@ from benchmarks.training import training_step
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
-from gsbench.models import GaussianModel, Query
-from gsbench.models.cuda_graph import GraphedFrames
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.factors import rotation
-from gsbench.models.render import render
+from gsbench.models.render import GraphedFrames, render
 from gsbench.raster import rasterize
 from gsbench.scenes.scene import Camera
 from gsbench.train.losses import photometric
@@ -107,7 +106,7 @@ def two_ways(place: Place, fitted: GaussianModel, size: int) -> tuple[Call, Call
 
     def theirs() -> Tensor:
         fitted.backend = REFERENCE
-        seen = fitted.slice(Query.of(seen_from, TIME))
+        seen = fitted.slice(CameraTime.of(seen_from, TIME))
         covars = seen.factors @ seen.factors.mT
         return gsplat_image(seen.means, None, None, seen.opacities, seen.colors, covars=covars, viewmats=viewmats,
                             Ks=Ks, size=size)[0]  # fmt: skip

@@ -8,8 +8,8 @@ from benchmarks.scene import camera, gaussians, model
 from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import Viewport, backward_by_splat
-from gsbench.models import Query
-from gsbench.models.sliced import tensors_of
+from gsbench.models import CameraTime
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
 from gsbench.raster.native import draw_within
 
@@ -32,7 +32,7 @@ def main() -> None:
                 draw_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEWPORT, room)
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
-        seen = model(name, 500, agr=True, **options).cuda().slice(Query.at(center, 0.4))
+        seen = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))
         sum(x.square().sum() for x in tensors_of(seen)).backward()
     image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()

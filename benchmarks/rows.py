@@ -12,8 +12,8 @@ from benchmarks.training import training_step
 from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS, CPU, REFERENCE
 from gsbench.kernels.loss import l1_ssim
-from gsbench.models import Query
-from gsbench.models.sliced import tensors_of
+from gsbench.models import CameraTime
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import rasterize
 from gsbench.train.losses import photometric
 
@@ -65,7 +65,7 @@ def observing() -> Iterator[Row]:
             observed = model(name, 100_000, backend=BACKENDS[backend])
             time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
-            query = Query.at(center, time)
+            query = CameraTime.at(center, time)
             out = tensors_of(observed.slice(query))
             upstream = [torch.ones_like(x) for x in out]
             targets = (15.0, 25.0) if name == "7dgs" and backend == "cpu" else (None, None)
@@ -125,7 +125,7 @@ def step() -> Iterator[Row]:
 
 def instruction_sets() -> Iterator[Row]:
     """The same calls by each instruction set that this machine has: a higher one is not to be slower."""
-    query, g = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.4), torch.Generator().manual_seed(0)
+    query, g = CameraTime.at(torch.tensor([0.0, 0.0, -4.0]), 0.4), torch.Generator().manual_seed(0)
     image, target = (torch.rand(400, 400, 3, generator=g) for _ in range(2))
     image.requires_grad_()
     inputs, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(10_000)], camera(400)

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.cholesky import CholeskyModel
 from gsbench.models.factors import KINDS
-from gsbench.models.triangular import TriangularModel
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
 from gsbench.train.rows import Rows
@@ -60,7 +60,7 @@ def model(
             if key == "opacities":
                 parameter.copy_(torch.randn(N, generator=g))
         logs = made.splats[made.geometry[0]]  # [N, 3 or more], of which those in space are set
-        space = made.rows["p"] if isinstance(made, TriangularModel) else [0, 1, 2]
+        space = made.rows["p"] if isinstance(made, CholeskyModel) else [0, 1, 2]
         logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
     made.set_active(ActiveComponents(3, refine=agr, tunes_lambda=False))
     return made
@@ -82,7 +82,7 @@ def trained(name: str, N: int, **options: Any) -> GaussianModel:
     Mean times are spread around TIME until so few Gaussians reach it; some then lie outside of the clip.
     """
     made = model(name, N, **options)
-    query = Query.at(torch.tensor([0.0, 0.0, -DISTANCE]), TIME)
+    query = CameraTime.at(torch.tensor([0.0, 0.0, -DISTANCE]), TIME)
     with torch.no_grad():
         if name == "dgs":  # whose mean times are inside (0, 1): its Gaussians live shortly instead
             made.splats["precision"][:, 6] += SHORTER

@@ -12,7 +12,7 @@ from benchmarks.training import adam_of, one_view, training_step
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, HIDDEN, TRANSMITTANCE_MIN
 from gsbench.kernels.raster import Splats, Viewport, bin_tiles, flag_values
 from gsbench.kernels.tape import Differentiable, Tape
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import rasterize_slice
 from gsbench.raster import reference
 from gsbench.scenes import View
@@ -96,7 +96,7 @@ def recorded(fitted: GaussianModel, view: View) -> dict[str, Call]:
     sums: dict[int, Tensor] = {}
     for _ in range(2):
         with Recording() as tape:
-            seen = fitted.slice(Query.of(view.camera, view.time))
+            seen = fitted.slice(CameraTime.of(view.camera, view.time))
             output = rasterize_slice(seen, view.camera, torch.zeros(3), fitted.backend)
             loss = photometric(output.image, view.image[None], 0.2, fitted.backend)
         means2d = output.info.means2d

@@ -10,10 +10,10 @@ keep_freed_memory()  # these three calls must come before the import of torch or
 sleep_when_idle()
 compute_the_same_bits()
 
-__all__ = ["Query", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
+__all__ = ["CameraTime", "build", "load_run", "load_scene", "lpips", "psnr", "rasterize", "slice_gaussians", "ssim"]
 
 _PUBLIC = {  # the names of __all__ with the modules that define them
-    "Query": "gsbench.models.query.Query",
+    "CameraTime": "gsbench.models.camera_time.CameraTime",
     "build": "gsbench.models.registry.build",
     "load_run": "gsbench.run.load.load_run",
     "load_scene": "gsbench.scenes.load",
@@ -26,7 +26,7 @@ _PUBLIC = {  # the names of __all__ with the modules that define them
 
 if TYPE_CHECKING:  # type checkers and editors do not run the code below, so they get imports
     from gsbench.measure.quality import lpips, psnr, ssim
-    from gsbench.models.query import Query
+    from gsbench.models.camera_time import CameraTime
     from gsbench.models.registry import build
     from gsbench.models.slicing import slice_gaussians
     from gsbench.raster import rasterize

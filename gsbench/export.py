@@ -10,7 +10,7 @@ import torch
 
 from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
-from gsbench.models.query import Query
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.process.memory import is_out_of_memory, require
@@ -197,7 +197,7 @@ def differences(export: Export, path: Path, ply: SlicePly) -> list[str]:
     return notes
 
 
-def slice_place(export: Export, time: float | None) -> tuple[Query, bool]:
+def slice_place(export: Export, time: float | None) -> tuple[CameraTime, bool]:
     """Return the camera centre and time of exported 3D Gaussians, and whether the PLY keeps SH colours.
 
     If the user names a camera or a direction, each Gaussian has only the colour that is seen from there. If `time` is
@@ -206,12 +206,12 @@ def slice_place(export: Export, time: float | None) -> tuple[Query, bool]:
     run, options = export.run, export.options
     if export.scene is not None and options.camera is not None:
         view = find_view(export.scene, options.camera)
-        return Query.of(view.camera.to(run.config.device), view.time if time is None else time), False
+        return CameraTime.of(view.camera.to(run.config.device), view.time if time is None else time), False
     if time is None and run.scene.has_time:
         time = 0.0
     keep = options.direction is None
     center = torch.zeros(3) if keep else video.far_along(run, direction(options.direction))
-    return Query.at(center.to(run.config.device), time), keep
+    return CameraTime.at(center.to(run.config.device), time), keep
 
 
 def direction(text: str) -> torch.Tensor:

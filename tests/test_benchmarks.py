@@ -10,7 +10,7 @@ from benchmarks.__main__ import HEADER, line
 from benchmarks.stages import MODELS, SUCCESSORS, blended_alphas, recorded, stages
 from benchmarks.training import one_view
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.models.render import rasterize_slice
 
 
@@ -47,7 +47,7 @@ def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
     """Catches stages that are timed with every Gaussian visible, or with visible ones far apart."""
     for name in ("4dgs", "7dgs", "dgs", "dbs", "freetime"):
         fitted, view = scene.trained(name, 1600), one_view(32, 32)
-        gaussians = fitted.slice(Query.of(view.camera, view.time)).opacities >= ALPHA_MIN
+        gaussians = fitted.slice(CameraTime.of(view.camera, view.time)).opacities >= ALPHA_MIN
         assert abs(float(gaussians.float().mean()) - scene.VISIBLE) < 0.02
         assert gaussians.unflatten(0, (-1, 16)).any(1).float().mean() < 0.6  # it is 1 in any order
 
@@ -68,7 +68,7 @@ def test_blended_alphas_are_those_of_the_image() -> None:
     view = one_view(32, 24)
     fitted = scene.model("3dgs", 4, sigma=0.3)
     fitted.select(torch.tensor([0]))
-    gaussians = fitted.slice(Query.of(view.camera, view.time))
+    gaussians = fitted.slice(CameraTime.of(view.camera, view.time))
     drawn = rasterize_slice(gaussians, view.camera, torch.zeros(3), fitted.backend).alpha > 0
     assert 0 < drawn.sum() < drawn.numel()
     assert blended_alphas(recorded(fitted, view)["project"]) == drawn.sum()

@@ -13,7 +13,7 @@ from gsbench.effects.sensitivity import Sensitivity
 from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
-from gsbench.models.color_order import order_of
+from gsbench.models.appearance import order_of
 from gsbench.models.gated import GatedModel
 
 SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # shares of the squared error, tried in this order

@@ -8,7 +8,7 @@ import torch
 from gsbench.effects.gate import effect_sets_of
 from gsbench.effects.sensitivity import MOST_VIEWS
 from gsbench.measure.quality import evenly
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import DIRECTION
 from gsbench.models.gated import has_gates
 from gsbench.models.simplifications import STATIC, shares_of
@@ -27,7 +27,7 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
     """
     if not has_gates(model) or "direction" not in model.observes:
         return None
-    queries = [Query.of(view.camera, view.time) for view in evenly(views, MOST_VIEWS)]
+    queries = [CameraTime.of(view.camera, view.time) for view in evenly(views, MOST_VIEWS)]
     weights = shares_of([model.slice(query).opacities for query in queries])
     frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
     changed = copy.deepcopy(model)

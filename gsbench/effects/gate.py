@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsbench.effects.sensitivity import Sensitivity
 from gsbench.models import GaussianModel
-from gsbench.models.color_order import MOST_PACKED, at_most, order_of
+from gsbench.models.appearance import MOST_PACKED, at_most, order_of
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC

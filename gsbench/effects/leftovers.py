@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from gsbench.kernels.backends import resolve
 from gsbench.kernels.tape import Tape
 from gsbench.models.appearance import sh_basis
+from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.query import Query, unit
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, Points, Scene, View
@@ -65,7 +65,7 @@ def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> A
 def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
     """Compute the gradients of a view's mean squared error with respect to the parameters `by` of a 3DGS model."""
     with Tape() as tape:
-        gaussians = model.slice(Query.of(view.camera, None))
+        gaussians = model.slice(CameraTime.of(view.camera, None))
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
     found: dict[int, Tensor] = {}
     residual = image.detach() - view.image

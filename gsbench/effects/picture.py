@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.effects.gate import cost_of, effect_sets_of, most_cost
 from gsbench.effects.messages import EFFECT_SETS
 from gsbench.measure.images import Pixels, inferno, to_bytes
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import Camera
@@ -52,7 +52,7 @@ def draw(
     Raises:
         InputError: the model depends on time and `time` is None.
     """
-    seen = model.slice(Query.of(camera, time))
+    seen = model.slice(CameraTime.of(camera, time))
     layers = (
         (seen.colors, background),
         (effect_set_colors(model), torch.ones_like(background)),

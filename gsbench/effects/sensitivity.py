@@ -30,11 +30,11 @@ from torch import Tensor
 
 from gsbench.kernels.tape import Tape
 from gsbench.measure.quality import evenly
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.gated import GatedModel
+from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import REMOVED, Simplification, simplifications_of
-from gsbench.models.sliced import Gaussians3D, tensors_of
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Camera, View
 
@@ -89,7 +89,7 @@ def probe(
         hidden: which Gaussians no training view shows.
     """
     looked_at = evenly(views, most)
-    queries = [Query.of(view.camera, view.time) for view in looked_at]
+    queries = [CameraTime.of(view.camera, view.time) for view in looked_at]
     workers = model.backend.workers(model.splats["means"])
     seen = list(side_by_side(model.slice, queries, workers))
     simplifications = simplifications_of(model, queries, seen, by_halves)
@@ -169,7 +169,7 @@ class Place(NamedTuple):
     """Hold a model's 3D Gaussians in one view, their image, and the derivatives from which errors are predicted."""
 
     model: GaussianModel
-    query: Query
+    query: CameraTime
     live: Gaussians3D  # the present slice
     rows: Tensor  # [N, 16], `live` as one matrix
     drawn: Drawn  # the image of `live`

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 
@@ -28,7 +28,7 @@ def seen_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
     own = dict(model.splats.items())
 
     def shown(view: View) -> Tensor:
-        query = Query.of(view.camera, view.time)
+        query = CameraTime.of(view.camera, view.time)
         moved = model.refined(query)
         opacities = model.slice_geometry(moved, query).opacities
         if model.refines:

@@ -47,7 +47,7 @@ def slice_direct(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return means [N, 3], factors [N, 3, 3] and opacities [N] of dGS Gaussians for a camera centre and a time.
 
-    `gsbench.models.dgs.DirectModel` has the formulas and describes the parameters; its `coupling` is `text`. Only the
+    `gsbench.models.moving.DirectModel` has the formulas and the parameters; its `coupling` is `text`. Only the
     first `conditioned` Gaussians (None: all) depend on the camera and the time. The others are static.
 
     Raises:
@@ -104,7 +104,7 @@ def slice_direct_beta(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return means [N, 3], factors [N, 3, 3], opacities [N] and profile exponents [N] of dBS Gaussians for a view.
 
-    `gsbench.models.dbs.DirectBetaModel` has the formulas and describes the parameters. Only the first `conditioned`
+    `gsbench.models.moving.DirectBetaModel` has the formulas and describes the parameters. Only the first `conditioned`
     Gaussians (None: all) depend on the camera and the time. The others are static.
 
     Raises:
@@ -149,7 +149,7 @@ def slice_free_time(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return means [N, 3], factors [N, 3, 3] and opacities [N] of FreeTimeGS Gaussians at a time.
 
-    `gsbench.models.freetime.FreeTimeModel` has the formulas. Only the first `conditioned` Gaussians (None: all) change
+    `gsbench.models.moving.FreeTimeModel` has the formulas. Only the first `conditioned` Gaussians (None: all) change
     with time. The others are static.
 
     Raises:

@@ -207,7 +207,7 @@ def slice_universal(
     center: Tensor,  # [3]
     time: Tensor | None,  # []
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Compute the conditional 3D Gaussians of UBS for a camera centre and a time, by `gsbench.models.ubs`, `whitened`.
+    """Compute the conditional 3D Gaussians of UBS for a camera centre and a time, by `gsbench.models.beta`, `whitened`.
 
     Return means [N, 3], factors [N, 3, 3] of the covariances, opacities [N] and exponents of the Beta profiles [N].
 

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.tensors import check_positive
-from gsbench.models.appearance import sh_colors
-from gsbench.models.color_order import ColorOrder
+from gsbench.models.appearance import ColorOrder, sh_colors
+from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.effect_sets import NAMES, EffectSets
-from gsbench.models.elementary import exp, sqrt
-from gsbench.models.query import Query, unit
+from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
+from gsbench.models.portable_math import exp, log, sqrt
 from gsbench.models.refinement import OCTAVES, Refinement
-from gsbench.models.sliced import Conditioned, Gaussians3D, Geometry
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
@@ -47,19 +47,14 @@ class GaussianModel(nn.Module, ABC):
     warm_up: int = 0  # the step, of 30,000, until which `active.warms_up`; a model with a static first stage sets it
 
     def __init__(
-        self, *, agr: bool = False, agr_octaves: int = OCTAVES, sh_degree: int = 3, backend: Backend = AUTO
+        self,
+        *,
+        agr: bool = False,  # whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time
+        agr_octaves: int = OCTAVES,  # frequencies of AGR's time encoding
+        sh_degree: int = 3,  # of the colours, 0 to 3
+        backend: Backend = AUTO,  # the implementation that computes conditional 3D Gaussians, colours and AGR
     ) -> None:
-        """Make a model without Gaussians; `initialise` or `load_state` adds them.
-
-        Args:
-            agr: whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time.
-            agr_octaves: the number of frequencies of AGR's time encoding.
-            sh_degree: the SH degree of the colours, 0 to 3.
-            backend: the implementation that computes conditional 3D Gaussians, colours and AGR.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
+        """Make a model without Gaussians; `initialise`, `start_from` or `load_state` adds them."""
         super().__init__()
         if sh_degree not in range(4):
             raise InputError(f"sh_degree: expected 0, 1, 2 or 3, got {sh_degree}")
@@ -79,17 +74,16 @@ class GaussianModel(nn.Module, ABC):
     # ---- what a subclass provides
 
     @abstractmethod
-    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return the initial raw parameters of the covariances, and of the means in time and direction.
-
-        Args:
-            points: the points at which the Gaussians start.
-            distances: the distance of each point to its neighbours, [N] world units.
-            generator: the source of all random numbers.
-        """
+    def initial_geometry(
+        self,
+        points: Points,  # at which the Gaussians start
+        distances: Tensor,  # [N] of each point to its neighbours, world units
+        generator: torch.Generator,
+    ) -> Raw:
+        """Return the initial raw parameters of the covariances, and of the means in time and direction."""
 
     @abstractmethod
-    def condition(self, raw: Raw, query: Query) -> Conditioned:
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Condition Gaussians with raw parameters (before exp and sigmoid) on a camera centre and time."""
 
     @abstractmethod
@@ -98,14 +92,9 @@ class GaussianModel(nn.Module, ABC):
 
     @abstractmethod
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
-        """Return means and covariance parameters of the two children of each split Gaussian.
+        """Return means and covariance parameters of the children of split Gaussians: two adjacent rows each."""
 
-        Args:
-            raw: the raw parameters of the parents, of which each has two copies, one after the other.
-            generator: the source of all random numbers.
-        """
-
-    def penalties(self) -> Sequence[tuple[float, Callable[[Query, int], Tensor]]]:
+    def penalties(self) -> Sequence[tuple[float, Callable[[CameraTime, int], Tensor]]]:
         """Return terms of the loss of every view: a weight, and a function of the view and its index in the batch.
 
         Each function returns a tensor []. Threads call it for several views at the same time.
@@ -117,13 +106,9 @@ class GaussianModel(nn.Module, ABC):
         return self.spatial_scales().detach().amax(-1)
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the standard deviations of conditional 3D Gaussians by factors in (0, 1]; by default do nothing.
+        """Multiply the sizes of the conditional 3D Gaussians `rows` [M] by `factors` [M] <= 1; by default do nothing.
 
         Positions, velocities and lifetimes do not change. The relocation of 3DGS-MCMC calls this method.
-
-        Args:
-            rows: the indices of the Gaussians, [M].
-            factors: the factor of each of these Gaussians, [M].
         """
         return
 
@@ -155,6 +140,24 @@ class GaussianModel(nn.Module, ABC):
         deviations = self.durations()
         return None if deviations is None else (self.splats["times"][:, 0], deviations / sqrt(self.lambda_of("time")))
 
+    @torch.no_grad()
+    def visible_intervals(self) -> Tensor | None:
+        """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
+
+        A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
+        is at least 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals only
+        serve to sort the Gaussians: they ignore AGR, the neural refinement.
+        """
+        lifetimes = self.lifetimes()
+        if lifetimes is None:
+            return None
+        times, deviations = lifetimes
+        opacities = torch.sigmoid(self.splats["opacities"])
+        half = sqrt(2 * log(opacities / ALPHA_MIN).clamp(min=0)) * deviations
+        interval = torch.stack([times - half, times + half], 1)
+        never = (half == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
+        return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
+
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
         return
@@ -164,13 +167,9 @@ class GaussianModel(nn.Module, ABC):
         return
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return covariance parameters of the model for which the spatial covariance is that of trained 3D Gaussians.
+        """Return covariance parameters for which the spatial covariance is that of trained 3D Gaussians.
 
-        By default the Gaussians become spheres of the same volume.
-
-        Args:
-            trained: the 3D Gaussians.
-            raw: the initial raw parameters of the model.
+        `raw` are the initial parameters. By default the Gaussians become spheres of the same volume.
         """
         points, radii = Points(trained.means, trained.means), exp(trained.log_scales.mean(1))
         spheres = self.initial_geometry(points, radii, torch.Generator().manual_seed(0))
@@ -181,11 +180,7 @@ class GaussianModel(nn.Module, ABC):
         return torch.zeros(len(self), dtype=torch.bool, device=self.splats["means"].device)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Return SH coefficients that give each Gaussian one colour for all directions and times.
-
-        Args:
-            dc: the coefficient of degree 0, [N, 3].
-        """
+        """Return SH coefficients of one colour for all directions and times; `dc` [N, 3] is that of degree 0."""
         rest = dc.new_zeros(len(dc), (self.sh_degree + 1) ** 2 - 1, 3)
         return {"sh0": dc[:, None], "shN": rest}
 
@@ -193,7 +188,7 @@ class GaussianModel(nn.Module, ABC):
         """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, 1).packed
 
-    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
+    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
         The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this
@@ -217,12 +212,8 @@ class GaussianModel(nn.Module, ABC):
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
         """Place an isotropic Gaussian of opacity 0.1, or `initial_opacity`, at each point (3DGS, section 5.1).
 
-        The standard deviation of a Gaussian is the root mean square distance to its three nearest neighbours.
-
-        Args:
-            points: the means and colours of the Gaussians.
-            extent: the radius of the scene, world units; density control and learning rates are relative to it.
-            generator: the source of all random numbers.
+        The standard deviation of a Gaussian is the root mean square distance to its three nearest neighbours. Density
+        control and learning rates are relative to `extent`, the radius of the scene in world units.
         """
         self.extent = extent
         distances = nearest_distances(points.means)
@@ -238,7 +229,26 @@ class GaussianModel(nn.Module, ABC):
             self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
         self.set_active(self.active)
 
-    def slice(self, query: Query) -> Gaussians3D:
+    @torch.no_grad()
+    def start_from(self, trained: TrainedGaussians, extent: float, generator: torch.Generator) -> None:
+        """Initialise with the means, covariances, opacities and colours of at least four trained 3D Gaussians.
+
+        Other parameters, such as mean times and directions, start as in `initialise`. SH coefficients above the model's
+        degree are left out.
+
+        Raises:
+            InputError: there are fewer than four Gaussians.
+        """
+        self.initialise(Points(trained.means, (0.5 + SH_C0 * trained.dc).clamp(0, 1)), extent, generator)
+        raw = {name: parameter.data for name, parameter in self.splats.items()}
+        raw["opacities"].copy_(trained.logits)
+        raw["sh0"].view(-1, 3).copy_(trained.dc)
+        known = min(trained.rest.shape[1], (self.sh_degree + 1) ** 2 - 1)
+        raw["shN"][:, :known] = trained.rest[:, :known]  # in 4DGS these are the coefficients that are constant in time
+        for name, value in self.shaped_as(trained, raw).items():
+            raw[name].copy_(value)
+
+    def slice(self, query: CameraTime) -> Gaussians3D:
         """Slice the model at the camera centre and time of `query`: return 3D Gaussians for the rasterizer.
 
         Raises:
@@ -249,12 +259,12 @@ class GaussianModel(nn.Module, ABC):
         raw = self.refined(query)
         return self.colored(self.slice_geometry(raw, query), raw, query)
 
-    def colored(self, geometry: Geometry, raw: Raw, query: Query) -> Gaussians3D:
+    def colored(self, geometry: Geometry, raw: Raw, query: CameraTime) -> Gaussians3D:
         """Compute the colours of 3D Gaussians, and return them together with means, factors and opacities."""
         means, factors, opacities, shapes = geometry
         return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), shapes)
 
-    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
 
         A subclass that has a kernel for this overrides the method.
@@ -264,10 +274,7 @@ class GaussianModel(nn.Module, ABC):
 
     @property
     def orders(self) -> Tensor | None:
-        """The SH degree and number of frequencies in time of each colour, [N].
-
-        They are encoded as degree + 4 (frequencies - 1). None: every colour uses all coefficients.
-        """
+        """The SH degree and number of frequencies of each colour, [N], as in `ColorOrder.packed`; None: all."""
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
@@ -284,7 +291,7 @@ class GaussianModel(nn.Module, ABC):
         """Whether the model has AGR, the neural refinement, and AGR is switched on."""
         return self.refinement is not None and self.active.refine
 
-    def refined(self, query: Query) -> Raw:
+    def refined(self, query: CameraTime) -> Raw:
         """Return the raw parameters after AGR, the neural refinement, has added its output (7DGS eq. 15)."""
         raw: Raw = dict(self.splats.items())
         rows = None if self.effect_sets is None else self.effect_sets.refined
@@ -298,11 +305,7 @@ class GaussianModel(nn.Module, ABC):
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:
-        """Add the parameter lambda_t or lambda_d, the coefficient in the exponent of the opacity factor (7DGS, eq. 11).
-
-        Args:
-            name: `time` or `direction`.
-            value: the initial value.
+        """Add lambda_t or lambda_d (of `time` or `direction`), the coefficient in the exponent of the opacity factor.
 
         Raises:
             InputError: `value` is not a positive number.
@@ -345,12 +348,7 @@ class GaussianModel(nn.Module, ABC):
 
     @torch.no_grad()
     def split_rows(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Replace copies of split Gaussians by their children.
-
-        Args:
-            rows: the indices of the copies, [M]; the two copies of a Gaussian are next to each other.
-            generator: the source of all random numbers.
-        """
+        """Replace the copies `rows` [M] of split Gaussians by their children; two copies are next to each other."""
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.split(raw, generator).items():
             self.splats[name].data[rows] = value
@@ -380,17 +378,28 @@ class GaussianModel(nn.Module, ABC):
         """
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0
-        own = self.state_dict()
-        shapes = {name: list(value.shape) for name, value in own.items()}
+        present = self.state_dict()
+        shapes = {name: list(value.shape) for name, value in present.items()}
         expected = {name: [N, *shape[1:]] if name.startswith("splats.") else shape for name, shape in shapes.items()}
         got = {name: list(value.shape) if isinstance(value, Tensor) else value for name, value in state.items()}
         for name in sorted(expected.keys() | got.keys()):
             if name not in expected or expected[name] != got.get(name):
                 raise InputError(f"checkpoint: not of this model: expected {name} of shape "
                                  f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
-            if state[name].dtype != own[name].dtype or state[name].layout != torch.strided:
-                raise InputError(f"checkpoint: not of this model: expected {name} of {own[name].dtype}, "
+            if state[name].dtype != present[name].dtype or state[name].layout != torch.strided:
+                raise InputError(f"checkpoint: not of this model: expected {name} of {present[name].dtype}, "
                                  f"got {state[name].dtype}, {state[name].layout}")  # fmt: skip
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)
+
+
+def slice_by(
+    kernel: Callable[..., Any],  # returns means, factors, opacities and, of Beta profiles, exponents
+    raw: Raw,
+    names: Sequence[str],  # of the raw parameters that it takes first; None stands for one that the model lacks
+    *others: Tensor | None,
+    **options: Any,
+) -> Geometry:
+    """Compute the 3D Gaussians at a camera and time by a kernel."""
+    return Geometry(*kernel(*map(raw.get, names), *others, **options))

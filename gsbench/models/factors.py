@@ -7,11 +7,15 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import LOG_SIZE_MAX
-from gsbench.models.elementary import exp, log
+from gsbench.models.portable_math import exp, log
 from gsbench.models.slicing import triangularise
 
-OFF_DIAGONALS = ("relative", "raw", "row_scaled")  # values of `form` of `Triangle`, in the order of math/off_diagonal.h
-KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal, see `Triangle`
+OFF_DIAGONALS = (
+    "relative",
+    "raw",
+    "row_scaled",
+)  # values of `form` of `CholeskyLayout`, in the order of math/off_diagonal.h
+KINDS = ("shape", "motion", "coupling")  # kinds of entries below the diagonal, see `CholeskyLayout`
 
 
 def sizes(logs: Tensor) -> Tensor:
@@ -19,7 +23,7 @@ def sizes(logs: Tensor) -> Tensor:
     return exp(logs.clamp(-LOG_SIZE_MAX, LOG_SIZE_MAX))
 
 
-class Triangle:
+class CholeskyLayout:
     """Describe the Cholesky factor of a covariance over position p, time t and direction d.
 
     The entries below the diagonal are of three kinds, each with its own learning rate:
@@ -30,16 +34,11 @@ class Triangle:
     """
 
     def __init__(self, letters: str, form: str = "relative") -> None:
-        """Describe a Cholesky factor by the variables of its rows.
+        """Describe a Cholesky factor by the variable of each row, "p", "t" or "d", for example "dddtppp".
 
-        Args:
-            letters: the variable of each row, "p", "t" or "d"; for example "dddtppp".
-            form: how a parameter x gives an entry below the diagonal. `raw`: the entry is x, as in the 7DGS paper.
-                `row_scaled`: it is (2 sigmoid(x) - 1) times the diagonal entry of its row, as in the authors' later
-                code. `relative`: it is x times the diagonal entry of its row if row and column are "p", else x.
-
-        Raises:
-            InputError: the form is unknown.
+        The form is how a parameter x gives an entry below the diagonal. `raw`: the entry is x, as in the 7DGS paper.
+        `row_scaled`: it is (2 sigmoid(x) - 1) times the diagonal entry of its row, as in the authors' later code.
+        `relative`: it is x times the diagonal entry of its row if row and column are "p", else x.
         """
         if form not in OFF_DIAGONALS:
             raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
@@ -65,14 +64,10 @@ class Triangle:
         return self.letters[row], self.letters[place - row * (row - 1) // 2]
 
     def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
-        """Compute the lower triangular factors L [N, n, n] from their parameters (7DGS, section 4.1).
+        """Compute lower triangular factors L [N, n, n] (7DGS, section 4.1) over position and k other variables.
 
-        Args:
-            log_diagonal: the logarithms of the diagonal, [N, n] with n = 3 + k: position, and k variables of time and
-                direction.
-            kinds: the parameters below the diagonal: `shape` (within position) [N, 3], `motion` (position with time or
-                direction) [N, 3 k], `coupling` (within time and direction) [N, k (k - 1) / 2].
-        """  # [N, n, n]
+        `log_diagonal` is [N, n] with n = 3 + k; `shape` is [N, 3], `motion` [N, 3 k], `coupling` [N, k (k - 1) / 2].
+        """
         n = log_diagonal.shape[-1]
         diagonal = sizes(log_diagonal)
         x = self.join(kinds)
@@ -100,11 +95,7 @@ class Triangle:
         return {"log_diagonal": log(diagonal)} | self.split(x)
 
     def split(self, below: Tensor) -> dict[str, Tensor]:
-        """Split the Cholesky factor's parameters below the diagonal, [N, n (n - 1) / 2], into three kinds.
-
-        These are `shape` (within position), `motion` (position with time or direction) and `coupling` (within time and
-        direction).
-        """
+        """Split the parameters below the diagonal, [N, n (n - 1) / 2] row by row, into the kinds of the class."""
         return {kind: below[:, self.places[kind]] for kind in self.kinds}
 
     def join(self, kinds: dict[str, Tensor]) -> Tensor:

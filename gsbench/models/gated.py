@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.models.appearance import MOST_PACKED, ColorOrder, coefficients_within
 from gsbench.models.base import GaussianModel, Raw
-from gsbench.models.color_order import MOST_PACKED, ColorOrder, coefficients_within
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
-from gsbench.models.query import Query
-from gsbench.models.sliced import Conditioned, Geometry, joined_shapes
+from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_shapes
 
 OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
 _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
@@ -31,10 +31,7 @@ class GatedModel(GaussianModel):
     gates: ClassVar[bool] = False  # whether gates may simplify the model
 
     def __init_subclass__(cls, *, gates: bool = False, **more: Any) -> None:
-        """Set whether gates may simplify the models of this class. This is not inherited.
-
-        A subclass may have parameters of which the inherited methods `static`, `frozen` and `kept` know nothing.
-        """
+        """Set `gates`, which is not inherited: a subclass may have parameters that `static`, `frozen`, `kept` miss."""
         super().__init_subclass__(**more)
         cls.gates = gates
 
@@ -49,17 +46,12 @@ class GatedModel(GaussianModel):
         """
 
     @abstractmethod
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
-        """Return raw parameters of Gaussians in which time, direction or both are replaced by a mean over views.
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
+        """Return raw parameters of Gaussians in which time, direction or both are replaced by a mean over V views.
 
         The result has a dictionary of changed raw parameters for each variable that is replaced, and a last dictionary
         `static`, in which all variables are replaced. The result is empty if the model depends on neither time nor
-        direction.
-
-        Args:
-            raw: the raw parameters, without AGR.
-            queries: the camera centres and times of V views.
-            weights: the weight of each view in the mean of each Gaussian, [V, N]; the sum over views is 1.
+        direction. `raw` is without AGR; `weights` [V, N] are those of the views for each Gaussian, with a sum of 1.
         """
 
     def lower_orders(self) -> list[int]:
@@ -67,10 +59,9 @@ class GatedModel(GaussianModel):
         return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
+        """Return masks of the parameter entries that are used: a static Gaussian uses no parameters of motion.
 
-        For example, a static Gaussian does not use its parameters of motion. The masks are bool and can be broadcast to
-        the parameters. All entries of a parameter without a mask are used. `fill` sets unused entries to constants.
+        Masks can be broadcast to the parameters; without a mask, all entries are used. `fill` sets the others.
         """
         if effect_sets.orders is None:
             return {}
@@ -93,7 +84,7 @@ class GatedModel(GaussianModel):
         """The number of Gaussians, from the first row on, that change with time or direction; None: all of them."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
-    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute the 3D Gaussians for a camera and time; Gaussians that ignore both are copied, not conditioned."""
         if self.conditioned is None:
             return super().slice_geometry(raw, query)
@@ -120,11 +111,7 @@ class GatedModel(GaussianModel):
                                 f"{_STATE}frozen": effect_sets.frozen}  # fmt: skip
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load the tensors that `pack` returned, for any number of Gaussians.
-
-        Raises:
-            InputError: the tensors belong to another model, or are damaged.
-        """
+        """Load the tensors that `pack` returned, for any number of Gaussians; see `GaussianModel.load_state`."""
         effect_sets = effect_sets_in(state)
         super().load_state(state if effect_sets is None else self._unpacked(state, effect_sets))
         self.effect_sets = effect_sets
@@ -173,23 +160,23 @@ def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
     Raises:
         InputError: the stored tensors are damaged.
     """
-    own = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
-    if not own:
+    stored = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
+    if not stored:
         return None
     opacities = state.get("splats.opacities")
     N = len(opacities) if isinstance(opacities, Tensor) and opacities.dim() == 1 else 0
 
     def part(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        value = own.pop(f"{_STATE}{name}", None)
+        value = stored.pop(f"{_STATE}{name}", None)
         if not isinstance(value, Tensor) or tuple(value.shape) != shape or value.dtype != dtype:
             raise InputError(f"checkpoint: expected {_STATE}{name} as {dtype} of shape {list(shape)}")
         return value
 
     refined, conditioned = part("counts", (2,), torch.int64).tolist()
     orders, frozen = part("orders", (N,), torch.uint8).to(torch.int32), part("frozen", (N,), torch.uint8)
-    intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in own else None
+    intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in stored else None
     known = bool((orders <= MOST_PACKED).all()) and bool((frozen <= TIME + DIRECTION).all())
-    if own or not known or not 0 <= refined <= conditioned <= N:
+    if stored or not known or not 0 <= refined <= conditioned <= N:
         raise InputError(f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders or "
                          f"frozen effects that there are not")  # fmt: skip
     return EffectSets(refined, conditioned, orders, frozen, intervals)

@@ -2,19 +2,19 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from gsbench.kernels.slices import slice_static
 from gsbench.models.base import SHRINK, Raw
-from gsbench.models.elementary import log
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
-from gsbench.models.query import Query
+from gsbench.models.gaussian_batch import Conditioned, Geometry
+from gsbench.models.portable_math import log
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
 
@@ -25,17 +25,13 @@ class Gaussians3DModel(GatedModel, gates=True):
 
     geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")
 
-    def __init__(self, **options: Any) -> None:
-        """Make a model without Gaussians. Options are those of `GatedModel`."""
-        super().__init__(**options)
-
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres whose radii are the distances [N] of the points to their neighbours."""
         quats = torch.zeros(len(distances), 4)
         quats[:, 0] = 1
         return {"scales": log(distances)[:, None].repeat(1, 3), "quats": quats}
 
-    def condition(self, raw: Raw, query: Query) -> Conditioned:
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Return the Gaussians themselves, because 3DGS depends on neither time nor direction."""
         return self.static(raw)
 
@@ -47,11 +43,11 @@ class Gaussians3DModel(GatedModel, gates=True):
         """Return the Gaussians themselves, with covariance factors R S and unchanged opacities."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Return an empty dictionary, because 3DGS has no dependence on time or direction that could be removed."""
         return {}
 
-    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute covariance factors and opacities by the backend's kernel if it has one, else in torch."""
         if not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)

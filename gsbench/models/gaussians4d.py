@@ -11,17 +11,16 @@ from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
 from gsbench.kernels.slices import slice_rotated
-from gsbench.models.appearance import sh_time_colors
-from gsbench.models.base import SHRINK, Raw
-from gsbench.models.color_order import ColorOrder, coefficients_within, order_of
+from gsbench.models.appearance import ColorOrder, coefficients_within, order_of, sh_time_colors
+from gsbench.models.base import SHRINK, Raw, slice_by
+from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.effect_sets import EffectSets
-from gsbench.models.elementary import exp, log
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN
+from gsbench.models.gaussian_batch import Conditioned, Geometry
 from gsbench.models.joint import JointModel
-from gsbench.models.query import Query, unit
+from gsbench.models.portable_math import exp, log
 from gsbench.models.registry import register
-from gsbench.models.sliced import Conditioned, Geometry
 from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import size_of
@@ -46,19 +45,13 @@ class Gaussians4DModel(JointModel, gates=True):
     geometry = ("scales", "left_quats", "right_quats")
 
     def __init__(
-        self, *, time_degree: int = 2, scheme: str = "square_root", lambda_t: float = 1.0, **options: Any
+        self,
+        *,
+        time_degree: int = 2,  # frequencies of the colours in time, without the constant; 0: constant colours
+        scheme: str = "square_root",  # the numerical method of conditioning on time, see `slice_gaussians`
+        lambda_t: float = 1.0,  # the coefficient in the exponent of f_temp, the factor of the opacity at a time
+        **options: Any,
     ) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            time_degree: the number of frequencies of the colours in time, without the constant; 0: constant colours.
-            scheme: the numerical method of conditioning on time, see `slice_gaussians`.
-            lambda_t: the coefficient in the exponent of f_temp, the factor of the opacity at a time.
-            options: the options of `GatedModel`.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
         super().__init__(**options)
         if not isinstance(time_degree, int) or not 0 <= time_degree <= MAX_DEGREE:
             raise InputError(f"time_degree: expected 0, 1, .., {MAX_DEGREE}, got {time_degree}")
@@ -79,7 +72,7 @@ class Gaussians4DModel(JointModel, gates=True):
         times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
-    def condition(self, raw: Raw, query: Query) -> Conditioned:
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Condition Gaussians on time t; f_temp = exp(-1/2 lambda_t (t - mu_t)^2 / S_t) multiplies opacities."""
         time = query.time
         assert time is not None
@@ -87,12 +80,12 @@ class Gaussians4DModel(JointModel, gates=True):
         # A Gaussian that is culled at this time is sliced at its own mean time instead, so its mean does not move.
         # Otherwise the huge numbers of a Gaussian that is thin in time would give gradients of 0 x inf.
         with torch.no_grad():
-            seen = self.opacity_factor(factor, delta) > TIME_OPACITY_FACTOR_MIN
+            visible = self.opacity_factor(factor, delta) > TIME_OPACITY_FACTOR_MIN
         mean = torch.cat([raw["means"], raw["times"]], -1)
-        at = torch.where(seen[:, None], time, raw["times"])
+        at = torch.where(visible[:, None], time, raw["times"])
         means, factors, _ = slice_gaussians(mean, factor, at, scheme=self.scheme)
-        opacity_factor = self.opacity_factor(factor, torch.where(seen[:, None], delta, 0.0))
-        return Conditioned(means, factors, torch.where(seen, opacity_factor, 0.0))
+        opacity_factor = self.opacity_factor(factor, torch.where(visible[:, None], delta, 0.0))
+        return Conditioned(means, factors, torch.where(visible, opacity_factor, 0.0))
 
     def static(self, raw: Raw) -> Conditioned:
         """Return the 3D Gaussians of Gaussians that ignore time, from left quaternions and spatial scales."""
@@ -106,7 +99,7 @@ class Gaussians4DModel(JointModel, gates=True):
         return {"scales": scales, "left_quats": left, "right_quats": right}
 
     @torch.no_grad()
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Remove the dependence on time: replace means and opacities by their weighted averages over views.
 
         The covariance becomes the conditional one, which is the same at all times.
@@ -178,26 +171,16 @@ class Gaussians4DModel(JointModel, gates=True):
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
-    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
         assert query.time is not None
-        geometry = slice_rotated(
-            raw["means"],
-            raw["times"],
-            raw["scales"],
-            raw["left_quats"],
-            raw["right_quats"],
-            raw["opacities"],
-            self.clock,
-            query.time,
-            self.log_lambda["time"],
-            conditioned=self.conditioned,
-        )
-        return Geometry(*geometry)
+        names = ("means", "times", "scales", "left_quats", "right_quats", "opacities")
+        at = self.clock, query.time, self.log_lambda["time"]
+        return slice_by(slice_rotated, raw, names, *at, conditioned=self.conditioned)
 
-    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: Query) -> Tensor:
+    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
-from gsbench.models.elementary import cos, sin
+from gsbench.models.portable_math import cos, sin
 
 OCTAVES = 10  # K of the time encoding in the 7DGS paper
 
@@ -45,9 +45,9 @@ class Refinement(nn.Module):
             outputs: the number of outputs of each network. The last network changes the parameters of the covariance,
                 the others change one mean each.
             generator: the source of the random weights of the first layers.
-            octaves: the number of frequencies of the time encoding. Many frequencies overfit a scene of few frames.
-            units: the unit of each parameter, [sum of outputs], by which inputs are divided and outputs multiplied, so
-                that the size of the scene does not matter; by default ones.
+            octaves: frequencies of the time encoding; many of them overfit a scene of few frames.
+            units: [sum of outputs], by which inputs are divided and outputs multiplied, so that the size of the scene
+                does not matter; by default ones.
         """
         super().__init__()
         self.features = sum(outputs[:-1])

@@ -1,54 +1,117 @@
-"""Render an image of a model: compute its 3D Gaussians for a camera and a time, and rasterize these."""
+"""Render an image of a model, once or as a CUDA graph that is replayed for other cameras and times."""
 
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import torch
 from torch import Tensor
 
-from gsbench.kernels.backends import Backend
+from gsbench.errors import InputError
+from gsbench.kernels.backends import Backend, resolve
+from gsbench.kernels.raster import Viewport
 from gsbench.models.base import GaussianModel
-from gsbench.models.query import Query
-from gsbench.models.sliced import Gaussians3D
-from gsbench.raster import RasterOutput, rasterize
+from gsbench.models.camera_time import CameraTime
+from gsbench.models.gaussian_batch import Gaussians3D
+from gsbench.raster import EPS2D, FAR, NEAR, RasterOutput, rasterize
+from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
 
 
 def rasterize_slice(
     gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
 ) -> RasterOutput:
-    """Rasterize the 3D Gaussians of a model (with colours) for one camera.
-
-    Args:
-        gaussians: the 3D Gaussians.
-        camera: the camera of the image.
-        background: the background colour, [3].
-        backend: the implementation of the rasterizer.
-        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
-    """
-    return rasterize(
-        gaussians.means,
-        gaussians.factors,
-        gaussians.opacities,
-        gaussians.colors,
-        camera.viewmat[None],
-        camera.K[None],
-        camera.width,
-        camera.height,
-        background=background,
-        backend=backend,
-        antialias=antialias,
-        shapes=gaussians.shapes,
-    )
+    """Rasterize the 3D Gaussians of a model (with colours) for one camera, as `gsbench.raster.rasterize`."""
+    view = camera.viewmat[None], camera.K[None], camera.width, camera.height
+    return rasterize(*gaussians[:4], *view, background=background, backend=backend, antialias=antialias,
+                     shapes=gaussians.shapes)  # fmt: skip
 
 
 def render(
     model: GaussianModel, camera: Camera, time: float | None, background: Tensor, antialias: bool = False
 ) -> Tensor:
-    """Render the image [H, W, 3] of a model for a camera and a time.
+    """Render the image [H, W, 3] of a model for a camera and a time in [0, 1], with its backend."""
+    gaussians = model.slice(CameraTime.of(camera, time))
+    return rasterize_slice(gaussians, camera, background, model.backend, antialias).image[0]
 
-    Args:
-        model: a model with Gaussians; its backend renders.
-        camera: the camera.
-        time: the time in [0, 1]; None if the scene has no time.
-        background: the background colour, [3].
-        antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
+
+MARGIN = 1.25  # room for intersections, as a multiple of what the first image needs
+T = TypeVar("T")
+
+
+class _Recording(NamedTuple):
+    """Hold a CUDA graph that renders images of one size. The camera and time are overwritten before each replay."""
+
+    camera: Camera
+    time: Tensor | None  # []
+    play: Callable[[], None]
+    image: Tensor  # [H, W, 3]
+    needed: Tensor  # [2] int64: intersections, and whether a value was out of range
+    room: int  # the number of intersections that fit into the graph's memory
+
+
+class GraphedFrames:
+    """Render images of a model on a GPU by replaying a CUDA graph.
+
+    The first call for an image size records the graph. The graph has memory for MARGIN times as many tile
+    intersections as the first image has, so rendering needs no synchronisation before the end of an image. If an image
+    has more intersections, the graph is recorded again. The number of Gaussians must not change.
     """
-    seen = model.slice(Query.of(camera, time))
-    return rasterize_slice(seen, camera, background, model.backend, antialias).image[0]
+
+    def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
+        """Prepare to render a model on a GPU; raises InputError if it does not use the CUDA backend."""
+        backend = resolve(model.backend.name, model.splats["means"].device.type)
+        if backend.name != "cuda":
+            raise InputError(f"CUDA graph: expected raster.backend=cuda, got '{backend.name}': only a GPU records what "
+                             f"it does")  # fmt: skip
+        self.model = model
+        self.background = background
+        self.antialias = antialias
+        self._recordings: dict[tuple[int, int, bool], _Recording] = {}
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera, time: float | None) -> Tensor:  # [H, W, 3]
+        """Return the image of the model for a camera and a time. The next call overwrites this image.
+
+        Raises:
+            InputError: the model depends on time and `time` is None, or a value is out of range.
+            RuntimeError: CUDA cannot record this model.
+        """
+        size = camera.width, camera.height, time is None
+        if size not in self._recordings:
+            self._recordings[size] = self._record(camera, time)
+        recording = self._recordings[size]
+        recording.camera.overwrite(camera)
+        if recording.time is not None and time is not None:
+            recording.time.fill_(time)
+        recording.play()
+        *pairs, flags = recording.needed.tolist()  # waits for the image
+        if flags or any(n > recording.room for n in pairs):
+            del self._recordings[size]
+            return self(camera, time)
+        return recording.image
+
+    def _record(self, camera: Camera, time: float | None) -> _Recording:
+        gaussians = self.model.slice(CameraTime.of(camera, time))
+        drawn = rasterize_slice(gaussians, camera, self.background, self.model.backend, self.antialias)
+        room = 1 + int(MARGIN * drawn.info.pairs)
+        recorded = camera.clone()
+        moment = None if time is None else recorded.K.new_full((), time)
+        view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
+
+        def frame() -> tuple[Tensor, Tensor]:
+            means, factors, opacities, colors, shapes = self.model.slice(CameraTime.of(recorded, moment))
+            return draw_within(means, factors, opacities, colors[None], recorded.viewmat[None], recorded.K[None],
+                               self.background, view, room, shapes)  # fmt: skip
+
+        with torch.cuda.device_of(recorded.K):
+            play, (image, needed) = capture(frame)
+        return _Recording(recorded, moment, play, image[0], needed, room)
+
+
+def capture(call: Callable[[], T]) -> tuple[Callable[[], None], T]:
+    """Record a call as a CUDA graph. Return a function that replays it, and the result, which a replay overwrites."""
+    call()  # the first call loads modules, which cannot be recorded
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        results = call()
+    return graph.replay, results

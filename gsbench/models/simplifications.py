@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from gsbench.models.base import GaussianModel, Raw
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
-from gsbench.models.query import Query
-from gsbench.models.sliced import Gaussians3D
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.process.workers import side_by_side
 from gsbench.scenes.points import SH_C0
 
@@ -35,7 +35,7 @@ class Simplification:
 
 
 def simplifications_of(
-    model: GatedModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], by_halves: bool = True
+    model: GatedModel, queries: Sequence[CameraTime], slices: Sequence[Gaussians3D], by_halves: bool = True
 ) -> list[Simplification]:
     """Return the parameters of a model's Gaussians after each possible simplification.
 
@@ -84,7 +84,7 @@ def _all(model: GaussianModel, order: int) -> Tensor:
 
 
 def _averages(
-    model: GaussianModel, queries: Sequence[Query], slices: Sequence[Gaussians3D], weights: Tensor,
+    model: GaussianModel, queries: Sequence[CameraTime], slices: Sequence[Gaussians3D], weights: Tensor,
     names: Sequence[str], fewer: Sequence[Raw],
 ) -> tuple[Raw, list[Tensor]]:  # fmt: skip
     """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops.

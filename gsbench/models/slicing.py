@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.tensors import check_tensor
-from gsbench.models.elementary import sqrt
+from gsbench.models.portable_math import sqrt
 
 SCHEMES = ("square_root", "schur", "cholesky")
 

@@ -11,7 +11,6 @@ from gsbench.config import Config, DataConfig
 from gsbench.config_roles import training_hash
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
-from gsbench.models.start import start_from
 from gsbench.run import progress, stop
 from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import Run
@@ -37,7 +36,7 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     """Initialise the Gaussians of a model, from trained ones or from points, and return the trainer at step 0."""
     random = generator(config.seed)
     if start is not None:
-        start_from(model, start, scene.extent, random)
+        model.start_from(start, scene.extent, random)
     else:
         model.initialise(scene.points or initial_points(config.data, scene, random), scene.extent, random)
     model.to(config.device)

@@ -83,11 +83,11 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         First run `python -m gsbench +exp=mini model=3dgs scene=moving-matte train.iterations=20`.
 
         >>> import torch
-        >>> from gsbench import Query, load_run
+        >>> from gsbench import CameraTime, load_run
         >>> run = load_run("results/mini/moving-matte/3dgs,iterations=20/seed0")
         >>> run.scene.name, run.step, run.config.seed
         ('moving-matte', 20, 0)
-        >>> gaussians = run.model.slice(Query.at(torch.tensor([0.0, -4.0, 0.0]), 0.5))
+        >>> gaussians = run.model.slice(CameraTime.at(torch.tensor([0.0, -4.0, 0.0]), 0.5))
         >>> gaussians.means.shape == (len(run.model), 3)
         True
     """

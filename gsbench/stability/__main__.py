@@ -15,7 +15,6 @@ from gsbench.errors import InputError, one_line
 from gsbench.models import GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.registry import import_models
-from gsbench.models.start import start_from
 from gsbench.process.ending import end_with
 from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
@@ -104,7 +103,7 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
 def _of_ply(path: Path, out: Path) -> Subject:
     trained = read_trained(path)
     model = build("3dgs", sh_degree=MAX_DEGREE)
-    start_from(model, trained, 1.0, generator(0))
+    model.start_from(trained, 1.0, generator(0))
     model.set_active(ActiveComponents(MAX_DEGREE, False, False))
     model.requires_grad_(False)
     middle = trained.means.median(0).values

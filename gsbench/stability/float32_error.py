@@ -14,9 +14,9 @@ from gsbench.errors import InputError, one_line
 from gsbench.kernels.raster import Viewport
 from gsbench.measure.images import STEPS, Pixels, rounding_image
 from gsbench.measure.quality import capped_psnr, evenly
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.joint import JointModel
-from gsbench.models.sliced import Gaussians3D
 from gsbench.models.slicing import reduce, subtract
 from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U
@@ -279,7 +279,7 @@ class Float32Error(NamedTuple):
 def float32_error(
     double: GaussianModel,
     single: Gaussians3D,
-    query: Query,
+    query: CameraTime,
     camera: Camera,
     background: Tensor,  # [3] float32
     antialias: bool,

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
-from gsbench.models.sliced import Gaussians3D
 from gsbench.raster.exact import ExactImage, exact_image
 from gsbench.scenes.scene import Camera
 
@@ -58,9 +58,9 @@ def render_twice(
     Raises:
         InputError: the CPU kernels are not installed, or a Gaussian has a value that is not finite.
     """
-    single = model.slice(Query.of(camera, time))
+    single = model.slice(CameraTime.of(camera, time))
     image = rasterize_slice(single, camera, background, model.backend, antialias).image[0]
-    gaussians = double.slice(Query.of(float64_camera(camera), time))
+    gaussians = double.slice(CameraTime.of(float64_camera(camera), time))
     return RenderedTwice(image, gaussians, float64_image(gaussians, single, camera, background, antialias))
 
 

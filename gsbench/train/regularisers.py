@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.scenes import View
 from gsbench.train.batches import generator
 from gsbench.train.checkpoint import MOST_STEPS, tensor, whole_number
@@ -47,7 +47,7 @@ class Penalty(ABC):
         self.frames = frames
 
     @abstractmethod
-    def __call__(self, query: Query, index: int) -> Tensor:
+    def __call__(self, query: CameraTime, index: int) -> Tensor:
         """Return the penalty for view number `index` of a batch, []."""
 
     def prepare(self, step: int, first: View) -> None:
@@ -68,7 +68,7 @@ class Penalty(ABC):
 class MeanOpacity(Penalty):
     """The mean opacity of all Gaussians, a regulariser of 3DGS-MCMC."""
 
-    def __call__(self, query: Query, index: int) -> Tensor:
+    def __call__(self, query: CameraTime, index: int) -> Tensor:
         """Return the mean opacity, []; it is the same for every view."""
         return torch.sigmoid(self.model.splats["opacities"]).mean()
 
@@ -76,7 +76,7 @@ class MeanOpacity(Penalty):
 class MeanSize(Penalty):
     """The mean scale in space over Gaussians and axes, divided by the radius of the scene (3DGS-MCMC)."""
 
-    def __call__(self, query: Query, index: int) -> Tensor:
+    def __call__(self, query: CameraTime, index: int) -> Tensor:
         """Return the mean scale, []; it is the same for every view."""
         return self.model.spatial_scales().mean() / self.model.extent
 
@@ -110,9 +110,9 @@ class Strain(Penalty):
         self.step = step
         if self.neighbours is None or step >= self.searched + EVERY:
             self.searched = step
-            self._use(self._nearest(Query.of(first.camera, first.time)))
+            self._use(self._nearest(CameraTime.of(first.camera, first.time)))
 
-    def __call__(self, query: Query, index: int) -> Tensor:
+    def __call__(self, query: CameraTime, index: int) -> Tensor:
         """Return E for a view, []."""
         if not len(self.rows):
             return query.center.new_zeros(())
@@ -121,7 +121,7 @@ class Strain(Penalty):
         draws = generator(self.seed, self.step, DRAWS, index)
         drawn = 2 * float(torch.rand((), generator=draws)) - 1
         share = (1 - LEAST_SHARE) * drawn + (LEAST_SHARE if drawn > 0 else -LEAST_SHARE)
-        later = Query(query.center, query.time + share / self.frames)
+        later = CameraTime(query.center, query.time + share / self.frames)
         assert later.time is not None
         sample = self.rows[torch.randperm(len(self.rows), generator=draws)[:SAMPLES].to(self.rows.device)]
         pairs = self.neighbours[sample].long().T.contiguous()  # [k, B]
@@ -157,7 +157,7 @@ class Strain(Penalty):
         self.neighbours = neighbours
         self.rows = (neighbours[:, 0] >= 0).nonzero()[:, 0]
 
-    def _nearest(self, query: Query) -> Tensor:
+    def _nearest(self, query: CameraTime) -> Tensor:
         """Return the nearest visible neighbours of each visible Gaussian for a camera and a time, [N, k] int32."""
         means, visible = self._visible_means(query)
         rows = ((visible > VISIBLE) & means.isfinite().all(-1)).nonzero()[:, 0]
@@ -171,7 +171,7 @@ class Strain(Penalty):
         neighbours[rows] = rows[nearest[~itself].unflatten(0, (-1, NEIGHBOURS)).to(rows.device)].int()
         return neighbours
 
-    def _visible_means(self, query: Query) -> tuple[Tensor, Tensor]:
+    def _visible_means(self, query: CameraTime) -> tuple[Tensor, Tensor]:
         """Return the conditional means [N, 3] and, without gradients, the opacity factors in [0, 1], [N]."""
         raw = self.model.refined(query)
         geometry = self.model.slice_geometry(raw, query)

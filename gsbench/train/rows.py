@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gsbench.models import GaussianModel
-from gsbench.models.visible_times import visible_intervals
 
 START_BINS = 16  # number of intervals of the time range, by which rows are sorted
 
@@ -69,7 +68,7 @@ class Rows:
         groups of 16 that are processed from 96 % to 42 %. Gaussians that a gate has simplified stay as they are, sorted
         by what they depend on.
         """
-        intervals = None if self.model.effect_sets is not None else visible_intervals(self.model)
+        intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
         if intervals is not None:
             first, last = intervals.unbind(1)
             self.select(((first * START_BINS).floor() + last / 2).argsort(stable=True))

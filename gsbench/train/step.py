@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
 from gsbench.measure.speed import StageClock
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
@@ -186,7 +186,7 @@ class Step:
         """
         with Tape() as tape:
             with stages("slice"):
-                query = Query.of(view.camera, view.time)
+                query = CameraTime.of(view.camera, view.time)
                 gaussians = self.model.slice(query)
             with stages("raster"):
                 try:

@@ -15,7 +15,7 @@ from gsbench.kernels.tape import Differentiable, Tape
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
-from gsbench.models.query import Query
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.render import rasterize_slice
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
@@ -149,8 +149,8 @@ class FrameRenderer:
             with self._lock, torch.inference_mode():
                 self._exact = self._exact or float64_model(run.model)
                 run.model.active = self._exact.active = self._active(request)
-                single = run.model.slice(Query.at(camera.center if center is None else center, request.time))
-            query = Query.at(float64_camera(camera).center if center is None else center.double(), request.time)
+                single = run.model.slice(CameraTime.at(camera.center if center is None else center, request.time))
+            query = CameraTime.at(float64_camera(camera).center if center is None else center.double(), request.time)
             background = self._background(request)
             return float32_error(self._exact, single, query, camera, background, run.config.raster.antialias)
 
@@ -159,7 +159,7 @@ class FrameRenderer:
         run, device = self.run, self.run.config.device
         camera = camera.to(device)
         center = camera.center if request.center is None else request.center.to(device)
-        query = Query.at(center, request.time)
+        query = CameraTime.at(center, request.time)
         with self._lock, torch.inference_mode(), StageWatch(device) as watch:
             run.model.active = self._active(request)
             gaussians = run.model.slice(query)

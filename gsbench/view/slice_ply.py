@@ -14,9 +14,9 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.measure.atomic import write_atomically
 from gsbench.models.base import GaussianModel
+from gsbench.models.camera_time import CameraTime
+from gsbench.models.gaussian_batch import reach
 from gsbench.models.gaussians4d import Gaussians4DModel
-from gsbench.models.query import Query
-from gsbench.models.sliced import reach
 from gsbench.run.load import LoadedRun
 from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 from gsbench.scenes.placement import gaussians_to_user
@@ -34,14 +34,14 @@ class SlicePly(NamedTuple):
     from_profiles: bool  # whether they stand for Beta profiles that look like them
 
 
-def write_ply(run: LoadedRun, query: Query, path: Path, *, keep_harmonics: bool) -> SlicePly:
+def write_ply(run: LoadedRun, query: CameraTime, path: Path, *, keep_harmonics: bool) -> SlicePly:
     """Write the 3D Gaussians of a query in the user's coordinates; see `trained_of`."""
     trained = trained_of(run.model, query, keep_harmonics=keep_harmonics)
     write_atomically(path, ply_of(gaussians_to_user(trained, run.scene.placement)))
     return SlicePly(path, len(trained), trained.from_profiles)
 
 
-def write_clip(run: LoadedRun, queries: Sequence[Query], folder: Path, *, keep_harmonics: bool) -> list[SlicePly]:
+def write_clip(run: LoadedRun, queries: Sequence[CameraTime], folder: Path, *, keep_harmonics: bool) -> list[SlicePly]:
     """Write a PLY file for each query as frame0000.ply, frame0001.ply and so on into an empty or new folder.
 
     SuperSplat plays such a folder as a clip: one prefix, numbers of one width. If this fails, the files that were
@@ -68,7 +68,7 @@ def write_clip(run: LoadedRun, queries: Sequence[Query], folder: Path, *, keep_h
         raise
 
 
-def trained_of(model: GaussianModel, query: Query, *, keep_harmonics: bool = False) -> TrainedGaussians:
+def trained_of(model: GaussianModel, query: CameraTime, *, keep_harmonics: bool = False) -> TrainedGaussians:
     """Compute a model's 3D Gaussians at a viewpoint and a time, and return those with enough opacity to be drawn.
 
     Beta profiles become the Gaussians that look like them. Colours stay spherical harmonics with `keep_harmonics`;
@@ -119,7 +119,7 @@ def has_harmonics(model: GaussianModel) -> bool:
     return are_harmonics and "direction" not in model.observes
 
 
-def harmonics_at(model: GaussianModel, query: Query) -> Tensor:
+def harmonics_at(model: GaussianModel, query: CameraTime) -> Tensor:
     """Return the SH coefficients of the colours at a certain time, [N, K, 3], of the degrees in use."""
     used = (model.active.sh_degree + 1) ** 2
     sh0, shN = model.splats["sh0"], model.splats["shN"]

@@ -16,7 +16,7 @@ from gsbench.effects import choose, leftovers, waves
 from gsbench.effects.choose import screen
 from gsbench.effects.waves import evidence
 from gsbench.errors import InputError
-from gsbench.models.sliced import Gaussians3D
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Scene
 
 EMBEDDED = Path(__file__).resolve().parents[2] / "gsbench/scenes/sample"

@@ -18,11 +18,11 @@ from gsbench.errors import InputError
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.exact_views import capped
 from gsbench.measure.quality import psnr
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import DIRECTION, EffectSets
+from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import render
 from gsbench.models.simplifications import simplifications_of
-from gsbench.models.sliced import Gaussians3D, tensors_of
 
 VIEWS = 10
 
@@ -88,8 +88,8 @@ def test_effect_sets_are_as_the_rows(name: str) -> None:
 def test_a_frozen_variable_changes_nothing() -> None:
     """Catches a Gaussian that still moves with what was frozen, or that no longer moves with what was not."""
     model, sensitivity = probed("7dgs")
-    here = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
-    later, beside = Query.at(here.center, 0.9), Query.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
+    here = CameraTime.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
+    later, beside = CameraTime.at(here.center, 0.9), CameraTime.at(torch.tensor([4.0, 0.0, 0.0]), 0.2)
     for name, same, different in (("time", later, beside), ("direction", beside, later), ("static", later, None)):
         after = copy.deepcopy(model)
         everything = choose(sensitivity, after, 0.0)
@@ -128,7 +128,7 @@ def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
     """Catches a simplification of a gated model that changes Gaussians whose errors the probe does not look at."""
     _, after = gated(name, 3.0)
     views = views_of(after, 1)[:VIEWS]
-    queries = [Query.of(view.camera, view.time) for view in views]
+    queries = [CameraTime.of(view.camera, view.time) for view in views]
     live = [after.slice(query) for query in queries]
     errors = probe(after, views, BLACK).errors
     for simplification in simplifications_of(after, queries, live):

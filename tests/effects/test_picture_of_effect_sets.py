@@ -16,8 +16,8 @@ from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.simplifications import STATIC
-from gsbench.models.sliced import Gaussians3D
 from gsbench.report.render.palette import SETS, THEMES
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents

@@ -6,10 +6,10 @@ from torch import Tensor
 from worlds import camera
 
 from gsbench.effects.sensitivity import probe
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import Simplification, simplifications_of
-from gsbench.models.sliced import Gaussians3D, tensors_of
 from gsbench.scenes.scene import Points, View
 from gsbench.schedule import ActiveComponents
 
@@ -47,12 +47,12 @@ def views_of(model: GaussianModel, seed: int) -> list[View]:
     for i in range(VIEWS):
         draws = torch.rand(3, generator=random).tolist()
         seen, time = camera(6.28 * draws[0], 1.6 * draws[1] - 0.8, SIZE), draws[2]
-        image = rasterize_slice(model.slice(Query.of(seen, time)), seen, BLACK, model.backend).image[0]
+        image = rasterize_slice(model.slice(CameraTime.of(seen, time)), seen, BLACK, model.backend).image[0]
         film.append(View(str(i), seen, time, image + 0.02 * torch.randn(image.shape, generator=random)))
     return film
 
 
-def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussians3D, query: Query) -> Gaussians3D:
+def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussians3D, query: CameraTime) -> Gaussians3D:
     """All Gaussians as the simplification has them."""
     if simplification.raw is None:
         return live._replace(opacities=torch.zeros_like(live.opacities))
@@ -67,7 +67,7 @@ def brute_force(model: GaussianModel, views: list[View], simplification: Simplif
     """The error that each Gaussian adds when it alone is simplified, what improves a view not counted, [N]."""
     errors = torch.zeros(len(model))
     for view in views:
-        query = Query.of(view.camera, view.time)
+        query = CameraTime.of(view.camera, view.time)
         live = model.slice(query)
         changed = slice_of(model, simplification, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
@@ -92,7 +92,7 @@ def test_prediction_against_brute_force(name: str) -> None:
     model = trained_a_little(name, 0)
     views = views_of(model, 1)
     predicted = probe(model, views, BLACK, draws=64)
-    queries = [Query.of(view.camera, view.time) for view in views]
+    queries = [CameraTime.of(view.camera, view.time) for view in views]
     seen = [model.slice(query) for query in queries]
     for simplification in simplifications_of(model, queries, seen):
         true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
@@ -121,7 +121,7 @@ def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
         model.splats["motion"][:] = 0.01 * torch.randn(6, 3, generator=torch.Generator().manual_seed(2))
         model.splats["opacities"][:] = logit
         views = views_of(model, 1)
-        queries = [Query.of(view.camera, view.time) for view in views]
+        queries = [CameraTime.of(view.camera, view.time) for view in views]
         ways = simplifications_of(model, queries, [model.slice(q) for q in queries])
         static = next(way for way in ways if way.name == "static")
         ratios[name] = probe(model, views, BLACK, draws=8).errors["static"] / brute_force(model, views, static)
@@ -135,7 +135,7 @@ def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
     with r = -x / 2, where it would be an improvement, nothing.
     """
     model, N = trained_a_little("3dgs", 0), 4
-    query = Query.at(camera(0.3, 0.2, SIZE).center, None)
+    query = CameraTime.at(camera(0.3, 0.2, SIZE).center, None)
     seen = camera(0.3, 0.2, SIZE)
     live = model.slice(query)
     image = rasterize_slice(live, seen, BLACK, model.backend).image[0]

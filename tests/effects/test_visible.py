@@ -13,7 +13,7 @@ from gsbench.effects.gate import apply, choose, effect_sets_of
 from gsbench.effects.sensitivity import probe
 from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import render
 
 
@@ -35,7 +35,7 @@ def test_when_a_gaussian_is_seen() -> None:
     intervals = seen_times(model, views)
     shown = torch.zeros(N, len(views), dtype=torch.bool)
     for i, view in enumerate(views):
-        query = Query.of(view.camera, view.time)
+        query = CameraTime.of(view.camera, view.time)
         for raw in (model.refined(query), dict(model.splats.items())):
             shown[:, i] |= model.slice_geometry(raw, query)[2] >= ALPHA_MIN
     at = torch.tensor([view.time for view in views])

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.backends import AUTO
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
-from gsbench.models.sliced import Gaussians3D
 from gsbench.scenes.scene import Camera, Scene, View, scene_extent
 
 SIZE = 40

@@ -8,7 +8,7 @@ from tensors import disturb
 from workers import Case
 
 from gsbench import models
-from gsbench.models.query import Query
+from gsbench.models.camera_time import CameraTime
 from gsbench.models.render import render
 from gsbench.scenes.points import random_points
 from gsbench.scenes.scene import Camera
@@ -51,7 +51,7 @@ def draw_model(r: random.Random) -> Case:
         model = models.build(name, **options)
         random_generator = torch.Generator().manual_seed(0)
         model.initialise(random_points(20, 1.0, random_generator), 1.0, random_generator)
-        model.slice(Query.at(center, time))
+        model.slice(CameraTime.at(center, time))
         viewmat = torch.eye(4)
         viewmat[2, 3] = 4.0
         K = torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]])

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.cholesky import CholeskyModel
+from gsbench.models.gaussian_batch import Geometry, tensors_of
 from gsbench.models.gaussians4d import Gaussians4DModel
-from gsbench.models.moving3d import MovingGaussians3D
-from gsbench.models.sliced import Geometry, tensors_of
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.moving import MovingGaussians3D
 from gsbench.scenes.scene import Points
 
 Raw = dict[str, Tensor]
@@ -57,7 +57,7 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
         return _moving(model, g)
     N, k = 45, {"7dgs": 4, "6dgs": 3, "7dgs_nodir": 1, "ubs": 4, "ubs_static": 3}.get(name, 0)
     raw = {"means": normal(N, 3), "opacities": normal(N, size=2)}
-    if isinstance(model, TriangularModel):
+    if isinstance(model, CholeskyModel):
         raw |= {"log_diagonal": normal(N, k + 3, size=0.3, mean=-0.5), "shape": normal(N, 3, size=0.5),
                 "motion": normal(N, 3 * k, size=0.5)}  # fmt: skip
         if name != "7dgs_nodir":
@@ -103,7 +103,7 @@ def _moving(model: MovingGaussians3D, g: torch.Generator) -> Raw:
 def slice_of(model: GaussianModel, raw: Raw) -> list[Tensor]:
     """A slice, with F F^T in the place of F where several square factors F are right."""
     at = raw["opacities"]
-    geometry = model.slice_geometry(raw, Query(CENTER.to(at), TIME.to(at)))
+    geometry = model.slice_geometry(raw, CameraTime(CENTER.to(at), TIME.to(at)))
     return _covariances(geometry) if "lower" in raw else tensors_of(geometry)
 
 

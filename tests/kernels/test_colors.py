@@ -11,7 +11,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.colors import show_colors
 from gsbench.models.appearance import sh_colors, sh_time_colors
-from gsbench.models.query import unit
+from gsbench.models.camera_time import unit
 
 CENTER, TIME = torch.tensor([0.1, 0.2, -2.0]), torch.tensor(0.7)
 

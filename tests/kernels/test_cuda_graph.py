@@ -12,9 +12,8 @@ from benchmarks.scene import model
 from gsbench.errors import InputError
 from gsbench.kernels.backends import CUDA, REFERENCE
 from gsbench.kernels.raster import Viewport
-from gsbench.models import GaussianModel, Query, cuda_graph
-from gsbench.models.cuda_graph import GraphedFrames
-from gsbench.models.render import render
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.render import GraphedFrames, render
 from gsbench.raster import EPS2D, FAR, NEAR
 from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
@@ -29,7 +28,7 @@ def camera(device: str, distance: float = 4.0, size: int = 40) -> Camera:
 
 
 def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
-    """`cuda_graph.capture` where there is no GPU: its results are overwritten, as a graph's are."""
+    """`render.capture` where there is no GPU: its results are overwritten, as a graph's are."""
     results = call()
 
     def play() -> None:
@@ -43,8 +42,8 @@ def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
 def device(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> str:
     """Where replays run."""
     if cuda_device == "cpu":
-        monkeypatch.setattr(cuda_graph, "capture", called_again)
-        monkeypatch.setattr(cuda_graph, "resolve", lambda *_: CUDA)
+        monkeypatch.setattr("gsbench.models.render.capture", called_again)
+        monkeypatch.setattr("gsbench.models.render.resolve", lambda *_: CUDA)
     return cuda_device
 
 
@@ -118,7 +117,7 @@ def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
     """Catches a pair written past the end of the lists; with too few of them the count alone is right."""
     at, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
-        means, factors, opacities, colors, _ = fitted.slice(Query.at(at.center, 0.4))
+        means, factors, opacities, colors, _ = fitted.slice(CameraTime.at(at.center, 0.4))
         image, needed = draw_within(
             means[:N], factors[:N], opacities[:N], colors[None, :N], at.viewmat[None], at.K[None],
             torch.tensor(BACKGROUND, device=device),

@@ -11,8 +11,8 @@ import torch
 from benchmarks.scene import camera, gaussians, model
 from gsbench import kernels
 from gsbench.kernels.loss import l1_ssim
-from gsbench.models import GaussianModel, Query
-from gsbench.models.sliced import tensors_of
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import rasterize
 
 N = 5_000
@@ -23,7 +23,7 @@ def calls() -> dict[str, Callable[[], object]]:
     """Forward and backward of every operation, by what it does."""
     names = "3dgs", "4dgs", "7dgs", "dgs", "dbs", "freetime", "ubs"
     sliced = {name: model(name, N, agr=name == "7dgs") for name in names}
-    query = Query.at(torch.tensor([0.0, 0.0, -4.0]), 0.4)
+    query = CameraTime.at(torch.tensor([0.0, 0.0, -4.0]), 0.4)
     splats, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(N)], camera(200)
     b = torch.full((N,), 4.0).requires_grad_()
     image, target = torch.rand(200, 200, 3).requires_grad_(), torch.rand(200, 200, 3)

@@ -17,10 +17,10 @@ from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import Tape
 from gsbench.measure.speed import StageClock
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import EffectSets
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.render import rasterize_slice
-from gsbench.models.sliced import tensors_of
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
 
@@ -62,7 +62,7 @@ def gradients(of: GaussianModel) -> dict[str, Tensor]:
 def test_a_tape_runs_backwards_for_several_vectors() -> None:
     """Catches a second vector whose product has the first one's in it, or is empty: the probe asks for two."""
     view = views(1)[0]
-    gaussians = fitted("7dgs").slice(Query.of(view.camera, view.time))
+    gaussians = fitted("7dgs").slice(CameraTime.of(view.camera, view.time))
     at = [x.detach().requires_grad_() for x in tensors_of(gaussians)]
     with Tape() as tape:
         images = rasterize_slice(type(gaussians)(*at), view.camera, BACKGROUND, CPU).image
@@ -86,7 +86,7 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) 
     fitting, batch = fitted(name, agr=agr, classed=classed), views(3)
     expected: dict[str, Tensor] = {}
     for view in batch:
-        gaussians = fitting.slice(Query.of(view.camera, view.time))
+        gaussians = fitting.slice(CameraTime.of(view.camera, view.time))
         output = rasterize_slice(gaussians, view.camera, BACKGROUND, CPU)
         output.info.means2d.retain_grad()
         (l1_ssim(output.image[0], view.image, 0.2) / 3).backward()
@@ -258,7 +258,7 @@ def test_torch_is_given_the_right_shapes(name: str, classed: bool) -> None:
         intervals = intervals_around(time, fitting.effect_sets.refined)[1]
         fitting.effect_sets = fitting.effect_sets._replace(intervals=intervals)
     with Calls() as calls:
-        fitting.slice(Query(torch.tensor([0.3, -0.2, -3.0]), time))
+        fitting.slice(CameraTime(torch.tensor([0.3, -0.2, -3.0]), time))
     slicing = "slice_triangular" if name == "7dgs" else "slice_rotated"
     assert {f"gsbench::{operation}" for operation in ("refine", slicing, "show_colors")} <= calls.arguments.keys()
     for operator, arguments in calls.arguments.values():

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import GaussianModel, Query, build
-from gsbench.models.visible_times import visible_intervals
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.scenes.scene import Points
 
 N = 24
@@ -70,12 +69,12 @@ def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gauss
 
 def assert_culled_outside_its_intervals(model: GaussianModel, times: Tensor, exact: bool) -> None:
     """A Gaussian has too low an opacity outside its visible interval and, if `exact`, only there."""
-    intervals = visible_intervals(model)
+    intervals = model.visible_intervals()
     assert intervals is not None
     first, last = intervals.unbind(1)
     hidden = 0
     for time in times:
-        opacities = model.slice(Query.at(CAMERA, time)).opacities
+        opacities = model.slice(CameraTime.at(CAMERA, time)).opacities
         outside = (time < first) | (time > last)
         assert (opacities[outside] < ALPHA_MIN * (1 + 1e-9)).all()
         hidden += int(outside.sum())

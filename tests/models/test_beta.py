@@ -8,17 +8,15 @@ from small import CAMERA, assert_culled_outside_its_intervals, moved, started
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query, build
-from gsbench.models.beta import BetaModel, opacity_factor, softplus_inverse
-from gsbench.models.dbs import DirectBetaModel
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.beta import BetaModel, joint_factor, opacity_factor, softplus_inverse
+from gsbench.models.camera_time import unit
 from gsbench.models.gated import GatedModel
-from gsbench.models.query import unit
+from gsbench.models.moving import DirectBetaModel
 from gsbench.models.slicing import slice_gaussians
-from gsbench.models.ubs import joint_factor
-from gsbench.models.visible_times import visible_intervals
 
 DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-QUERY = Query(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # seen from there, the origin lies in DIRECTION
+QUERY = CameraTime(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # seen from there, the origin lies in DIRECTION
 NAMES = ("ubs", "ubs_static", "dbs", "dbs_static")
 
 
@@ -122,7 +120,7 @@ def test_they_start_as_their_authors_start(name: str) -> None:
     assert -1 <= model.splats["directions"].min() < -0.9
     dynamic = "time" in model.observes
     assert model.splats["betas"].unique(dim=0).tolist() == [[0.0, *[-3.0 if dynamic else 0.0] * 3, *[0.0] * dynamic]]
-    first = model.slice(Query.at(CAMERA.float(), 0.3))
+    first = model.slice(CameraTime.at(CAMERA.float(), 0.3))
     assert first.shapes is not None
     assert first.shapes.unique().tolist() == [4.0]
     sizes = torch.linalg.matrix_norm(first.factors, ord=2)
@@ -159,7 +157,7 @@ def test_outside_its_interval_a_gaussian_of_dbs_is_culled() -> None:
     with torch.no_grad():
         model.splats["betas"].clamp_(min=-1.5)  # weaker ones end at the floor, where they may stay visible
     assert_culled_outside_its_intervals(model, torch.linspace(0, 1, 21, dtype=torch.float64), exact=False)
-    assert visible_intervals(started(build("ubs"), 5)) is None  # its rows are not sorted
+    assert started(build("ubs"), 5).visible_intervals() is None  # its rows are not sorted
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsbench.models.color_order import MOST_PACKED, ColorOrder, at_most, coefficients_within, order_of
+from gsbench.models.appearance import MOST_PACKED, ColorOrder, at_most, coefficients_within, order_of
 
 PACKED = st.integers(0, MOST_PACKED)
 

@@ -6,15 +6,15 @@ from small import CAMERA, VARIANTS, N, lively, seeded
 from torch import Tensor
 
 from gsbench.kernels.headers import LOG_SIZE_MAX
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.cholesky import CholeskyModel
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import rotation, rotation4d, turn_of_space
-from gsbench.models.sliced import tensors_of
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.schedule import ActiveComponents
 
 OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs")]
-QUERY = Query.at(CAMERA, 0.45)
+QUERY = CameraTime.at(CAMERA, 0.45)
 
 
 def classed(variant: str, count: int, refined: int, conditioned: int, sh_degree: int = 3) -> GaussianModel:
@@ -52,7 +52,7 @@ def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
     for name in (*model.centers, *model.geometry):
         assert torch.equal(moved[name][8:], raw[name][8:])
         torch.testing.assert_close(moved[name][:8], everything[name][:8])
-    other = Query.at(torch.tensor([3.0, 1.0, 2.0], dtype=torch.float64), 0.9)
+    other = CameraTime.at(torch.tensor([3.0, 1.0, 2.0], dtype=torch.float64), 0.9)
     here, there = model.slice(QUERY), model.slice(other)
     for x, y in zip(here[:3], there[:3], strict=True):
         assert torch.equal(x[15:], y[15:])
@@ -86,7 +86,7 @@ def test_agr_that_moves_nothing_is_not_called(monkeypatch: pytest.MonkeyPatch) -
 def test_agr_moves_a_row_within_its_span_alone(dtype: torch.dtype) -> None:
     """Catches a Gaussian that AGR moves before its first time, or after its last one, by torch and by the kernel."""
     model = classed("7dgs_agr", N, 4, 10).to(dtype)
-    query = Query.at(CAMERA.to(dtype), 0.45)
+    query = CameraTime.at(CAMERA.to(dtype), 0.45)
     whole = model.refined(query)
     model.effect_sets = model.effect_sets._replace(
         intervals=torch.tensor([[0.5, 0.9], [0.1, 0.4], [0.4, 0.5], [0.0, 1.0]])
@@ -101,8 +101,8 @@ def freeze(model: GaussianModel) -> None:
     """Make every row an ordinary one that hardly changes: endlessly long in all that is observed, and not moving."""
     splats = model.splats
     with torch.no_grad():
-        if isinstance(model, TriangularModel):
-            for kind in model.triangle.kinds[1:]:
+        if isinstance(model, CholeskyModel):
+            for kind in model.layout.kinds[1:]:
                 splats[kind].zero_()
             splats["log_diagonal"][:, model.rows["t"] + model.rows["d"]] = LOG_SIZE_MAX
         else:
@@ -120,7 +120,7 @@ def test_a_static_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
     """
     model = lively(variant).to(dtype)
     freeze(model)
-    query, raw = Query.at(CAMERA.to(dtype), 0.45), dict(model.splats.items())
+    query, raw = CameraTime.at(CAMERA.to(dtype), 0.45), dict(model.splats.items())
     means, factors, opacities = tensors_of(model.slice_geometry(raw, query))
     model.effect_sets = EffectSets(0, 0, None)
     static = model.slice_geometry(raw, query)

@@ -15,11 +15,11 @@ from small import CAMERA, moved, seeded, started
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query, build, registry
+from gsbench.models import CameraTime, GaussianModel, build, registry
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated, has_gates
+from gsbench.models.gaussian_batch import reach, tensors_of
 from gsbench.models.simplifications import simplifications_of
-from gsbench.models.sliced import reach, tensors_of
 from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.train.regularisers import MeanOpacity, MeanSize, Penalty
@@ -36,7 +36,7 @@ WRONG: dict[Any, tuple[Any, ...]] = {
 assert registry.is_registered("3dgs")  # all are
 NAMES = sorted(registry._REGISTRY)
 EVERY = pytest.mark.parametrize(("name", "agr"), [(name, agr) for name in NAMES for agr in (False, True)])
-QUERY = Query.at(CAMERA, 0.45)
+QUERY = CameraTime.at(CAMERA, 0.45)
 
 
 def options_of(name: str) -> dict[str, inspect.Parameter]:
@@ -117,7 +117,7 @@ def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
     assert all(x.isfinite().all() for x in tensors_of(seen))
     assert ((seen.opacities >= 0) & (seen.opacities <= 1)).all()
     assert (seen.colors >= 0).all()
-    by_kernels = copy.deepcopy(model).float().slice(Query.at(CAMERA.float(), 0.45))
+    by_kernels = copy.deepcopy(model).float().slice(CameraTime.at(CAMERA.float(), 0.45))
     drawn = (seen.opacities > 1 / 200)[:, None]  # kernels do not colour what cannot be seen
     for x, y in ((by_kernels.means, seen.means), (by_kernels.opacities, seen.opacities)):
         torch.testing.assert_close(x.double(), y, rtol=1e-3, atol=1e-4)
@@ -192,7 +192,7 @@ def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
         with pytest.raises(InputError, match="is no GatedModel"):
             as_gated(model)
         return
-    queries = [QUERY, Query.at(-CAMERA, 0.7)]
+    queries = [QUERY, CameraTime.at(-CAMERA, 0.7)]
     found = simplifications_of(as_gated(model), queries, [model.slice(query) for query in queries])
     assert {"removed"} < {one.name for one in found}
     for one in found:
@@ -214,7 +214,7 @@ def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
 @EVERY
 def test_a_slice_is_exported(name: str, agr: bool, tmp_path: Path) -> None:
     """Catches a PLY that has lost a Gaussian or moved one, and harmonics for a model whose slice has none."""
-    model, query = made(name, agr).float(), Query.at(CAMERA.float(), 0.45)
+    model, query = made(name, agr).float(), CameraTime.at(CAMERA.float(), 0.45)
     (tmp_path / "slice.ply").write_bytes(ply_of(trained_of(model, query)))
     read, seen = read_trained(tmp_path / "slice.ply"), model.slice(query)
     drawn = seen.opacities >= 1 / 255
@@ -259,7 +259,7 @@ def test_a_model_holds_it(name: str) -> None:
 
     def shares() -> torch.Tensor:
         """The opacities LEAST after the mean time, divided by those at the mean time."""
-        now, later = (model.slice(Query.at(CAMERA.float(), 0.5 + dt)).opacities for dt in (0.0, LEAST))
+        now, later = (model.slice(CameraTime.at(CAMERA.float(), 0.5 + dt)).opacities for dt in (0.0, LEAST))
         return (later / now)[now > 1e-3]
 
     assert (shares() < 0.01).any()

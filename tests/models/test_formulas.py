@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from small import CAMERA, MODELS, TRIANGULAR, N, fresh, joint, lively, raw, seeded
 
-from gsbench.models import GaussianModel, Gaussians3D, Query, build
+from gsbench.models import CameraTime, GaussianModel, Gaussians3D, build
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
-from gsbench.models.sliced import tensors_of
 
 TIME = 0.45
 ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
@@ -33,7 +33,7 @@ def by_hand(model: GaussianModel, order: str, half: float) -> tuple[np.ndarray, 
     there = "p" + "t" * ("times" in values) + "d" * ("directions" in values)
     letters = "".join(x * (1 if x == "t" else 3) for x in order if x in there)
     p, t, d = ([i for i, x in enumerate(letters) if x == which] for which in "ptd")
-    below, form = model.triangle.join(raw(model)).numpy(), model.triangle.form
+    below, form = model.layout.join(raw(model)).numpy(), model.layout.form
     means, covariances, opacities = [], [], []
     for i, mean in enumerate(values["means"]):
         L = triangular_factor(values["log_diagonal"][i], below[i])
@@ -69,7 +69,7 @@ def agree(sliced: Gaussians3D, means: np.ndarray, covariances: np.ndarray, opaci
 def test_triangular_models(name: str, order: str, scheme: str, form: str) -> None:
     """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one, a wrong lambda."""
     model = lively(name, factor_order=order, scheme=scheme, off_diagonal=form)
-    agree(model.slice(Query.at(CAMERA, TIME)), *by_hand(model, ORDERS[order], 1.0 if name == "6dgs" else 0.5))
+    agree(model.slice(CameraTime.at(CAMERA, TIME)), *by_hand(model, ORDERS[order], 1.0 if name == "6dgs" else 0.5))
 
 
 @pytest.mark.parametrize("half", [True, False])
@@ -77,7 +77,7 @@ def test_triangular_models(name: str, order: str, scheme: str, form: str) -> Non
 def test_directional_half(name: str, half: bool) -> None:
     """Catches the 1/2 of 7DGS in 6DGS, or its option without effect; the 1/2 of f_temp stays."""
     model = lively(name, directional_half=half)
-    agree(model.slice(Query.at(CAMERA, TIME)), *by_hand(model, "dtp", 0.5 if half else 1.0))
+    agree(model.slice(CameraTime.at(CAMERA, TIME)), *by_hand(model, "dtp", 0.5 if half else 1.0))
     assert MODELS["6dgs"]["directional_half"] is False
 
 
@@ -90,10 +90,10 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
     n = joint(paper).shape[-1]
     to_own = [*range(3, n), 0, 1, 2]  # from (p, d, t) to (d, t, p)
     factor = paper.factors(raw(paper))[:, to_own]
-    for key, value in first.triangle.parameters(factor).items():
+    for key, value in first.layout.parameters(factor).items():
         first.splats[key].data = value
     torch.testing.assert_close(joint(first), joint(paper))
-    a, b = paper.slice(Query.at(CAMERA, TIME)), first.slice(Query.at(CAMERA, TIME))
+    a, b = paper.slice(CameraTime.at(CAMERA, TIME)), first.slice(CameraTime.at(CAMERA, TIME))
     covariance = (a.factors @ a.factors.mT).detach().numpy()
     agree(b, a.means.detach().numpy(), covariance, a.opacities.detach().numpy())
 
@@ -103,10 +103,10 @@ def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
 def test_far_from_the_query(name: str, order: str) -> None:
     """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
     model = fresh(name, factor_order=order)
-    for kind in model.triangle.kinds:
+    for kind in model.layout.kinds:
         model.splats[kind].data.normal_(generator=seeded(1))
     model.splats["log_diagonal"].data.fill_(-30.0)
-    sliced = model.slice(Query.at(CAMERA.float(), TIME))
+    sliced = model.slice(CameraTime.at(CAMERA.float(), TIME))
     sum(x.sum() for x in tensors_of(sliced)).backward()
     assert all(x.isfinite().all() for x in tensors_of(sliced))
     assert all(p.grad.isfinite().all() for p in model.splats.values())
@@ -141,7 +141,7 @@ def test_4dgs(scheme: str) -> None:
         means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
         covariances.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
         opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
-    agree(model.slice(Query.at(CAMERA, TIME)), np.stack(means), np.stack(covariances), np.array(opacities))
+    agree(model.slice(CameraTime.at(CAMERA, TIME)), np.stack(means), np.stack(covariances), np.array(opacities))
     assert 0 < opacities.count(0) < N
 
 
@@ -153,7 +153,7 @@ def test_4dgs_is_the_same_in_metres_and_centimetres(native: bool) -> None:
     larger.clock *= 100
     for name, times, plus in (("means", 100.0, 0.0), ("scales", 1.0, math.log(100.0))):
         larger.splats[name].data.mul_(times).add_(plus)
-    a, b = model.slice(Query.at(CAMERA.to(dtype), TIME)), larger.slice(Query.at(100 * CAMERA.to(dtype), TIME))
+    a, b = model.slice(CameraTime.at(CAMERA.to(dtype), TIME)), larger.slice(CameraTime.at(100 * CAMERA.to(dtype), TIME))
     torch.testing.assert_close(100 * a.means, b.means, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(100 * a.factors @ a.factors.mT, b.factors @ b.factors.mT / 100, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(a.opacities, b.opacities, rtol=1e-4, atol=1e-6)
@@ -165,7 +165,7 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     sigma = math.sqrt(1 / 5) / math.sqrt(MODELS["4dgs"]["lambda_t"])
     for factor, drawn in [(1 - 1e-4, True), (1 + 1e-4, False)]:
         model.splats["times"].data.fill_(TIME + factor * sigma * math.sqrt(-2 * math.log(0.05)))
-        assert ((model.slice(Query.at(CAMERA, TIME)).opacities > 0) == drawn).all()
+        assert ((model.slice(CameraTime.at(CAMERA, TIME)).opacities > 0) == drawn).all()
     assert TIME_OPACITY_FACTOR_MIN == 0.05
 
 
@@ -180,7 +180,7 @@ def test_4dgs_at_a_time_of_its_own_is_3dgs() -> None:
     np.testing.assert_allclose(F[:, :3, 3], 0, atol=1e-12)
     R = F[:, :3, :3] / np.exp(raw(model)["scales"].numpy())[:, None, :3]
     assert np.abs(Rotation.from_matrix(R).as_matrix() - R).max() < 1e-9
-    sliced = model.slice(Query.at(CAMERA, TIME))
+    sliced = model.slice(CameraTime.at(CAMERA, TIME))
     covariance = (sliced.factors @ sliced.factors.mT).detach().numpy()
     np.testing.assert_allclose(covariance, F[:, :3, :3] @ F[:, :3, :3].swapaxes(1, 2), atol=1e-12)
     torch.testing.assert_close(sliced.means.data, model.splats["means"].data)

@@ -13,8 +13,8 @@ from gsbench.models import registry
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel, as_gated
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.sliced import Conditioned
 from gsbench.scenes.scene import Points
 
 

@@ -10,11 +10,11 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, N, fresh, lively, raw, seede
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.models import Query, build
+from gsbench.models import CameraTime, build
 from gsbench.models.appearance import sh_colors, sh_time_colors
+from gsbench.models.camera_time import unit
 from gsbench.models.factors import KINDS
-from gsbench.models.query import unit
-from gsbench.models.sliced import tensors_of
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
@@ -34,7 +34,7 @@ def test_start(variant: str) -> None:
     torch.testing.assert_close(torch.sigmoid(model.splats["opacities"]).data, torch.full((N,), 0.1))
     size = nearest_distances(points.means)
     torch.testing.assert_close(model.scales(), size)
-    sliced = model.slice(Query.at(CAMERA.float(), 0.4))
+    sliced = model.slice(CameraTime.at(CAMERA.float(), 0.4))
     torch.testing.assert_close(sliced.means.data, points.means)
     covariance = (sliced.factors @ sliced.factors.mT).data
     torch.testing.assert_close(covariance, size.square()[:, None, None] * torch.eye(3))
@@ -94,7 +94,7 @@ def test_slice_has_gradients(variant: str) -> None:
 
     def sliced(*values: Tensor) -> tuple[Tensor, ...]:
         model.splats = dict(zip(names, values, strict=True))
-        return tuple(tensors_of(model.slice(Query.at(CAMERA, 0.45))))
+        return tuple(tensors_of(model.slice(CameraTime.at(CAMERA, 0.45))))
 
     output = sliced(*values)
     assert (output[2] > 0).any()
@@ -107,7 +107,7 @@ def test_slice_has_gradients(variant: str) -> None:
 @given(st.sampled_from(sorted(VARIANTS)), st.integers(0, 2**31), st.floats(-1, 2))
 def test_slices_can_be_drawn(variant: str, seed: int, time: float) -> None:
     """Catches NaN, opacities outside [0, 1] and negative colours at any time, also beyond the clip."""
-    sliced = lively(variant, seed=seed).slice(Query.at(CAMERA, time))
+    sliced = lively(variant, seed=seed).slice(CameraTime.at(CAMERA, time))
     assert [tuple(x.shape) for x in tensors_of(sliced)] == [(N, 3), (N, 3, 3), (N,), (N, 3)]
     assert all(x.isfinite().all() for x in tensors_of(sliced))
     assert (sliced.opacities >= 0).all()
@@ -126,7 +126,7 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
         at = {name: value[i] for name, value in raw(model).items()}
         mean, direction = at["means"], at.get("directions", torch.tensor([0, 0.6, 0.8]).double())
         time = at["times"].item() if "times" in at else 0.5
-        sliced = model.slice(Query.at(mean - 3 * direction, time))
+        sliced = model.slice(CameraTime.at(mean - 3 * direction, time))
         torch.testing.assert_close(sliced.means[i], mean)
         torch.testing.assert_close(sliced.opacities[i], torch.sigmoid(model.splats["opacities"][i]))
 
@@ -135,9 +135,9 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
 def test_colors_are_seen_from_the_camera(variant: str) -> None:
     """Catches a colour looked up in the direction to the camera, or to where the Gaussian is not at that time."""
     model = lively(variant)
-    sliced = model.slice(Query.at(CAMERA, 0.5))
+    sliced = model.slice(CameraTime.at(CAMERA, 0.5))
     d = nn.functional.normalize(sliced.means - CAMERA, dim=-1)
-    values = model.refined(Query.at(CAMERA, 0.5))
+    values = model.refined(CameraTime.at(CAMERA, 0.5))
     coefficients = torch.cat([values["sh0"].flatten(1, -2), values["shN"]], 1)
     if variant.startswith("4dgs"):
         expected = sh_time_colors(coefficients.unflatten(1, (-1, 16)), d, 3, 0.5 - values["times"][:, 0])
@@ -150,7 +150,7 @@ def test_colors_are_seen_from_the_camera(variant: str) -> None:
 def test_camera_on_a_mean(variant: str) -> None:
     """Catches 0/0: d is undefined there and taken as zero, and its gradient too."""
     model = lively(variant)
-    sliced = model.slice(Query.at(model.splats["means"].data[0], 0.5))
+    sliced = model.slice(CameraTime.at(model.splats["means"].data[0], 0.5))
     sum(x.sum() for x in tensors_of(sliced)).backward()
     assert all(x.isfinite().all() for x in tensors_of(sliced))
     assert all(p.grad.isfinite().all() for p in model.splats.values())
@@ -162,9 +162,9 @@ def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
     model = fresh(variant)
     if "time" in model.observes or model.agr:
         with pytest.raises(InputError, match="expected a time"):
-            model.slice(Query.at(CAMERA.float(), None))
+            model.slice(CameraTime.at(CAMERA.float(), None))
     else:
-        assert model.slice(Query.at(CAMERA.float(), None)).means.shape == (N, 3)
+        assert model.slice(CameraTime.at(CAMERA.float(), None)).means.shape == (N, 3)
 
 
 # ---- AGR and active components
@@ -177,9 +177,9 @@ def test_agr_changes_nothing_at_first(name: str) -> None:
     for p in (model.refinement.weight_out, model.refinement.bias_out):
         p.data.zero_()
     model.set_active(ActiveComponents(3, False, False))
-    off = tensors_of(model.slice(Query.at(CAMERA, 0.3)))
+    off = tensors_of(model.slice(CameraTime.at(CAMERA, 0.3)))
     model.set_active(ActiveComponents(3, True, False))
-    on = tensors_of(model.slice(Query.at(CAMERA, 0.3)))
+    on = tensors_of(model.slice(CameraTime.at(CAMERA, 0.3)))
     assert all(torch.equal(a, b) for a, b in zip(off, on, strict=True))
 
 
@@ -188,7 +188,7 @@ def test_agr_moves_what_it_should(name: str) -> None:
     """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity."""
     model = lively(f"{name}_agr")
     model.set_active(ActiveComponents(3, True, False))
-    before, after = raw(model), model.refined(Query.at(CAMERA, 0.3))
+    before, after = raw(model), model.refined(CameraTime.at(CAMERA, 0.3))
     names = [*model.centers, *model.geometry]
     moved = model.refinement([before[k] for k in names], torch.tensor(0.3, dtype=torch.float64))
     torch.testing.assert_close([after[k] for k in names], moved)
@@ -207,7 +207,7 @@ def test_what_is_off_does_not_learn(name: str) -> None:
     for refine, tune in [(False, False), (True, False), (False, True), (True, True)]:
         model.set_active(ActiveComponents(3, refine, tune))
         model.zero_grad(set_to_none=True)
-        sum(x.square().sum() for x in tensors_of(model.slice(Query.at(CAMERA, 0.3)))).backward()
+        sum(x.square().sum() for x in tensors_of(model.slice(CameraTime.at(CAMERA, 0.3)))).backward()
         learnt = model.refinement.weight_out.grad
         assert (learnt is not None and learnt.any(1).all().item()) == refine
         assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_lambda.parameters())
@@ -220,10 +220,10 @@ def test_sh_degree_grows_with_the_phase() -> None:
     """Catches colours that use coefficients of a degree not yet on."""
     model = lively("3dgs")
     model.set_active(ActiveComponents(0, False, False))
-    flat = model.slice(Query.at(CAMERA, None)).colors
+    flat = model.slice(CameraTime.at(CAMERA, None)).colors
     torch.testing.assert_close(flat, (SH_C0 * model.splats["sh0"][:, 0] + 0.5).clamp(min=0))
     model.set_active(ActiveComponents(1, False, False))
-    assert not torch.allclose(model.slice(Query.at(CAMERA, None)).colors, flat)
+    assert not torch.allclose(model.slice(CameraTime.at(CAMERA, None)).colors, flat)
 
 
 # ---- build
@@ -257,4 +257,4 @@ def test_build_takes_every_option_of_the_bases(variant: str) -> None:
     model = fresh(variant, agr=True, sh_degree=1)
     assert model.sh_degree == 1
     assert model.refinement is not None
-    assert model.slice(Query.at(CAMERA.float(), 0.2)).colors.isfinite().all()
+    assert model.slice(CameraTime.at(CAMERA.float(), 0.2)).colors.isfinite().all()

@@ -8,12 +8,11 @@ from small import CAMERA, assert_culled_outside_its_intervals, moved, started
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query, build
-from gsbench.models.dgs import DirectModel, precision_factor
-from gsbench.models.moving3d import MovingGaussians3D
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.moving import DirectModel, MovingGaussians3D, precision_factor
 
 DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-QUERY = Query(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # seen from there, the origin lies in DIRECTION
+QUERY = CameraTime(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # seen from there, the origin lies in DIRECTION
 
 
 def direct(**options: object) -> tuple[DirectModel, dict[str, Tensor]]:
@@ -76,7 +75,7 @@ def test_the_equations_of_freetime() -> None:
     assert isinstance(model, MovingGaussians3D)
     raw = {"times": torch.tensor([[0.2]]), "durations": torch.tensor([[0.5]]).log(),
            "velocities": torch.tensor([[1.0, 0, -2]])}  # fmt: skip
-    shift, opacity_factor = model.change(raw, Query(torch.zeros(3), torch.tensor(0.7)))
+    shift, opacity_factor = model.change(raw, CameraTime(torch.zeros(3), torch.tensor(0.7)))
     torch.testing.assert_close(shift, torch.tensor([[0.5, 0, -1.0]]))
     torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
     with pytest.raises(InputError, match="duration"):
@@ -93,7 +92,7 @@ def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
     model = lively(name)
     assert isinstance(model, MovingGaussians3D)
     raw = {key: value.detach() for key, value in model.splats.items()}
-    queries = [Query.at(CAMERA, 0.2), Query.at(-CAMERA, 0.7)]
+    queries = [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]
     weights = torch.tensor([0.25, 0.75], dtype=torch.float64)[:, None].expand(2, len(model))
     static = raw | model.frozen(raw, queries, weights)["static"]
     slices = [model.slice(query) for query in queries]

@@ -11,7 +11,7 @@ from tiny_training import compose, moving_square
 
 from gsbench.config import DensifyConfig
 from gsbench.kernels.backends import REFERENCE
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.setup import build as build_for
 from gsbench.scenes.scene import Points, View
@@ -45,7 +45,7 @@ def four_gaussians() -> GaussianModel:
 
 def weights_of_pixels(model: GaussianModel, view: View) -> torch.Tensor:
     """The blend weight of each Gaussian in each pixel, [H, W, N]: an image whose channels are the Gaussians."""
-    seen = model.slice(Query.of(view.camera, view.time))
+    seen = model.slice(CameraTime.of(view.camera, view.time))
     channels = seen._replace(colors=torch.eye(len(model)))
     return rasterize_slice(channels, view.camera, torch.zeros(len(model)), REFERENCE).image[0].detach()
 

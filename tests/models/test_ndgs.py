@@ -10,12 +10,12 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import REFERENCE
-from gsbench.models import Query, build
+from gsbench.models import CameraTime, build
 from gsbench.models.base import Raw
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.cholesky import CholeskyModel
 
 TIME, LAMBDA = 0.45, 0.4
-QUERY = Query.at(CAMERA, TIME)
+QUERY = CameraTime.at(CAMERA, TIME)
 LAMBDAS = {"lambda_t": LAMBDA, "lambda_d": LAMBDA}
 MODELS: dict[str, tuple[str, dict[str, Any]]] = {
     "ndgs": ("ndgs", LAMBDAS),
@@ -25,11 +25,11 @@ MODELS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def lively(which: str, count: int = 24, **options: Any) -> TriangularModel:
+def lively(which: str, count: int = 24, **options: Any) -> CholeskyModel:
     """A model with options of N-DGS in the midst of a training, in float64, with a mean direction of zero."""
     name, own = MODELS[which]
     model = moved(started(build(name, **own | options), count))
-    assert isinstance(model, TriangularModel)
+    assert isinstance(model, CholeskyModel)
     return model
 
 
@@ -45,7 +45,7 @@ def offset_of(values: Raw) -> Tensor:
     return torch.cat(parts, -1)
 
 
-def by_hand(model: TriangularModel) -> tuple[Tensor, Tensor, Tensor]:
+def by_hand(model: CholeskyModel) -> tuple[Tensor, Tensor, Tensor]:
     """Means [N, 3], covariances [N, 3, 3] and opacities [N] at QUERY, with explicit inverses."""
     values, S = raw(model), joint(model)
     delta, k = offset_of(values), S.shape[-1] - 3
@@ -94,7 +94,7 @@ def test_gradients_of_a_slice(which: str) -> None:
 def test_kernels_are_given_means_as_they_are_sliced(which: str) -> None:
     """Catches a kernel that gets raw directions or times; with a joint gate, one that is used without having it."""
     model = lively(which).float()
-    query = Query.at(CAMERA.float(), TIME)
+    query = CameraTime.at(CAMERA.float(), TIME)
     by_kernel = model.slice_geometry(raw(model), query)
     model.backend = REFERENCE
     in_torch = model.slice_geometry(raw(model), query)

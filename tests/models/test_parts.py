@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from gsbench.errors import InputError
 from gsbench.models.appearance import sh_basis, sh_colors, sh_time_colors
-from gsbench.models.factors import OFF_DIAGONALS, Triangle, rotation, rotation4d
-from gsbench.models.query import unit
+from gsbench.models.camera_time import unit
+from gsbench.models.factors import OFF_DIAGONALS, CholeskyLayout, rotation, rotation4d
 from gsbench.models.refinement import Refinement, encode_time
 
 PROPERTY = settings(max_examples=25, deadline=None)
@@ -35,16 +35,16 @@ def directions(seed: int, N: int) -> Tensor:
 
 def test_triangular_row_by_row() -> None:
     """Catches off-diagonals filled column by column, or above the diagonal."""
-    triangle = Triangle("ddd", "raw")
-    L = triangle.factor(torch.tensor([[0.0, 1.0, 2.0]]), triangle.split(torch.tensor([[5.0, 6.0, 7.0]])))
+    layout = CholeskyLayout("ddd", "raw")
+    L = layout.factor(torch.tensor([[0.0, 1.0, 2.0]]), layout.split(torch.tensor([[5.0, 6.0, 7.0]])))
     expected = torch.tensor([[1.0, 0, 0], [5, math.e, 0], [6, 7, math.e**2]])
     torch.testing.assert_close(L[0], expected)
 
 
 def test_triangular_row_scaled() -> None:
     """Catches another scaling than (2 sigmoid(x) - 1) times the diagonal of the entry's own row."""
-    triangle = Triangle("ddd", "row_scaled")
-    L = triangle.factor(torch.tensor([[0.0, 1.0, 2.0]]), triangle.split(torch.tensor([[5.0, -6.0, 0.0]])))
+    layout = CholeskyLayout("ddd", "row_scaled")
+    L = layout.factor(torch.tensor([[0.0, 1.0, 2.0]]), layout.split(torch.tensor([[5.0, -6.0, 0.0]])))
     expected = [(2 / (1 + math.exp(-5.0)) - 1) * math.e, (2 / (1 + math.exp(6.0)) - 1) * math.e**2, 0.0]
     torch.testing.assert_close(L[0, [1, 2, 2], [0, 0, 1]], torch.tensor(expected))
 
@@ -53,11 +53,11 @@ def test_triangular_row_scaled() -> None:
 @given(seeds, st.sampled_from(["ppp", "dddppp", "dddtppp", "ptd", "pppddd", "ppptddd"]), st.sampled_from(OFF_DIAGONALS))
 def test_parameters_undo_a_factor(seed: int, letters: str, form: str) -> None:
     """Catches a factor that changes when a split writes it back: parameters -> L -> L Q -> parameters."""
-    triangle, n = Triangle(letters, form), len(letters)
-    parameters = {"log_diagonal": normal(seed, 4, n), **triangle.split(normal(seed + 1, 4, n * (n - 1) // 2))}
-    L = triangle.factor(parameters["log_diagonal"], parameters)
+    layout, n = CholeskyLayout(letters, form), len(letters)
+    parameters = {"log_diagonal": normal(seed, 4, n), **layout.split(normal(seed + 1, 4, n * (n - 1) // 2))}
+    L = layout.factor(parameters["log_diagonal"], parameters)
     Q = torch.linalg.qr(normal(seed + 2, 4, n, n))[0]
-    torch.testing.assert_close(triangle.parameters(L @ Q), parameters, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(layout.parameters(L @ Q), parameters, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("letters", "expected"), [
@@ -68,17 +68,17 @@ def test_parameters_undo_a_factor(seed: int, letters: str, form: str) -> None:
 ])  # fmt: skip
 def test_kinds_of_entries(letters: str, expected: dict[str, str]) -> None:
     """Catches an entry of L_pp among the motions, or of L_td among the shapes: each has its unit and its rate."""
-    triangle, n = Triangle(letters, "raw"), len(letters)
+    layout, n = CholeskyLayout(letters, "raw"), len(letters)
     names = torch.tensor([10 * i + j for i in range(n) for j in range(i)])[None]
-    assert {kind: " ".join(map(str, found[0].tolist())) for kind, found in triangle.split(names).items()} == expected
+    assert {kind: " ".join(map(str, found[0].tolist())) for kind, found in layout.split(names).items()} == expected
 
 
 def test_relative_shape_is_in_units_of_its_row() -> None:
     """Catches a shape whose skew changes with its size, and motion or coupling that do change with it."""
-    triangle = Triangle("dddtppp", "relative")
+    layout = CholeskyLayout("dddtppp", "relative")
     below = normal(0, 1, 21)
-    L = triangle.factor(torch.zeros(1, 7), triangle.split(below))
-    larger = triangle.factor(torch.full((1, 7), math.log(100.0)), triangle.split(below))
+    L = layout.factor(torch.zeros(1, 7), layout.split(below))
+    larger = layout.factor(torch.full((1, 7), math.log(100.0)), layout.split(below))
     torch.testing.assert_close(larger[:, 4:, 4:], 100 * L[:, 4:, 4:])
     torch.testing.assert_close(larger[:, 4:, :4], L[:, 4:, :4])
     torch.testing.assert_close(larger[:, :4, :4].tril(-1), L[:, :4, :4].tril(-1))
@@ -87,15 +87,15 @@ def test_relative_shape_is_in_units_of_its_row() -> None:
 def test_unknown_form() -> None:
     """Catches a misspelt form that is taken for another."""
     with pytest.raises(InputError, match="relative"):
-        Triangle("ppp", "relativ")
+        CholeskyLayout("ppp", "relativ")
 
 
 def test_row_scaled_cuts_what_it_cannot_reach() -> None:
     """Catches atanh of 1 or more, which is not finite: such entries become 99.9 % of their diagonal."""
     factor = torch.tensor([[[1.0, 0, 0], [4.0, 2.0, 0], [-9.0, 0, 3.0]]])
-    triangle = Triangle("ddd", "row_scaled")
-    parameters = triangle.parameters(factor)
-    L = triangle.factor(parameters["log_diagonal"], parameters)
+    layout = CholeskyLayout("ddd", "row_scaled")
+    parameters = layout.parameters(factor)
+    L = layout.factor(parameters["log_diagonal"], parameters)
     torch.testing.assert_close(L[0], torch.tensor([[1.0, 0, 0], [1.998, 2.0, 0], [-2.997, 0, 3.0]]))
 
 

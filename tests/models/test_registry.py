@@ -59,7 +59,7 @@ def test_an_installed_package_lists_its_models(folder: Path) -> None:
 def test_a_name_that_is_taken(folder: Path) -> None:
     """Catches a stranger's model that stands in the place of 7DGS in silence; the same class twice is no clash."""
     (folder / "models_of_a_thief.py").write_text(MODEL.replace("NAME", "7dgs"))
-    with pytest.raises(InputError, match=r"'7dgs': expected a name of its own, gsbench\.models\.gaussians7d has"):
+    with pytest.raises(InputError, match=r"'7dgs': expected a name of its own, gsbench\.models\.cholesky has"):
         find("7dgs", "models_of_a_thief")
 
 

@@ -9,7 +9,7 @@ import torch
 from small import CAMERA, moved, started
 
 from gsbench.config import DensifyConfig
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.train.batches import generator
 from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
@@ -91,7 +91,7 @@ def test_shrinking_keeps_position_and_life(name: str) -> None:
     model = started(build(name, **NAMES[name])).double()
     if name != "4dgs":  # where it is exact only for rotations that do not mix space and time, as at the start
         model = moved(model)
-    queries = [Query.at(CAMERA, time) for time in (0.2, 0.6)]
+    queries = [CameraTime.at(CAMERA, time) for time in (0.2, 0.6)]
     before = [model.slice(query) for query in queries]
     model.shrink_rows(torch.tensor([3, 5]), torch.tensor([0.9, 0.7], dtype=torch.float64))
     factor = torch.ones(len(model), 1, 1, dtype=torch.float64)

@@ -9,7 +9,7 @@ from small import CAMERA, EXTENT, MODELS, VARIANTS, fresh, joint, lively, raw, s
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.base import CHILDREN
 from gsbench.schedule import ActiveComponents
 
@@ -35,7 +35,7 @@ def split_all(model: GaussianModel, seed: int = 0) -> Tensor:
 
 def sliced_covariance(model: GaussianModel) -> Tensor:
     """Covariances [N, 3, 3] of a slice; they do not depend on where the model is observed."""
-    factors = model.slice(Query.at(CAMERA, 0.5)).factors.detach()
+    factors = model.slice(CameraTime.at(CAMERA, 0.5)).factors.detach()
     return factors @ factors.mT
 
 
@@ -61,7 +61,7 @@ def test_select(variant: str) -> None:
         assert parameter.grad is None
     model.select(torch.zeros(0, dtype=torch.long))
     assert len(model) == 0
-    assert model.slice(Query.at(CAMERA, 0.5)).means.shape == (0, 3)
+    assert model.slice(CameraTime.at(CAMERA, 0.5)).means.shape == (0, 3)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -132,7 +132,7 @@ def test_children_of_a_split_in_time(variant: str) -> None:
     assert model.long_in_time().all()
     covariance, slopes, S_t = sliced_covariance(model), gain(model), joint(model)[:, -1, -1]
     before = raw(model)
-    paths = {t: model.slice(Query.at(4 * CAMERA, t)).means.detach() for t in (0.0, 0.4, 1.3)}
+    paths = {t: model.slice(CameraTime.at(4 * CAMERA, t)).means.detach() for t in (0.0, 0.4, 1.3)}
     parents = split_all(model)
     torch.testing.assert_close(joint(model)[:, -1, -1], S_t[parents] / SHRINK**2)
     torch.testing.assert_close(gain(model), slopes[parents], rtol=1e-6, atol=1e-9)
@@ -143,7 +143,7 @@ def test_children_of_a_split_in_time(variant: str) -> None:
     offset = model.splats["means"].data - before["means"][parents]
     for t, path in paths.items():
         for i in range(4):
-            child = model.slice(Query.at(4 * CAMERA + offset[i], t)).means[i]
+            child = model.slice(CameraTime.at(4 * CAMERA + offset[i], t)).means[i]
             torch.testing.assert_close(child, path[parents[i]], rtol=1e-6, atol=1e-8)
 
 

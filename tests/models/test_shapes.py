@@ -10,19 +10,19 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.tape import Tape
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
+from gsbench.models.gaussian_batch import Conditioned, joined_shapes, tensors_of
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import rasterize_slice, render
-from gsbench.models.sliced import Conditioned, joined_shapes, tensors_of
 from gsbench.scenes.scene import Camera, Points
 from gsbench.view.slice_ply import trained_of
 
 N = 6
 SEEN = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
-HERE = Query.of(SEEN, None)
+HERE = CameraTime.of(SEEN, None)
 
 
 class Shaped(GatedModel):
@@ -41,7 +41,7 @@ class Shaped(GatedModel):
     def static(self, raw: Raw) -> Conditioned:
         return self.condition(raw, None)
 
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         return {}
 
     def spatial_scales(self) -> Tensor:

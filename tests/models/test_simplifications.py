@@ -4,7 +4,7 @@ import pytest
 import torch
 from small import CAMERA, fresh, lively, seeded
 
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.models.simplifications import shares_of, simplifications_of
 
 
@@ -18,7 +18,9 @@ def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
     model.splats["sh0"] *= 0.5  # away from black, below which a colour is cut
     if variant == "4dgs":
         model.splats["scales"][:, 3] = 2.0  # seen at all times, and more at some than at others
-    queries = [Query.at(4 * torch.randn(3, generator=g, dtype=torch.float64), time) for time in (0.1, 0.4, 0.5, 0.9)]
+    queries = [
+        CameraTime.at(4 * torch.randn(3, generator=g, dtype=torch.float64), time) for time in (0.1, 0.4, 0.5, 0.9)
+    ]
     seen = [model.slice(query) for query in queries]
     weights = shares_of([one.opacities for one in seen])
     assert min(float(one.colors.amin()) for one in seen) > 0
@@ -39,7 +41,7 @@ def test_time_goes_on_as_it_did_where_direction_is_frozen(variant: str) -> None:
     """Catches f_temp by the deviation that t has at a known direction: frozen, direction is known no more."""
     model = lively(variant)
     raw = {name: x.detach() for name, x in model.splats.items()}
-    early, late = (Query.at(CAMERA, time) for time in (0.35, 0.6))
+    early, late = (CameraTime.at(CAMERA, time) for time in (0.35, 0.6))
     frozen = model.frozen(raw, [early, late], torch.full((2, len(model)), 0.5, dtype=torch.float64))["direction"]
 
     def fades(raw: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -7,11 +7,10 @@ import torch
 from models.small import CAMERA, MODELS, VARIANTS, seeded
 from torch import Tensor
 
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.base import Raw
 from gsbench.models.factors import quaternions_in_space, rotation, rotation4d
-from gsbench.models.sliced import Conditioned
-from gsbench.models.start import start_from
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
@@ -30,7 +29,7 @@ def trained(degree: int = 3) -> TrainedGaussians:
 def started(variant: str, given: TrainedGaussians, **options: Any) -> GaussianModel:
     name, own = VARIANTS[variant]
     model = build(name, **own | options)
-    start_from(model, given, 2.0, seeded(0))
+    model.start_from(given, 2.0, seeded(0))
     model.set_active(ActiveComponents(model.sh_degree, False, False))
     return model.requires_grad_(False)
 
@@ -40,7 +39,7 @@ def covariance(given: TrainedGaussians) -> Tensor:
     return F @ F.mT
 
 
-# A row-scaled triangle cannot express every shape: Triangle.parameters.
+# A row-scaled triangle cannot express every shape: CholeskyLayout.parameters.
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if not name.endswith("row_scaled")])
 def test_the_shape_in_space_is_theirs(variant: str) -> None:
     """Catches axes in another order, a mirrored quaternion, and time or direction that leak into space."""
@@ -48,7 +47,7 @@ def test_the_shape_in_space_is_theirs(variant: str) -> None:
     model = started(variant, given)
     if "times" in model.splats:
         model.splats["times"][:] = 0.3
-    seen = model.condition(dict(model.splats.items()), Query.at(CAMERA.float(), 0.3))
+    seen = model.condition(dict(model.splats.items()), CameraTime.at(CAMERA.float(), 0.3))
     torch.testing.assert_close(seen.means, given.means, atol=1e-4, rtol=0)
     torch.testing.assert_close(seen.factors @ seen.factors.mT, covariance(given), atol=2e-4, rtol=2e-4)
     torch.testing.assert_close(model.splats["opacities"].data, given.logits)
@@ -71,7 +70,7 @@ def test_harmonics_of_another_degree(name: str, theirs: int, own: int) -> None:
     given = trained(theirs)
     shared = (min(theirs, own) + 1) ** 2 - 1
     cut = TrainedGaussians(given.means, given.log_scales, given.quats, given.logits, given.dc, given.rest[:, :shared])
-    query = Query.at(CAMERA.float(), 0.3)
+    query = CameraTime.at(CAMERA.float(), 0.3)
     model, still = started(name, given, sh_degree=own), started("3dgs", cut, sh_degree=own)
     opaque = torch.ones(N)
     colors = [one.shade(dict(one.splats.items()), given.means, opaque, query) for one in (model, still)]
@@ -106,7 +105,7 @@ def test_a_model_that_is_not_known_starts_with_spheres() -> None:
         def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
             return {"radii": distances.log()[:, None]}
 
-        def condition(self, raw: Raw, query: Query) -> Conditioned:
+        def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
             raise NotImplementedError
 
         def spatial_scales(self) -> Tensor:
@@ -116,5 +115,5 @@ def test_a_model_that_is_not_known_starts_with_spheres() -> None:
             raise NotImplementedError
 
     model, given = Balls(), trained()
-    start_from(model, given, 2.0, seeded(0))
+    model.start_from(given, 2.0, seeded(0))
     torch.testing.assert_close(model.splats["radii"][:, 0].data, given.log_scales.mean(1))

@@ -5,7 +5,6 @@ import torch
 from small import assert_culled_outside_its_intervals, fresh, lively
 from torch import nn
 
-from gsbench.models.visible_times import visible_intervals
 from gsbench.train.rows import START_BINS, Rows
 
 TIMED = ["4dgs", "7dgs", "7dgs_nodir", "7dgs_paper", "7dgs_raw"]
@@ -23,8 +22,8 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
 
 def test_a_model_without_time_has_no_intervals() -> None:
     """Catches a model that is sorted by times that it does not have."""
-    assert visible_intervals(fresh("3dgs")) is None
-    assert visible_intervals(fresh("6dgs")) is None
+    assert fresh("3dgs").visible_intervals() is None
+    assert fresh("6dgs").visible_intervals() is None
 
 
 class Moments:
@@ -51,7 +50,7 @@ def test_rows_are_sorted_by_when_they_can_be_visible() -> None:
     before = model.splats["means"].detach().clone()
     Rows(model, moments).sort_by_time()
     assert torch.equal(model.splats["means"], before[moments.rows])
-    intervals = visible_intervals(model)
+    intervals = model.visible_intervals()
     assert intervals is not None
     bins = (intervals[:, 0] * START_BINS).floor()
     assert torch.equal(bins, bins.sort().values)

@@ -9,7 +9,7 @@ from mpmath import mpf
 from torch import Generator, Tensor
 
 from gsbench.kernels.backends import BACKENDS
-from gsbench.models import Query, build
+from gsbench.models import CameraTime, build
 from numerics import oracle
 from numerics.cases import COPIES, Case, Cell, case, device_of, fastest, worst
 
@@ -122,7 +122,7 @@ def differentiate(inputs: ColorInputs, backend: str, weight: Tensor, copies: int
     means, times, sh = (value.to(device) for value in leaves)
     sh0 = sh[:, None, :1] if inputs.model == "4dgs" else sh[:, :1]
     raw = {"means": means, "times": times, "sh0": sh0, "shN": sh[:, 1:]}
-    query = Query(inputs.center.to(device), torch.tensor(inputs.time, device=device))
+    query = CameraTime(inputs.center.to(device), torch.tensor(inputs.time, device=device))
     color = model.shade(raw, means, torch.ones_like(means[:, 0]), query).cpu()
     gradients = torch.autograd.grad(color.double(), leaves, weight.repeat(copies, 1), materialize_grads=True)
     return color.detach().double(), torch.cat([g.flatten(1).double() for g in gradients], 1)

@@ -13,8 +13,8 @@ from gsbench import kernels
 from gsbench.kernels.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
 from gsbench.models import build
-from gsbench.models.sliced import tensors_of
-from gsbench.models.triangular import TriangularModel
+from gsbench.models.cholesky import CholeskyModel
+from gsbench.models.gaussian_batch import tensors_of
 from numerics import picture_cases, pictures, population
 from numerics.brute import Arguments
 from numerics.cases import backends_with, device_of, fastest
@@ -115,7 +115,7 @@ def accuracy_for_time(backends: list[str]) -> Iterator[AccuracyPoint]:
 
 
 def _passes(
-    model: TriangularModel, hard: population.Hard, dtype: torch.dtype = torch.float32
+    model: CholeskyModel, hard: population.Hard, dtype: torch.dtype = torch.float32
 ) -> tuple[Callable[[], tuple[Tensor, ...]], Callable[[tuple[Tensor, ...]], None]]:
     """Return the forward pass of slicing, and the backward pass from its result; each waits for its device."""
     device = device_of(model.backend.name)
@@ -170,7 +170,7 @@ def safety(backends: list[str]) -> Iterator[SliceTime]:
             for backend in backends_with(scheme, "7dgs", backends):
                 model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme,
                               backend=BACKENDS[backend])  # fmt: skip
-                assert isinstance(model, TriangularModel)
+                assert isinstance(model, CholeskyModel)
                 forward, backward = _passes(model.to(device_of(backend)), hard)
                 times = []
                 for _ in range(1 if backend == "reference" else REPEATS):

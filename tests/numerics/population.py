@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor, nn
 
 from gsbench.kernels.backends import BACKENDS
-from gsbench.models import Query, build
-from gsbench.models.beta import softplus_inverse
-from gsbench.models.factors import KINDS, Triangle
+from gsbench.models import CameraTime, build
+from gsbench.models.beta import joint_factor, softplus_inverse
+from gsbench.models.cholesky import FACTOR_ORDERS, CholeskyModel
+from gsbench.models.factors import KINDS, CholeskyLayout
 from gsbench.models.slicing import SCHEMES
-from gsbench.models.triangular import FACTOR_ORDERS, TriangularModel
-from gsbench.models.ubs import joint_factor
 from numerics import oracle, slices
 from numerics.cases import ONE_SCHEME, Bound, Cell, backends_with, device_of
 from numerics.slice_cases import LN_10, Observed, ordinary
@@ -227,7 +226,7 @@ def _oracle(order: str) -> oracle.Function:
               "opacities": 1}  # fmt: skip
     names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
     log_lambda = {"direction": NEVER, "time": NEVER}
-    places = Triangle(names).places
+    places = CholeskyLayout(names).places
     kinds = [7 + place for kind in KINDS for place in places[kind]]
     return lambda x: oracle.slice_triangular(
         [*x[:7], *(x[i] for i in kinds), *x[28:]], layout, [0.0] * 3, 0.0, names, 0.5, log_lambda, relative=False
@@ -243,24 +242,24 @@ def judge(hard: Hard, exact: PopulationTruth, order: str, scheme: str, backend: 
     return Errors(cov, gradient, bad)
 
 
-def all_seen(order: str, scheme: str, backend: str) -> TriangularModel:
+def all_seen(order: str, scheme: str, backend: str) -> CholeskyModel:
     """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
                   backend=BACKENDS[backend])  # fmt: skip
-    assert isinstance(model, TriangularModel)
+    assert isinstance(model, CholeskyModel)
     for name in ("direction", "time"):
         model.log_lambda[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))
 
 
-def at_the_origin(model: TriangularModel, dtype: torch.dtype = torch.float32) -> Query:
+def at_the_origin(model: CholeskyModel, dtype: torch.dtype = torch.float32) -> CameraTime:
     """Return the viewpoint and the time at which `Hard` Gaussians are sliced, on the device of a model."""
     there = {"device": device_of(model.backend.name), "dtype": dtype}
-    return Query(torch.zeros(3, **there), torch.zeros((), **there))
+    return CameraTime(torch.zeros(3, **there), torch.zeros((), **there))
 
 
 def _judge(
-    model: TriangularModel, hard: Hard, exact: PopulationTruth, w: Floats, W: Floats, rows: slice
+    model: CholeskyModel, hard: Hard, exact: PopulationTruth, w: Floats, W: Floats, rows: slice
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     some = hard.rows(rows)
     leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
@@ -281,11 +280,11 @@ def _judge(
     return cov_error.detach().numpy(), gradient_error.numpy(), bad.numpy()
 
 
-def raw_parameters(hard: Hard, model: TriangularModel) -> dict[str, Tensor]:
+def raw_parameters(hard: Hard, model: CholeskyModel) -> dict[str, Tensor]:
     """Return the raw parameters of the given 7D Gaussians for a model made by `all_seen`."""
     N = len(hard)
     return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
-            "log_diagonal": hard.log_diagonal, **model.triangle.split(hard.off_diagonal),
+            "log_diagonal": hard.log_diagonal, **model.layout.split(hard.off_diagonal),
             "opacities": torch.zeros(N)}  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import normalize
 
 from gsbench.kernels.headers import ALPHA_MIN, LOG_SIZE_MAX
-from gsbench.models.factors import Triangle
+from gsbench.models.factors import CholeskyLayout
 from numerics.cases import case
 
 COUNT = 4  # Gaussians in a case; the truth of each takes about a hundred evaluations in mpmath
@@ -73,7 +73,7 @@ def _joint(g: Generator, model: str, N: int) -> Observed:
     n = len(variables(model))
     raw["directions"] = observed.towards() + 0.2 * torch.randn(N, 3, generator=g)
     raw["log_diagonal"] = SPREAD * torch.randn(N, n, generator=g) - 0.5
-    raw |= Triangle(variables(model)).split(SPREAD * torch.randn(N, n * (n - 1) // 2, generator=g))
+    raw |= CholeskyLayout(variables(model)).split(SPREAD * torch.randn(N, n * (n - 1) // 2, generator=g))
     observed.log_lambda = {"direction": math.log(0.35)}
     if model == "7dgs":
         raw["times"] = TIME + 0.1 * torch.randn(N, 1, generator=g)
@@ -155,11 +155,11 @@ def all_sizes(observed: Observed) -> Tensor:
 
 def set_below(observed: Observed, variable: str, times: float = 1.0, plus: float = 0.0) -> None:
     """Multiply the entries left of the diagonal in one variable's rows of the triangular factor, and add to them."""
-    triangle = Triangle(variables(observed.model))
-    below = triangle.join(observed.raw)
+    layout = CholeskyLayout(variables(observed.model))
+    below = layout.join(observed.raw)
     entries = [i * (i - 1) // 2 + j for i in _rows(observed, variable) for j in range(i)]
     below[:, entries] = below[:, entries] * times + plus
-    observed.raw |= triangle.split(below)
+    observed.raw |= layout.split(below)
 
 
 def upright(observed: Observed) -> None:
@@ -225,8 +225,8 @@ def diagonals_over_eight_decades(observed: Observed, severity: float, g: Generat
     logs[:] = -8 * LN_10 * severity * torch.rand(logs.shape, generator=g)
     if observed.model == "4dgs":
         return
-    triangle = Triangle(variables(observed.model))
-    raw |= triangle.split(torch.randn(triangle.join(raw).shape, generator=g))
+    layout = CholeskyLayout(variables(observed.model))
+    raw |= layout.split(torch.randn(layout.join(raw).shape, generator=g))
     observed.center, raw["means"][:] = torch.ones(3), 1.0
     narrowest = sizes(observed, "d").amin(1, keepdim=True).clamp(min=-LOG_SIZE_MAX).exp()
     raw["directions"] = 0.3 * narrowest * torch.randn(COUNT, 3, generator=g)

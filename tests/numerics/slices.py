@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from gsbench.kernels.backends import BACKENDS
 from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import GaussianModel, Query, build
-from gsbench.models.sliced import tensors_of
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.slicing import SCHEMES, subtract
 from numerics import oracle
 from numerics.cases import COPIES, ONE_SCHEME, Case, Cell, backends_with, device_of, fastest, worst
@@ -134,7 +134,7 @@ def differentiate(
     device = device_of(model.backend.name)
     there = {name: value.to(device) for name, value in raw.items()}
     moment = torch.tensor(observed.time).to(there["means"]) if "time" in model.observes else None
-    sliced = model.slice_geometry(there, Query(observed.center.to(there["means"]), moment))
+    sliced = model.slice_geometry(there, CameraTime(observed.center.to(there["means"]), moment))
     mean, F, opacity, *shapes = (x.cpu().double() for x in tensors_of(sliced))
     outputs = torch.cat([mean, (F @ F.mT).flatten(1), opacity[:, None], *(b[:, None] for b in shapes)], 1)
     gradients = torch.autograd.grad(outputs, list(raw.values()), weights, materialize_grads=True)

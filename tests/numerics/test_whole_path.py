@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gsbench.kernels.backends import BACKENDS
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.raster import rasterize
 from gsbench.train.losses import photometric
 from numerics import pictures, population, slices
@@ -36,7 +36,7 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], observed: Observed,
     """Slice, draw, compare with a photograph, and differentiate; everything must be finite."""
     raw = raw | appearance(observed.model, seed)
     inputs = {name: value.detach().clone().requires_grad_() for name, value in raw.items()}
-    query = Query(observed.center, torch.tensor(observed.time))
+    query = CameraTime(observed.center, torch.tensor(observed.time))
     means, factors, opacities, shapes = model.slice_geometry(inputs, query)
     shown = model.shade(inputs, means, opacities, query)
     viewmat = torch.eye(4)

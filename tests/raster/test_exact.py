@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.scene import camera, model
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.raster import rasterize
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, Gaussians, exact_image
 
@@ -102,9 +102,9 @@ def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
     gaussians = model(name.removesuffix("_agr"), 2_000, agr=name.endswith("_agr"), sigma=0.05)
     viewmat, K = (x[0] for x in camera(32))
     with torch.no_grad():
-        query = Query.at(-viewmat[:3, 3], 0.4)
+        query = CameraTime.at(-viewmat[:3, 3], 0.4)
         single = gaussians.slice(query)
-        exact = copy.deepcopy(gaussians).double().slice(Query.at(query.center.double(), 0.4))
+        exact = copy.deepcopy(gaussians).double().slice(CameraTime.at(query.center.double(), 0.4))
         image = rasterize(*single[:4], viewmat[None], K[None], 32, 32, shapes=single.shapes).image[0]
         bounded = exact_image(exact, single, viewmat, K, 32, 32)
     error = (image.double() - bounded.image).abs().amax(-1)

@@ -13,7 +13,7 @@ from tiny_run import main_here, overrides, write_moving_square
 from tiny_training import compose, moving_square
 
 from gsbench import kernels
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.factors import KINDS
 from gsbench.run import setup
@@ -142,7 +142,7 @@ def test_why_a_gaussian_is_hard() -> None:
     """Catches a reason given to the wrong Gaussian."""
     model = hard_model()
     camera = around(model, 4.0, 32, 32, 0.0, 0.0)
-    exact = model.double().slice(Query.of(float64_camera(camera), None))
+    exact = model.double().slice(CameraTime.of(float64_camera(camera), None))
     far_away = exact._replace(means=exact.means + torch.tensor([1e6, 0.0, 0.0]))
     shift = torch.eye(4)
     shift[:3, 3] = camera.viewmat[:3, 3] - camera.viewmat[:3, :3] @ torch.tensor([1e6, 0.0, 0.0])
@@ -236,7 +236,7 @@ def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatc
     model, views = small_model("cpu")
     right = type(model).slice
 
-    def single(self: Any, query: Query) -> Any:
+    def single(self: Any, query: CameraTime) -> Any:
         if query.center.dtype == torch.float64:
             raise kind("expected scalar type Float but found Double")
         return right(self, query)

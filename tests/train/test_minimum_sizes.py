@@ -10,7 +10,7 @@ import torch
 from test_wiring import trainer
 from tiny_training import moving_square
 
-from gsbench.models import GaussianModel, Query, build
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import render
 from gsbench.scenes import Camera
 from gsbench.scenes.points import random_points
@@ -75,7 +75,7 @@ def test_no_camera_sees_the_floor(name: str) -> None:
         minimum_scale.after_update(0)
     after = render(model, eye, 0.5, background)
     assert 0 < (after - before).abs().max() < 1 / 255
-    factors = model.slice(Query.at(eye.center, 0.5)).factors
+    factors = model.slice(CameraTime.at(eye.center, 0.5)).factors
     assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * minimum_scale.least).all()
     assert all(torch.equal(model.splats[n], p) for n, p in others.items())
     assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)

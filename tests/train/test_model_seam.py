@@ -10,10 +10,10 @@ from tiny_training import compose, moving_square
 from torch import Tensor, nn
 
 from gsbench.config import LearningRate
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.models.base import Raw
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.sliced import Conditioned
 from gsbench.scenes import Points
 from gsbench.schedule import Schedule
 from gsbench.train.batches import generator
@@ -44,7 +44,7 @@ class Deformed(Gaussians3DModel):
         self.started_at = points.times
         return super().initial_geometry(points, distances, generator)
 
-    def condition(self, raw: Raw, query: Query) -> Conditioned:
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         assert query.time is not None
         time = torch.as_tensor(query.time).reshape(1)
         moved = raw if self.active.warms_up else raw | {"means": raw["means"] + self.field(time)}

@@ -11,8 +11,8 @@ from tiny_training import compose
 from train.test_wiring import trainer
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query, build
-from gsbench.models.freetime import FreeTimeModel
+from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.moving import FreeTimeModel
 from gsbench.run import setup
 from gsbench.scenes.scene import Camera, Points, View
 from gsbench.schedule import ActiveComponents
@@ -21,7 +21,7 @@ from gsbench.train.hooks.penalties import Penalties
 from gsbench.train.regularisers import LEAST_DISTANCE, Strain
 
 FRAMES = 7
-QUERY = Query.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
+QUERY = CameraTime.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
 VIEWMAT = torch.eye(4, dtype=torch.float64)
 VIEWMAT[2, 3] = 4.0
 VIEW = View("of QUERY", Camera(VIEWMAT, torch.eye(3, dtype=torch.float64), 16, 16), 0.5, torch.zeros(16, 16, 3))
@@ -143,7 +143,7 @@ def test_what_is_culled_later_does_not_count() -> None:
     splats["log_diagonal"][:3, model.rows["t"]] = math.log(1e-4)
     splats["motion"][:3] = 1.0  # at t0, the mean is half a unit from mu_p
     penalty = prepared(model)
-    later = Query(QUERY.center, QUERY.time + 0.1 / FRAMES)
+    later = CameraTime(QUERY.center, QUERY.time + 0.1 / FRAMES)
     assert penalty._visible_means(QUERY)[1].min() > 0.5
     assert penalty._visible_means(later)[1][:3].max() == 0
     assert (penalty._visible_means(later)[0] - penalty._visible_means(QUERY)[0])[:3].abs().min() > 0.4

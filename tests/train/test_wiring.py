@@ -16,9 +16,9 @@ from gsbench.kernels.adam import adam_all
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
-from gsbench.models import Query
+from gsbench.models import CameraTime
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.render import rasterize_slice
-from gsbench.models.sliced import tensors_of
 from gsbench.run.checks import check_values
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
@@ -263,7 +263,7 @@ def test_a_model_shows_the_same_by_kernels_and_in_torch(name: str, degree: int, 
     shown = []
     for backend in (AUTO, REFERENCE):
         model.backend = backend
-        shown.append(model.slice(Query.at(fitted.scene.train[2].camera.center, 0.4)))
+        shown.append(model.slice(CameraTime.at(fitted.scene.train[2].camera.center, 0.4)))
     drawn = shown[1].opacities > 1 / 200  # colours of what is not drawn are not computed
     assert drawn.sum() > 10
     for a, b in zip(*map(tensors_of, shown), strict=True):
@@ -408,7 +408,7 @@ def test_blend_weights_add_up_to_alpha() -> None:
     """Catches weights of another channel count or view: the weights of a pixel add up to its alpha."""
     fitted = trainer("3dgs")
     view = fitted.scene.train[0]
-    seen = fitted.model.slice(Query.of(view.camera, view.time))
+    seen = fitted.model.slice(CameraTime.of(view.camera, view.time))
     alpha = rasterize_slice(seen, view.camera, torch.zeros(3), fitted.model.backend).alpha
     weights = blend_weights(fitted.model, [view], antialias=False)
     torch.testing.assert_close(weights.sum(), alpha.detach().sum(), rtol=1e-4, atol=0)

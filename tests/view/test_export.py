@@ -18,7 +18,7 @@ import torch
 from gsbench.errors import TooLargeError
 from gsbench.export import direction, main
 from gsbench.measure.images import to_bytes
-from gsbench.models import GaussianModel, Gaussians3D, Query, build, cameras
+from gsbench.models import CameraTime, GaussianModel, Gaussians3D, build, cameras
 from gsbench.models.render import render
 from gsbench.run.load import LoadedRun, load_run
 from gsbench.run.setup import load_scene
@@ -71,7 +71,7 @@ def test_a_ply_says_how_it_differs_from_the_model(
 ) -> None:
     """Catches Beta profiles or an antialiasing filter that are lost without a word, and a word where there are none."""
 
-    def with_profiles(self: GaussianModel, query: Query) -> Gaussians3D:
+    def with_profiles(self: GaussianModel, query: CameraTime) -> Gaussians3D:
         gaussians = PLAIN_SLICE(self, query)
         return gaussians._replace(shapes=torch.full_like(gaussians.opacities, 2.0))
 
@@ -173,7 +173,7 @@ def test_a_clip_that_fails_leaves_nothing(
             raise failure
         return ply_of(trained)
 
-    def fading(self: GaussianModel, query: Query) -> Gaussians3D:
+    def fading(self: GaussianModel, query: CameraTime) -> Gaussians3D:
         gaussians = PLAIN_SLICE(self, query)
         assert query.time is not None
         return gaussians._replace(opacities=gaussians.opacities * (query.time < 0.9))

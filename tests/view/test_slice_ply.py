@@ -10,7 +10,7 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from gsbench.errors import InputError
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.cameras import UP, intrinsics, look_at
 from gsbench.models.render import render
 from gsbench.raster import rasterize
@@ -68,7 +68,7 @@ def drawn(data: bytes, view: Camera) -> torch.Tensor:
 def test_the_ply_is_the_image(variant: str) -> None:
     """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
     model, view = trained(variant), camera(0.3, -4.0, 1.0)
-    gaussians = trained_of(model, Query.of(view, 0.4))
+    gaussians = trained_of(model, CameraTime.of(view, 0.4))
     image = render(model, view, 0.4, BACKGROUND)
     assert (image - BACKGROUND).abs().max() > 0.1
     assert (drawn(ply_of(gaussians), view) - image).abs().max() < 2e-3
@@ -78,7 +78,7 @@ def test_the_ply_is_the_image(variant: str) -> None:
 def test_harmonics_are_right_from_everywhere(variant: str) -> None:
     """Catches f_rest in the wrong order, waves of time that are left out, or mean times that AGR has not moved."""
     model = trained(variant)
-    data = ply_of(trained_of(model, Query.at(torch.zeros(3), 0.4), keep_harmonics=True))
+    data = ply_of(trained_of(model, CameraTime.at(torch.zeros(3), 0.4), keep_harmonics=True))
     for view in (camera(0.3, -4.0, 1.0), camera(3.0, 2.0, -2.0)):
         assert (drawn(data, view) - render(model, view, 0.4, BACKGROUND)).abs().max() < 2e-3
 
@@ -88,10 +88,10 @@ def test_what_is_culled_is_left_out(name: str) -> None:
     """Catches a file of Gaussians that nobody sees, and an empty file."""
     model = trained(name)
     model.splats["opacities"][:20] = -20.0
-    assert 0 < len(trained_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))) <= 40
+    assert 0 < len(trained_of(model, CameraTime.of(camera(0.0, -4.0, 0.0), 0.4))) <= 40
     model.splats["opacities"][:] = -20.0
     with pytest.raises(InputError, match="no Gaussian"):
-        trained_of(model, Query.of(camera(0.0, -4.0, 0.0), 0.4))
+        trained_of(model, CameraTime.of(camera(0.0, -4.0, 0.0), 0.4))
 
 
 def test_factors_are_decomposed() -> None:
@@ -110,4 +110,4 @@ def test_a_ply_of_a_diverged_model_is_refused() -> None:
     model = trained("3dgs")
     model.splats["means"][3, 1] = float("nan")
     with pytest.raises(InputError, match="means"):
-        ply_of(trained_of(model, Query.at(torch.zeros(3), None)))
+        ply_of(trained_of(model, CameraTime.at(torch.zeros(3), None)))

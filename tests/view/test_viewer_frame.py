@@ -19,7 +19,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import Pixels, rounding_image, to_bytes
-from gsbench.models import Query
+from gsbench.models import CameraTime
 from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
@@ -94,7 +94,7 @@ def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
     """
     here, there = camera_of(0.5, agr), camera_of(2.0, agr)
     plain = agr.render(here, NOW).image
-    gaussians = agr.run.model.slice(Query.at(there.center, 0.4))
+    gaussians = agr.run.model.slice(CameraTime.at(there.center, 0.4))
     frozen = to_bytes(rasterize_slice(gaussians, here, BLACK, AUTO).image[0].cpu().numpy())
     flat = lively("7dgs_agr", count=80).float().requires_grad_(False)
     flat.splats["shN"].data.zero_()
@@ -234,10 +234,10 @@ def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypat
 def test_a_model_that_does_not_compute_in_float64_has_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a user's model whose error is not an InputError, or that answers in float32 and counts as exact."""
     agr = renderer()
-    camera, single = camera_of(0.5, agr), agr.run.model.slice(Query.at(BLACK, 0.4))
+    camera, single = camera_of(0.5, agr), agr.run.model.slice(CameraTime.at(BLACK, 0.4))
     slice_of = type(agr.run.model).slice
 
-    def fails(model: Any, query: Query) -> Any:
+    def fails(model: Any, query: CameraTime) -> Any:
         if model is agr.run.model:
             return slice_of(model, query)
         raise TypeError("only float32")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.tape import Tape
-from gsbench.models import GaussianModel, Query
+from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes import View
 
@@ -34,7 +34,7 @@ class WeighedImage:
     def __init__(self, model: GaussianModel, view: View, background: Tensor, antialias: bool) -> None:
         """Render the view; `background` is its colour, [3]."""
         with torch.no_grad():
-            gaussians = model.slice(Query.of(view.camera, view.time))
+            gaussians = model.slice(CameraTime.of(view.camera, view.time))
         self._colors = gaussians.colors.detach().requires_grad_()  # [N, 3]
         gaussians = gaussians._replace(colors=self._colors)
         with torch.enable_grad(), Tape() as self._tape:

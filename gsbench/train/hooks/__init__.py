@@ -20,13 +20,15 @@ if TYPE_CHECKING:
     from gsbench.config import Config
     from gsbench.measure.curve import Curve
     from gsbench.measure.speed import Effort, StageClock
-    from gsbench.models import GaussianModel, Query
+    from gsbench.models import CameraTime, GaussianModel
     from gsbench.scenes import Scene, View
     from gsbench.schedule import Schedule
     from gsbench.train.renderer import Renderer
     from gsbench.train.rows import Rows
 
-LossTerm = tuple[float, "Callable[[Query, int], Tensor]"]  # weight, and the term [] of a view of the batch by its index
+LossTerm = tuple[
+    float, "Callable[[CameraTime, int], Tensor]"
+]  # weight, and the term [] of a view of the batch by its index
 ELSEWHERE = ("gsbench.train.gating",)  # modules of hooks outside of this folder, which act last
 
 

@@ -1,4 +1,4 @@
-"""Define `Query`: the camera centre and the time for which a model returns 3D Gaussians."""
+"""Define `CameraTime`: the camera centre and the time for which a model returns 3D Gaussians."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gsbench.scenes.scene import Camera
 TIME_MARGIN = 1e-6  # least distance from 0 and 1 of a time that is stored as its logit
 
 
-class Query(NamedTuple):
+class CameraTime(NamedTuple):
     """The camera centre and the time for which a model returns 3D Gaussians with colours.
 
-    `Query.of` makes a query from a camera, and `Query.at` from a position. These two functions check their arguments.
+    `CameraTime.of` takes a camera, and `CameraTime.at` a position; both check their arguments.
 
     Args:
         center: the position of the camera [3], world units.
@@ -25,10 +25,10 @@ class Query(NamedTuple):
 
     Example:
         >>> import torch
-        >>> from gsbench import Query
-        >>> Query.at(torch.tensor([0.0, -4.0, 0.0]), 0.25)
-        Query(center=tensor([ 0., -4.,  0.]), time=tensor(0.2500))
-        >>> Query.at(torch.zeros(2), 0.25)
+        >>> from gsbench import CameraTime
+        >>> CameraTime.at(torch.tensor([0.0, -4.0, 0.0]), 0.25)
+        CameraTime(center=tensor([ 0., -4.,  0.]), time=tensor(0.2500))
+        >>> CameraTime.at(torch.zeros(2), 0.25)
         Traceback (most recent call last):
         ...
         gsbench.errors.InputError: query: center: expected shape [3], got [2]
@@ -38,17 +38,13 @@ class Query(NamedTuple):
     time: Tensor | None = None  # [] in [0, 1]; None: the scene has no time
 
     @classmethod
-    def of(cls, camera: Camera, time: float | Tensor | None) -> Query:
+    def of(cls, camera: Camera, time: float | Tensor | None) -> CameraTime:
         """Take the centre of a camera and a time in [0, 1]; raises InputError if the time is not a finite number."""
         return cls.at(camera.center, time)
 
     @classmethod
-    def at(cls, center: Tensor, time: float | Tensor | None) -> Query:
-        """Make a query from a camera position and a time.
-
-        Args:
-            center: the position [3], world units.
-            time: the time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it; None: no time.
+    def at(cls, center: Tensor, time: float | Tensor | None) -> CameraTime:
+        """Take a position [3] and a time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it.
 
         Raises:
             InputError: the position is not a tensor [3], or the time is not a finite number.

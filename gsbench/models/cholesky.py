@@ -1,4 +1,4 @@
-"""Define 6DGS and 7DGS: Gaussians over position, direction and (in 7DGS) time, with a Cholesky factor as parameter."""
+"""Define 6DGS, 7DGS and N-DGS: Gaussians over position, direction and time, with a Cholesky factor as parameter."""
 
 import math
 from collections.abc import Sequence
@@ -12,13 +12,14 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
 from gsbench.models.base import SHRINK, Raw
+from gsbench.models.camera_time import CameraTime, times_inside, unit
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
-from gsbench.models.elementary import exp, log
-from gsbench.models.factors import KINDS, OFF_DIAGONALS, Triangle, rotation, sizes
-from gsbench.models.gated import OPACITY_MARGIN
+from gsbench.models.factors import KINDS, OFF_DIAGONALS, CholeskyLayout, rotation, sizes
+from gsbench.models.gated import OPACITY_MARGIN, GatedModel
+from gsbench.models.gaussian_batch import Conditioned, Geometry
 from gsbench.models.joint import JointModel
-from gsbench.models.query import Query, times_inside, unit
-from gsbench.models.sliced import Conditioned, Geometry
+from gsbench.models.portable_math import exp, log
+from gsbench.models.registry import register
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.scene import Points
@@ -33,7 +34,7 @@ TIME_CORRELATION = 0.05  # a Gaussian is split in time if |S_pt| is above this p
 TIME_SCALE = 0.25  # .. and sqrt(S_t) is above this part of the scene's length (7DGS, section 4.4)
 
 
-class TriangularModel(JointModel):
+class CholeskyModel(JointModel):
     """The base class of 6DGS and 7DGS: Gaussians over position p, and over direction d, time t, or d and t.
 
     The parameters are those of a lower triangular factor of the covariance. Before conditioning on d and t, its rows
@@ -49,25 +50,12 @@ class TriangularModel(JointModel):
     def __init__(
         self,
         *,
-        factor_order: str = "conditioned_first",
-        scheme: str = "square_root",
-        off_diagonal: str = "relative",
-        split_in_time: bool = True,
+        factor_order: str = "conditioned_first",  # of the rows: (direction, time, position); paper: (p, t, d)
+        scheme: str = "square_root",  # the numerical method of conditioning, see `slice_gaussians`
+        off_diagonal: str = "relative",  # how a parameter gives an entry below the diagonal, see `CholeskyLayout`
+        split_in_time: bool = True,  # whether moving Gaussians are also split if they are long in time (section 4.4)
         **options: Any,
     ) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            factor_order: the order of variables in the triangular factor: `paper` is (position, time, direction),
-                `conditioned_first` is (direction, time, position).
-            scheme: the numerical method of conditioning, see `slice_gaussians`.
-            off_diagonal: how a parameter gives an entry below the diagonal, see `form` of `Triangle`.
-            split_in_time: whether moving Gaussians are also split if they are long in time (7DGS, section 4.4).
-            options: the options of `GatedModel`.
-
-        Raises:
-            InputError: an option is out of its range.
-        """
         super().__init__(**options)
         if factor_order not in FACTOR_ORDERS:
             raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
@@ -79,9 +67,9 @@ class TriangularModel(JointModel):
         there = "p" + "".join(LETTERS[x] for x in self.observes)
         letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in there)
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
-        own = {"time": [len(letters) - 4], "direction": [0, 1, 2]}
-        self.columns = {x: own[x] for x in own if x in self.observes}
-        self.triangle = Triangle(letters, off_diagonal)
+        columns = {"time": [len(letters) - 4], "direction": [0, 1, 2]}
+        self.columns = {x: columns[x] for x in columns if x in self.observes}
+        self.layout = CholeskyLayout(letters, off_diagonal)
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
@@ -95,7 +83,7 @@ class TriangularModel(JointModel):
         log_diagonal[:, self.rows["p"]] = log(distances)[:, None]
         log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
         raw = {"log_diagonal": log_diagonal}
-        raw |= {kind: torch.zeros(N, len(self.triangle.places[kind])) for kind in self.triangle.kinds}
+        raw |= {kind: torch.zeros(N, len(self.layout.places[kind])) for kind in self.layout.kinds}
         if "direction" in self.observes:
             raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
@@ -103,18 +91,18 @@ class TriangularModel(JointModel):
             raw["times"] = times_inside(times).logit() if self.bounded_times else times
         return raw
 
-    def condition(self, raw: Raw, query: Query) -> Conditioned:
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Condition Gaussians on time t and on the unit vector d from the camera to their means (7DGS, algorithm 1)."""
         factor, offset = self.factors(raw), self.offset(raw, query)
         reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
         # If q is so far from mu_q that the opacity is zero, T_qq is replaced by the identity and q by mu_q, and the
         # opacity factor is zero. Otherwise the huge numbers would give gradients of 0 x inf.
         with torch.no_grad():
-            seen = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
-        delta = torch.where(seen[:, None], offset, 0.0)
-        T_qq = torch.where(seen[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
+            visible = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
+        delta = torch.where(visible[:, None], offset, 0.0)
+        T_qq = torch.where(visible[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
         white = whiten(T_qq, delta)
-        opacity_factor = torch.where(seen, exp(-self._exponent(T_qq, delta, white)), 0.0)
+        opacity_factor = torch.where(visible, exp(-self._exponent(T_qq, delta, white)), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
@@ -128,18 +116,19 @@ class TriangularModel(JointModel):
         Their covariance factor L_pp is the position block of the Cholesky factor.
         """
         space = self.rows["p"]
-        factors = Triangle("ppp", self.triangle.form).factor(raw["log_diagonal"][:, space], raw)
+        factors = CholeskyLayout("ppp", self.layout.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
-    def slice_geometry(self, raw: Raw, query: Query) -> Geometry:
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
+        directed, timed = "direction" in self.observes, "time" in self.observes
         geometry = slice_triangular(
             raw["means"],
-            self.mean_directions(raw) if "direction" in self.observes else None,
-            self.mean_times(raw) if "time" in self.observes else None,
+            self.mean_directions(raw) if directed else None,
+            self.mean_times(raw) if timed else None,
             raw["log_diagonal"],
             raw["shape"],
             raw["motion"],
@@ -147,10 +136,10 @@ class TriangularModel(JointModel):
             raw["opacities"],
             query.center,
             query.time,
-            self.log_lambda["direction"] if "direction" in self.observes else None,
-            self.log_lambda["time"] if "time" in self.observes else None,
+            self.log_lambda["direction"] if directed else None,
+            self.log_lambda["time"] if timed else None,
             conditioned_first=self.factor_order == "conditioned_first",
-            form=OFF_DIAGONALS.index(self.triangle.form),
+            form=OFF_DIAGONALS.index(self.layout.form),
             directional_half=self.directional_half,
             subtracts=self.scheme == "cholesky",
             conditioned=self.conditioned,
@@ -213,7 +202,7 @@ class TriangularModel(JointModel):
 
     def _parameters_of(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> dict[str, Tensor]:
         """Compute the parameters of covariance factors from the blocks of [T_qq 0; T_pq T_pp]."""
-        return self.triangle.parameters(self._assembled(T_qq, T_pq, T_pp))
+        return self.layout.parameters(self._assembled(T_qq, T_pq, T_pp))
 
     def _assembled(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> Tensor:
         """Assemble covariance factors [N, n, n] from blocks [T_qq 0; T_pq T_pp] of position p and other variables q."""
@@ -221,19 +210,16 @@ class TriangularModel(JointModel):
         return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, self.own_order()]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used, given what each Gaussian depends on.
-
-        A Gaussian that does not depend on time or direction does not use the entries of this variable.
-        """
+        """Return masks of the parameter entries that are used: a static Gaussian uses none of time and direction."""
         masks = super().kept(effect_sets)
         if effect_sets.frozen is None:
             return masks
         static = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device) >= effect_sets.conditioned
         gone = {"p": torch.zeros_like(static), "t": static | (effect_sets.frozen & TIME > 0),
                 "d": static | (effect_sets.frozen & DIRECTION > 0)}  # fmt: skip
-        masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.triangle.letters], -1)
-        for kind in self.triangle.kinds[1:]:  # all but shape
-            pairs = [self.triangle.pair(place) for place in self.triangle.places[kind]]
+        masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.layout.letters], -1)
+        for kind in self.layout.kinds[1:]:  # all but shape
+            pairs = [self.layout.pair(place) for place in self.layout.places[kind]]
             masks[kind] = ~torch.stack([gone[a] | gone[b] for a, b in pairs], -1)
         if "direction" in self.observes:
             masks["directions"] = ~gone["d"][:, None]
@@ -249,15 +235,15 @@ class TriangularModel(JointModel):
         """Return initial Cholesky factors whose block of position is that of trained 3D Gaussians."""
         space = torch.tensor(self.rows["p"])
         double = {name: value.double() for name, value in raw.items()}
-        factor = self.triangle.factor(double["log_diagonal"], double)  # diagonal: the model starts without coupling
+        factor = self.layout.factor(double["log_diagonal"], double)  # diagonal: the model starts without coupling
         # The smallest scale of a flat Gaussian is computed as a difference of numbers as large as its largest scale.
         log_scales = trained.log_scales.double()
         log_scales = log_scales.clamp(min=log_scales.amax(1, keepdim=True) + math.log(FLATTEST))
         factor[:, space[:, None], space] = rotation(trained.quats.double()) * sizes(log_scales)[:, None, :]
-        return self.triangle.parameters(factor)
+        return self.layout.parameters(factor)
 
     @torch.no_grad()
-    def frozen(self, raw: Raw, queries: Sequence[Query], weights: Tensor) -> dict[str, Raw]:
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Return parameters of Gaussians that do not depend on time, on direction, or on both.
 
         To remove the dependence on a variable, its columns of the gain K (the derivative of the mean with respect to
@@ -282,20 +268,14 @@ class TriangularModel(JointModel):
             columns = [column for x in variables for column in self.columns[x]]
             moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
             opacity = torch.sigmoid(raw["opacities"].double()) * opacity_factors[name]
-            new = self.triangle.parameters(self._without(blocks, gain, variables)) | {"means": moved}
+            new = self.layout.parameters(self._without(blocks, gain, variables)) | {"means": moved}
             new["opacities"] = torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))
             new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
             changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
         return changed
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
-        """Compute Cholesky factors [N, n, n] of Gaussians that do not depend on the given variables.
-
-        Args:
-            blocks: the blocks T_qq, T_pq and T_pp of the present factors (p: position; q: time and direction).
-            gain: the gain K = T_pq T_qq^-1 of the present factors.
-            variables: `time`, `direction` or both.
-        """
+        """Compute Cholesky factors [N, n, n] without the given variables, from present blocks and gain K."""
         T_qq, kept = blocks.T_qq.clone(), gain.clone()
         if "direction" in variables and "time" in self.observes:
             # Without d, the row of t has its whole standard deviation on the diagonal.
@@ -310,10 +290,10 @@ class TriangularModel(JointModel):
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute Cholesky factors from raw parameters, with rows sorted to (position, direction, time), [N, n, n]."""
-        L = self.triangle.factor(raw["log_diagonal"], raw)
+        L = self.layout.factor(raw["log_diagonal"], raw)
         return L[:, self.rows["p"] + self.rows["d"] + self.rows["t"]]
 
-    def offset(self, raw: Raw, query: Query) -> Tensor:
+    def offset(self, raw: Raw, query: CameraTime) -> Tensor:
         """Compute the offset q - mu_q of direction and time from their means, [N, k], ordered (direction, time)."""
         parts = []
         if "direction" in self.observes:
@@ -341,21 +321,17 @@ class TriangularModel(JointModel):
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
         """Compute -ln of the factor by which each variable dims a Gaussian, and of both (`static`), [N] each.
 
-        For `direction` and `time` the factors are f_dir and f_temp (7DGS, eq. 11 and 12).
-
-        Args:
-            T_qq: the triangular factor of the covariance of q, which is direction and time.
-            delta: the offset of direction and time from their means, q - mu_q.
-            white: T_qq^-1 delta.
+        For `direction` and `time` the factors are f_dir and f_temp (7DGS, eq. 11 and 12). T_qq is the triangular factor
+        of the covariance of q = (direction, time), delta = q - mu_q, and white = T_qq^-1 delta.
         """
-        found = {}
+        exponents = {}
         if "direction" in self.observes:
             half = 0.5 if self.directional_half else 1.0
-            found["direction"] = half * self.lambda_of("direction") * white[:, :3].square().sum(-1)
+            exponents["direction"] = half * self.lambda_of("direction") * white[:, :3].square().sum(-1)
         if "time" in self.observes:
             distance = delta[:, -1] / T_qq[:, -1].norm(dim=-1)  # in standard deviations, sqrt(S_t)
-            found["time"] = 0.5 * self.lambda_of("time") * distance.square()
-        return found | {"static": torch.stack(list(found.values())).sum(0)}
+            exponents["time"] = 0.5 * self.lambda_of("time") * distance.square()
+        return exponents | {"static": torch.stack(list(exponents.values())).sum(0)}
 
     def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
         """Compute -ln of the factor by which time and direction dim a Gaussian, [N]."""
@@ -386,3 +362,131 @@ class TriangularModel(JointModel):
         the variance S_t of time.
         """
         return self.moves_long(self.factors(dict(self.splats.items())))
+
+
+class TimedModel(CholeskyModel):
+    """The base class of models whose Gaussians depend on time, such as 7DGS with or without direction."""
+
+    def __init__(
+        self,
+        *,
+        lambda_t: float,  # the initial coefficient in the exponent of f_temp, the factor of the opacity at a time
+        bounded_times: bool = False,  # whether mean times are sigmoids of their parameters, in (0, 1) (N-DGS)
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.add_lambda("time", lambda_t)
+        self.bounded_times = bounded_times
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; see `GaussianModel.lifetimes`."""
+        lifetimes = super().lifetimes()
+        assert lifetimes is not None
+        return self.mean_times(dict(self.splats.items()))[:, 0], lifetimes[1]
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the diagonal entry of time in each Cholesky factor, a lower bound of sqrt(S_t), to at least `least`."""
+        least_entry = math.log(least) + 0.5 * self.log_lambda["time"].detach()
+        self.splats["log_diagonal"].data[:, self.rows["t"][0]].clamp_(min=least_entry)
+
+
+class DirectionalModel(CholeskyModel):
+    """The base class of models whose Gaussians depend on view direction: 6DGS, and together with time 7DGS."""
+
+    def __init__(
+        self,
+        *,
+        lambda_d: float,  # the initial coefficient in the exponent of f_dir, the factor of the opacity in a direction
+        directional_half: bool = True,  # whether f_dir has the 1/2 of 7DGS eq. 12; 6DGS does not have it
+        unit_directions: bool = False,  # whether mean directions are normalised when a Gaussian is sliced (N-DGS)
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.add_lambda("direction", lambda_d)
+        self.directional_half = directional_half
+        self.unit_directions = unit_directions
+
+
+@register("6dgs")
+class Gaussians6DModel(DirectionalModel, gates=True):
+    """6DGS: Gaussians over position and direction, conditioned on the direction from the camera (Gao et al. 2024)."""
+
+    observes = ("direction",)
+    centers = ("means", "directions")
+
+
+@register("7dgs")
+class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
+    """7DGS: Gaussians over position, time and direction, conditioned on a time and a direction (Gao et al. 2025)."""
+
+    observes = ("time", "direction")
+    centers = ("means", "times", "directions")
+
+    def __init__(self, *, joint_gate: bool = False, **options: Any) -> None:
+        """Make a model without Gaussians.
+
+        With `joint_gate`, direction and time q dim a Gaussian together, by exp(-lambda (q - mu_q)^T S_qq^-1 (q - mu_q))
+        as in N-DGS, and not by f_dir f_temp. There is no 1/2, whatever directional_half says, and one lambda, which
+        lambda_t and lambda_d must both be. No kernel has it: slices are computed in torch.
+        """
+        super().__init__(**options)
+        self.joint_gate = joint_gate
+        if joint_gate:
+            if not torch.equal(self.log_lambda["time"], self.log_lambda["direction"]):
+                raise InputError(f"joint_gate: expected lambda_d equal to lambda_t, got {options['lambda_d']} and "
+                                 f"{options['lambda_t']}: a joint gate has one lambda")  # fmt: skip
+            del self.log_lambda["direction"]
+
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Compute conditional 3D Gaussians by a kernel if the backend has one; with a joint gate, in torch."""
+        return GatedModel.slice_geometry(self, raw, query) if self.joint_gate else super().slice_geometry(raw, query)
+
+    def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
+        """Compute -ln of the factor by which each variable dims a Gaussian, and of both (`static`), [N] each.
+
+        With a joint gate, the factor of a variable is that of both, divided by the one that is left without it.
+        """
+        if not self.joint_gate:
+            return super().exponents(T_qq, delta, white)
+        scale = self.lambda_of("time")
+        time = (delta[:, -1] / T_qq[:, -1].norm(dim=-1)).square()  # delta_t^2 / S_t
+        both = white.square().sum(-1)
+        return {
+            "direction": scale * (both - time).clamp(min=0),
+            "time": scale * white[:, 3].square(),
+            "static": scale * both,
+        }
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; see `GaussianModel.lifetimes`.
+
+        With a joint gate, s is that of the direction which dims the Gaussian least at each time.
+        """
+        times, deviations = super().lifetimes()
+        return times, deviations / math.sqrt(2) if self.joint_gate else deviations
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the lifetime of each Gaussian to at least `least`; see `TimedModel.hold_lifetimes`."""
+        super().hold_lifetimes(least * math.sqrt(2) if self.joint_gate else least)
+
+
+@register("7dgs_nodir")
+class Gaussians7DWithoutDirectionModel(TimedModel, gates=True):
+    """7DGS without direction, to test direction: Gaussians over position and time, conditioned on a time.
+
+    4DGS also has position and time, but another covariance factor, colours that change with time, and other rates.
+    """
+
+    observes = ("time",)
+    centers = ("means", "times")
+    geometry = ("log_diagonal", "shape", "motion")
+
+
+@register("ndgs")
+class NDGSModel(Gaussians7DModel, gates=True):
+    """N-DGS, the later code of the authors of 7DGS: Gaussians over position, direction and time."""
+
+    def __init__(
+        self, *, unit_directions: bool = True, bounded_times: bool = True, joint_gate: bool = True, **options: Any
+    ) -> None:
+        super().__init__(unit_directions=unit_directions, bounded_times=bounded_times, joint_gate=joint_gate, **options)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.models.elementary import sqrt
+from gsbench.models.portable_math import sqrt
 
 
 class Gaussians3D(NamedTuple):
@@ -48,9 +48,6 @@ def reach(shapes: Tensor) -> Tensor:
 
     A profile (1 - r^2)^b ends at r = 1, and is close to the Gaussian exp(-b r^2), whose standard deviation is
     1 / sqrt(2 b).
-
-    Args:
-        shapes: the exponents b, [N].
     """
     return sqrt(2 * shapes)
 

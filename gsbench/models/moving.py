@@ -1,0 +1,357 @@
+"""Define dGS, dBS and FreeTimeGS: 3D Gaussians that keep one shape, while means and opacities change.
+
+Means and opacities change with time, in dGS and dBS also with the view direction. The equations of these two are those
+of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the authors' code. Wang et al.,
+"FreeTimeGS: Free Gaussian Primitives at Anytime and Anywhere", arXiv 2506.05348.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsbench.errors import InputError, did_you_mean
+from gsbench.kernels.headers import DIRECT_FADING
+from gsbench.kernels.moving import slice_direct, slice_direct_beta, slice_free_time
+from gsbench.kernels.tensors import check_positive
+from gsbench.models.base import Raw, slice_by
+from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
+from gsbench.models.camera_time import CameraTime, times_inside, unit
+from gsbench.models.effect_sets import EffectSets
+from gsbench.models.factors import sizes
+from gsbench.models.gated import OPACITY_MARGIN, GatedModel
+from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.portable_math import exp, log
+from gsbench.models.registry import register
+from gsbench.scenes.scene import Points
+
+
+class MovingGaussians3D(Gaussians3DModel):
+    """3D Gaussians of 3DGS (rotation and scales) whose means and opacities depend on time or direction.
+
+    Density control is that of 3DGS: a split makes two children that are 1.6 times smaller and move like their parent.
+    """
+
+    moving: ClassVar[tuple[str, ...]]  # names of the raw parameters that a static Gaussian does not use
+
+    @abstractmethod
+    def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Return how far the means move [N, 3] and the factors of the opacities [N], for a camera centre and a time."""
+
+    @abstractmethod
+    def lifetimes(self) -> tuple[Tensor, Tensor] | None:
+        """Return mean [N] and standard deviation [N] of each opacity as a function of time; None without time."""
+
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
+        """Return the moved means, the covariance factors R S and the opacity factors for a camera centre and a time."""
+        shift, opacity_factor = self.change(raw, query)
+        return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
+
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Compute the 3D Gaussians for a camera and a time in torch; a model with a kernel overrides this."""
+        return GatedModel.slice_geometry(self, raw, query)
+
+    @torch.no_grad()
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
+        """Replace means and opacities by their weighted averages over views; see `GatedModel.frozen`."""
+        exact = {name: value.double() for name, value in raw.items()}
+        shift, opacity = torch.zeros_like(exact["means"]), torch.zeros_like(exact["opacities"])
+        for query, weight in zip(queries, weights.double(), strict=True):
+            moved, factor = self.change(exact, CameraTime(query.center.double(), query.time))
+            shift += weight[:, None] * moved
+            opacity += weight * factor * torch.sigmoid(exact["opacities"])
+        new = {"means": exact["means"] + shift,
+               "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))}  # fmt: skip
+        return {"static": {name: value.to(raw[name].dtype) for name, value in new.items()}}
+
+    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        """Return masks of the parameter entries that are used: a static Gaussian uses no parameter in `moving`."""
+        masks = super().kept(effect_sets)
+        if effect_sets.frozen is not None:
+            rows = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
+            masks |= dict.fromkeys(self.moving, rows < effect_sets.conditioned)
+        return masks
+
+    def log_duration(self, index: int) -> float | None:
+        """Return the logarithm of the standard deviation in time of the Gaussian `index`; None without time."""
+        lifetimes = self.lifetimes()
+        return None if lifetimes is None else math.log(float(lifetimes[1][index]))
+
+
+@register("freetime")
+class FreeTimeModel(MovingGaussians3D, gates=True):
+    """FreeTimeGS: each Gaussian has a mean time mu_t, a standard deviation in time s and a velocity v,
+
+        mean = mu_p + v (t - mu_t)      opacity = sigmoid(o) exp(-1/2 ((t - mu_t) / s)^2)      cov = R S S^T R^T
+
+    A velocity is the movement during the whole time range [0, 1], in world units.
+    """  # fmt: skip
+
+    observes = ("time",)
+    centers = ("means", "times")
+    geometry = ("scales", "quats", "durations", "velocities")
+    lengths = ("means", "velocities")
+    moving = ("times", "durations", "velocities")
+
+    def __init__(
+        self,
+        *,
+        duration: float = math.sqrt(1 / 5),  # initial standard deviation in time: 4DGS', because points have no times
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        check_positive(duration, "duration")
+        self.duration = duration
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Return spheres at rest with mean times uniform in [-0.1, 1.1]."""
+        N = len(distances)
+        return super().initial_geometry(points, distances, generator) | {
+            "times": torch.rand(N, 1, generator=generator) * 1.2 - 0.1,
+            "durations": torch.full((N, 1), math.log(self.duration)),
+            "velocities": torch.zeros(N, 3),
+        }
+
+    def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Return the shifts v (t - mu_t) of means [N, 3] and opacity factors exp(-1/2 ((t - mu_t) / s)^2) [N]."""
+        assert query.time is not None
+        delta = query.time - raw["times"]
+        opacity_factor = exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
+        return raw["velocities"] * delta, opacity_factor
+
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Compute the moved 3D Gaussians by the backend's kernel if it has one, else in torch."""
+        if not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        assert query.time is not None
+        names = ("means", "times", "scales", "quats", "durations", "velocities", "opacities")
+        return slice_by(slice_free_time, raw, names, query.time, conditioned=self.conditioned)
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
+        return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Raise the standard deviation in time of each Gaussian to at least `least`."""
+        self.splats["durations"].data.clamp_(min=math.log(least))
+
+
+COUPLINGS = ("text", "interpolated", "none")
+TIME_PRECISION = math.sqrt(10)  # initial L_tt
+SHARES = -1.2  # initial logits of Lam
+LARGEST_SHARE = 0.999  # of Lam after `shrink_rows`: the logit of 1 is infinite
+COUPLING_SPREAD = 0.01  # initial standard deviation of the entries of Theta
+
+
+@register("dgs")
+class DirectModel(MovingGaussians3D, gates=True):
+    """dGS: 3D Gaussians that move and fade with the direction d from the camera and the time t.
+
+    Let q = (d, t), delta = q - mu_q with the mean mu_q, and V_qq = L L^T the precision over direction and time. Then
+
+        mean    = mu_p + V_pq diag(Lam) V_qq delta        V_pq = s Theta / |Theta|, s: mean of the three scales
+        opacity = sigmoid(o) exp(-lambda_o |L^T delta|^2)   lambda_o = 0.35
+        cov     = R S S^T R^T, for all times and directions
+
+    The learned parameters of motion are Theta [3, 4] and Lam. L is lower triangular over direction and has one entry
+    for time. Lam has one number in [0, 1] for the three columns of direction and one for time. No gradient flows
+    through d.
+    """  # fmt: skip
+
+    observes = ("time", "direction")
+    centers = ("means", "times", "directions")
+    geometry = ("scales", "quats", "precision", "coupling", "shares")
+    moving = ("times", "directions", "precision", "coupling", "shares")
+
+    def __init__(self, *, coupling: str = "text", view_precision: float = 1.0, **options: Any) -> None:
+        """Make a model without Gaussians.
+
+        Args:
+            coupling: how the mean moves. `text`: by the formula of the class. `interpolated`: by V_pq ((1 - Lam) delta
+                + Lam V_qq delta), as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
+            view_precision: the initial diagonal of L over direction. The authors use 0.02 for D-NeRF, 2.5 for the cloud
+                of 7DGS-PBR, 0.4 for its other scenes, and 1.0 elsewhere.
+            options: the options of `GatedModel`.
+        """
+        super().__init__(**options)
+        if coupling not in COUPLINGS:
+            raise InputError(f"coupling '{coupling}' is not known. {did_you_mean(coupling, COUPLINGS)}")
+        check_positive(view_precision, "view_precision")
+        self.coupling = coupling
+        self.view_precision = view_precision
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Return spheres with random mean directions, and mean times uniform in [-0.1, 1.1], clipped to [0, 1]."""
+        N = len(distances)
+        times = times_inside(torch.rand(N, 1, generator=generator) * 1.2 - 0.1)
+        view, time = math.log(self.view_precision), math.log(TIME_PRECISION)
+        return super().initial_geometry(points, distances, generator) | {
+            "times": times.logit(),
+            "directions": F.normalize(torch.randn(N, 3, generator=generator), dim=-1),
+            "precision": torch.tensor([view, 0.0, view, 0.0, 0.0, view, time]).repeat(N, 1),
+            "coupling": COUPLING_SPREAD * torch.randn(N, 12, generator=generator),
+            "shares": torch.full((N, 2), SHARES),
+        }
+
+    def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""
+        assert query.time is not None
+        direction = unit(raw["means"] - query.center).detach()
+        delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
+        L = precision_factor(raw["precision"])
+        white = (L.mT @ delta[..., None])[..., 0]
+        opacity_factor = exp(-DIRECT_FADING * white.square().sum(-1))
+        if self.coupling == "none":
+            return torch.zeros_like(raw["means"]), opacity_factor
+        V_pq = coupling_matrix(raw["coupling"], sizes(raw["scales"]))
+        shares = torch.sigmoid(raw["shares"])[:, [0, 0, 0, 1]]
+        shift = shares * (L @ white[..., None])[..., 0]
+        if self.coupling == "interpolated":
+            shift = shift + (1 - shares) * delta
+        return (V_pq @ shift[..., None])[..., 0], opacity_factor
+
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Compute the moved 3D Gaussians by a kernel, or in torch if the backend has none for this `coupling`."""
+        if self.coupling != "text" or not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        assert query.time is not None
+        names = ("means", "directions", "times", "scales", "quats", "precision", "coupling", "shares", "opacities")
+        return slice_by(slice_direct, raw, names, query.center, query.time, conditioned=self.conditioned)
+
+    @torch.no_grad()
+    def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
+        """Multiply the scales of Gaussians by factors, and keep the motion of their means.
+
+        The motion is proportional to the scales times Lam, so Lam is divided by the factors, up to LARGEST_SHARE.
+        """
+        super().shrink_rows(rows, factors)
+        shares = torch.sigmoid(self.splats["shares"].data[rows])
+        larger = (shares / factors[:, None].to(shares.dtype)).clamp(max=LARGEST_SHARE)
+        self.splats["shares"].data[rows] = larger.logit()
+
+    def lifetimes(self) -> tuple[Tensor, Tensor]:
+        """Return the mean time [N] of each Gaussian, and the standard deviation [N] of its opacity over time."""
+        L_tt = sizes(self.splats["precision"].detach()[:, 6])
+        return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * DIRECT_FADING) * L_tt)
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
+        self.splats["precision"].data[:, 6].clamp_(max=-math.log(math.sqrt(2 * DIRECT_FADING) * least))
+
+
+def coupling_matrix(coupling: Tensor, scales: Tensor) -> Tensor:
+    """Compute V_pq = s Theta / |Theta| from Theta [N, 3 C] and scales [N, 3] with the mean s, [N, 3, C]."""
+    size = scales.mean(-1)[:, None, None]
+    return size * F.normalize(coupling, dim=-1).unflatten(-1, (3, -1))
+
+
+def precision_factor(raw: Tensor) -> Tensor:
+    """Compute the factor L [N, C, C] of the precision V_qq = L L^T over direction and, if C = 4, time.
+
+    The parameters, [N, 6] or [N, 7], are the lower triangle over direction, row by row, and then the entry of time.
+    """
+    zero = torch.zeros_like(raw[:, 0])
+    xx, yx, yy, zx, zy, zz, *time = raw.unbind(-1)
+    xx, yy, zz = (sizes(log) for log in (xx, yy, zz))
+    L = torch.stack([xx, zero, zero, yx, yy, zero, zx, zy, zz], -1).unflatten(-1, (3, 3))
+    if not time:
+        return L
+    L = F.pad(L, (0, 1, 0, 1))
+    return L + F.pad(sizes(time[0])[:, None, None], (3, 0, 3, 0))
+
+
+@register("dbs")
+class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
+    """dBS: Gaussians with Beta profiles that move and fade with the direction d from the camera and the time t.
+
+    Let q = (d, t), delta = q - mu_q, and V_qq = L L^T the precision over direction and time. Then
+
+        z       = L^T delta                    opacity = sigmoid(o) prod_i (1 - tanh(z_i^2))^b_i
+        mean    = mu_p + V_pq diag(min(b_q / 4, 1)) V_qq delta         V_pq = s Theta / |Theta|, s: mean of three sizes
+        cov     = (I + A) S S^T (I + A)^T, for all times and directions
+
+    No gradient flows through d. L is lower triangular over direction and has one entry for time.
+    """  # fmt: skip
+
+    observes: ClassVar[tuple[str, ...]] = ("time", "direction")
+    centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")
+    geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "precision", "coupling", "betas")
+    moving: ClassVar[tuple[str, ...]] = ("times", "directions", "precision", "coupling")
+
+    def __init__(self, *, view_precision: float = 1.0, **options: Any) -> None:
+        """Make a model without Gaussians.
+
+        Args:
+            view_precision: the initial diagonal of L over direction. The authors use 2.5 for the cloud of 7DGS-PBR, 0.4
+                for its other scenes, and 1.0 elsewhere.
+            options: the options of `GatedModel`.
+        """
+        super().__init__(**options)
+        check_positive(view_precision, "view_precision")
+        self.view_precision = view_precision
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        """Return spheres with mean directions uniform in [-1, 1]^3 and mean times uniform in [0, 1]."""
+        raw = super().initial_geometry(points, distances, generator)
+        N, view = len(distances), math.log(self.view_precision)
+        precision = [view, 0.0, view, 0.0, 0.0, view] + [math.log(TIME_PRECISION)] * ("time" in self.observes)
+        raw["precision"] = torch.tensor(precision).repeat(N, 1)
+        raw["coupling"] = COUPLING_SPREAD * torch.randn(N, 3 * (raw["betas"].shape[1] - 1), generator=generator)
+        return raw
+
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
+        """Return moved means, covariance factors, opacity factors and the exponents of the profiles."""
+        return super().condition(raw, query)._replace(shapes=profiles(raw))
+
+    def static(self, raw: Raw) -> Conditioned:
+        """Return the Gaussians at their means, with their profiles."""
+        return super().static(raw)._replace(shapes=profiles(raw))
+
+    def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""
+        delta = unit(raw["means"] - query.center).detach() - raw["directions"]
+        if "time" in self.observes:
+            assert query.time is not None
+            delta = torch.cat([delta, query.time - raw["times"]], -1)
+        L = precision_factor(raw["precision"])
+        white = (L.mT @ delta[..., None])[..., 0]
+        V_pq = coupling_matrix(raw["coupling"], positive(raw["scales"]))
+        moved = V_pq @ (shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0])[..., None]
+        return moved[..., 0], opacity_factor(white, raw["betas"])
+
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Compute the moved 3D Gaussians and their exponents by the backend's kernel if it has one, else in torch."""
+        if not self.backend.serves(raw["means"]):
+            return super().slice_geometry(raw, query)
+        names = ("means", "directions", "times", "scales", "skew", "precision", "coupling", "betas", "opacities")
+        return slice_by(slice_direct_beta, raw, names, query.center, query.time, conditioned=self.conditioned)
+
+    def lifetimes(self) -> tuple[Tensor, Tensor] | None:
+        """Return mean times [N] and standard deviations [N] of the Gaussians exp(-b z^2); None without time.
+
+        They bound the opacity factors (1 - tanh(z^2))^b, with z = L_tt (t - mu_t).
+        """
+        if "time" not in self.observes:
+            return None
+        L_tt = sizes(self.splats["precision"].detach()[:, -1])
+        b = exponents(self.splats["betas"].detach()[:, -1])
+        return self.splats["times"].detach()[:, 0], 1 / (reach(b) * L_tt)
+
+    def hold_lifetimes(self, least: float) -> None:
+        """Lower the entry L_tt of each precision such that the lifetime is at least `least`."""
+        b = exponents(self.splats["betas"].detach()[:, -1])
+        self.splats["precision"].data[:, -1].clamp_(max=-log(reach(b) * least))
+
+
+@register("dbs_static")
+class StaticDirectBetaModel(DirectBetaModel, gates=True):
+    """dBS over direction alone, for scenes without time."""
+
+    observes: ClassVar[tuple[str, ...]] = ("direction",)
+    centers: ClassVar[tuple[str, ...]] = ("means", "directions")
+    moving: ClassVar[tuple[str, ...]] = ("directions", "precision", "coupling")
