@@ -8,24 +8,16 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
 from urllib.parse import unquote
 
-import length_blocks
-import published as published_blocks
 import pytest
-import readme_blocks
-import results_blocks
-import suite_blocks
-from report.make_golden import make
 from tiny_run import ROOT, environment
 
-from gsbench.measure.curve import Point
 from gsbench.measure.record import Record
-from gsbench.report import study
+from gsbench.report import blocks, study
 
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 
@@ -52,7 +44,7 @@ def copied(to: Path, name: str, change: Callable[[Record], Record] = lambda reco
     records, faults = study.read(ROOT / "results" / "published" / name)
     assert not faults
     study.write(map(change, records), to / name)
-    published_blocks.experiments.cache_clear()
+    blocks.study.cache_clear()
 
 
 def better(record: Record, by: float) -> Record:
@@ -62,58 +54,24 @@ def better(record: Record, by: float) -> Record:
     return dataclasses.replace(record, metrics=metrics | {"psnr": (metrics["psnr"] or 0) + by}, per_view=views)
 
 
-def test_a_sentence_follows_from_the_records(tmp_path: Path) -> None:
-    """Catches a sentence of README that stays when the records say something else."""
-    for name in ("frontier", "mini"):
+def row_of(block: str, name: str) -> list[str]:
+    """The cells of a row of a table."""
+    (line,) = (line for line in block.splitlines() if line.startswith(f"| {name} |"))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_tables_follow_from_the_records(tmp_path: Path) -> None:
+    """Catches a best model, a price or a loss of choosing another one that stays when the records change."""
+    for name in ("frontier", "suite"):
         copied(tmp_path, name)
-    before = readme_blocks.cost(tmp_path)
-    assert re.search(r"2,000 iterations \(not shown\) to 4,000, PSNR falls by more than 0.1 dB for \d of 7", before)
-    copied(tmp_path, "frontier", lambda record: better(record, 20 * record.variant.endswith("iterations=4000")))
-    after = readme_blocks.cost(tmp_path)
-    assert "falls" not in after
-    old, new = ([float(cell) for cell in re.findall(r"(\d\d\.\d\d)\**,", row_of(text))] for text in (before, after))
-    assert new == pytest.approx([psnr + 20 for psnr in old])
-
-
-def row_of(block: str) -> str:
-    """The row of the longest runs."""
-    (found,) = (line for line in block.splitlines() if line.startswith("| 4,000 |"))
-    return found
-
-
-def test_the_sign_of_a_price_follows_from_the_records(tmp_path: Path) -> None:
-    """Catches a sentence about an effect that stays when the effect changes its sign."""
-    copied(tmp_path, "dnerf_trex100")
-    for change, lowers in ((-30, True), (30, False)):
-        copied(tmp_path, "frontier", lambda r, by=change: better(r, by * ((r.model, r.variant) == ("7dgs_noagr", ""))))
-        assert ("Direction lowers PSNR" in results_blocks.effects(tmp_path)) == lowers
-
-
-def test_the_tables_of_the_suite_follow_from_the_records(tmp_path: Path) -> None:
-    """Catches a best model, or a loss of choosing another one, that stays when the records change."""
-    copied(tmp_path, "suite")
-    before = suite_blocks.choices(tmp_path)
+    before = blocks.suite_choices(tmp_path)
+    assert row_of(blocks.cost(tmp_path), "4,000")[7].startswith("**28.32**")
+    copied(tmp_path, "frontier", lambda r: better(r, 20 * ((r.model, r.variant) == ("3dgs", "iterations=4000"))))
+    assert row_of(blocks.cost(tmp_path), "4,000")[1].startswith("**37.27**")
     copied(tmp_path, "suite", lambda r: better(r, 20 * ((r.scene, r.model, r.variant) == ("suzanne", "3dgs", ""))))
-    assert before.endswith("Left out: playroom has no val; lego100 is measured on val.")
-    (row,) = (line for line in suite_blocks.scenes(tmp_path).splitlines() if line.startswith("| suzanne |"))
-    assert row.split(" | ")[2].startswith("**4")
-    lost = [float(re.findall(r"\| 7DGS \| (-\d+\.\d+) ", text)[0]) for text in (before, suite_blocks.choices(tmp_path))]
+    assert row_of(blocks.suite_scenes(tmp_path), "suzanne")[2].startswith("**4")
+    lost = [float(row_of(text, "7DGS")[1]) for text in (before, blocks.suite_choices(tmp_path))]
     assert lost[0] - lost[1] == pytest.approx((20 + 20.85 - 24.72) / 9, abs=0.02)  # without playroom and lego100
-
-
-@pytest.mark.parametrize(
-    ("on_val", "kept", "done"),
-    [
-        ((20.0, 21.0, 22.0, 23.0), 8000, 15_000),
-        ((20.0, 21.0, 21.0, 23.0), 2000, 7000),
-        ((20.0, 19.0, 22.0), 1000, 3000),
-    ],
-)
-def test_a_length_is_chosen_as_train_lengths_does(on_val: tuple[float, ...], kept: int, done: int) -> None:
-    """Catches a table that chooses with hindsight: among lengths that `train.lengths` does not try."""
-    runs = [replace(make(), curve=[Point(1000 << i, 1.0, psnr)]) for i, psnr in enumerate(on_val)]
-    chosen, steps = length_blocks.choose(runs)
-    assert (chosen.curve[-1].iteration, steps) == (kept, done)
 
 
 def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:

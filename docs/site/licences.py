@@ -33,6 +33,8 @@ NOTES = {
     "opencv-contrib-python-headless": "its wheel brings FFmpeg under LGPL-2.1, as a library of its own",
     "sphinx": "its docutils is public domain and BSD-2-Clause, except an Emacs mode under the GPL",
     "nanobind": "linked into the kernels",
+    "vl-convert-python": "brings Vega, Vega-Lite and Vega-Embed under BSD-3-Clause, © University of Washington "
+    "Interactive Data Lab and contributors, which are a part of each `report.html`",
     "axe-playwright-python": "axe itself is under MPL-2.0",
     "plyfile": "tests only read files with it; gsbench writes and reads PLY by code of its own",
 }

@@ -6,29 +6,23 @@
 import inspect
 import re
 import sys
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
 import config_tables
 import hydra
-import length_blocks
-import readme_blocks
-import results_blocks
-import suite_blocks
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import CONF, register_schema
 from gsbench.models import find
 from gsbench.models.base import GaussianModel
+from gsbench.report import blocks
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Points
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = ROOT / "results" / "published"
-WIDTH = 120
-WHOLE = {"break_long_words": False, "break_on_hyphens": False}
 MARKS = "<!-- written by docs/site/tables.py: {} -->", "<!-- end -->"
 
 
@@ -68,10 +62,10 @@ def numbers(composed: DictConfig) -> int:
 
 
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
-    "README.md": readme_blocks.BLOCKS,
+    "README.md": blocks.README,
     "docs/models.md": {"models": lambda _: models()},
     "docs/config.md": {"config": lambda _: config_tables.tables()},
-    "docs/results.md": results_blocks.BLOCKS | suite_blocks.BLOCKS | length_blocks.BLOCKS,
+    "docs/results.md": blocks.RESULTS,
 }
 
 
@@ -87,17 +81,8 @@ def filled(page: str, published: Path = PUBLISHED) -> str:
         first, last = MARKS[0].format(name), MARKS[1]
         before, found, rest = text.partition(first)
         assert found, f"{page}: expected the line {first}"
-        text = f"{before}{first}\n\n{wrapped(write(published))}\n\n{last}{rest.partition(last)[2]}"
+        text = f"{before}{first}\n\n{write(published)}\n\n{last}{rest.partition(last)[2]}"
     return text
-
-
-def wrapped(block: str) -> str:
-    """Break the sentences of a block into lines; tables and images stay as they are."""
-    parts = block.split("\n\n")
-    is_whole = [part[0] in "|!#" or "\n---|" in part for part in parts]
-    return "\n\n".join(
-        part if whole else textwrap.fill(part, WIDTH, **WHOLE) for part, whole in zip(parts, is_whole, strict=True)
-    )
 
 
 def main() -> int:

@@ -25,7 +25,6 @@ from gsbench.report.frame import Results
 from gsbench.report.section import Section
 from gsbench.report.sections import built, experiment
 from gsbench.report.sections.budgets import BUDGETS
-from gsbench.report.tables import load
 from gsbench.run.identity import identify
 from gsbench.train import checkpoint
 
@@ -56,14 +55,6 @@ PAGE: dict[str, tuple[str, list[str], dict[str, str]]] = {
                                   "significant": "significant"}),
     "curves": ("anytime", [], {}),
 }  # fmt: skip
-
-
-@cache
-def records(study: str) -> list[Record]:
-    """The published runs of a study."""
-    read, faults = load(PUBLISHED / study)
-    assert not faults
-    return read
 
 
 @cache

@@ -343,7 +343,7 @@ def test_the_commit_is_unknown_where_git_is_missing(monkeypatch):
 def test_records_and_tables_do_not_import_torch():
     """Would catch two seconds of importing torch before a table is printed, and a table that needs torch at all."""
     code = (
-        "import sys, gsbench.measure.record, gsbench.measure.speed, gsbench.report.tables, gsbench.measure.images;"
+        "import sys, gsbench.measure.record, gsbench.measure.speed, gsbench.report.output, gsbench.measure.images;"
         "from gsbench.measure.provenance import versions; versions();"
         "sys.exit('torch' in sys.modules)"
     )

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from chapters import chapter, lost, results, sections
+from chapters import chapter, lost, results, sections, three_lengths
 from make_golden import make, records
 from many_records import HOSTILE, frontier, hostile, on_demand, write_all
 from skimage.color import deltaE_ciede2000, rgb2lab
@@ -145,6 +145,9 @@ def test_charts_hold_the_numbers_of_their_tables():
     means = [row["psnr_db"] for row in rows if row["kind"] == "mean"]
     assert means == pytest.approx(of["frontier"].table.psnr_db.tolist(), rel=1e-4)
     assert {row["kind"] for row in rows} == {"mean", "run"}
+    (rows,) = specs(*three_lengths())["g0-frontier-0"]["datasets"].values()
+    best = {(row["model"], row["variant"]) for row in rows if row["best"] is True and row["kind"] == "mean"}
+    assert best == {("a", ""), ("a", "iterations=4"), ("b", ""), ("b", "iterations=9")}
     json.dumps(drawn, allow_nan=False)
 
 

@@ -87,8 +87,7 @@ def write(figure: Figure, look: Look, stem: Path) -> list[Path]:
 def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerChart:
     """Draw PSNR against a cost: means with intervals, a line through those on the frontier, single runs, the paper."""
     halves = table.get("psnr_db ±", pd.Series(0.0, table.index)).fillna(0.0)
-    best = table[f"best {x}"].fillna(value=False).astype(bool) if f"best {x}" in table else False
-    table = table.assign(best=best, low=table.psnr_db - halves, high=table.psnr_db + halves).dropna(
+    table = table.assign(best=table[f"best {x}"], low=table.psnr_db - halves, high=table.psnr_db + halves).dropna(
         subset=[x, "psnr_db"]
     )
     names = ["scene", "series", "model", "variant", "kind", "seeds", x, "psnr_db", "low", "high", "best"]

@@ -102,6 +102,8 @@ def frontier(chapter: Results, tests: pd.DataFrame) -> Section | None:
     if table.empty:
         return None
     drawn = pd.concat([table.assign(kind="mean"), *_single_runs(chapter), *_of_paper(chapter)], ignore_index=True)
+    bests = [f"best {cost}" for cost in COSTS]
+    drawn[bests] = drawn[bests] == True  # noqa: E712  # False where a row is no mean
     figures = tuple(
         Figure(f"PSNR against {title}", "frontier", drawn, {"x": cost, "title": title})
         for cost, title in COSTS.items()
