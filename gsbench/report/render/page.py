@@ -22,7 +22,7 @@ from gsbench.report.section import text as short
 from gsbench.report.sections import built
 
 FILE_NAME = "report.html"
-MOST_ROWS = 60  # of a table that the page shows; its CSV file has all
+MOST_ROWS = 250  # of a table that the page shows; its CSV file has all
 MOST_FAULTS = 20  # damaged records that are listed
 TURNED = 13  # columns from which a table of few rows is shown with its columns as rows
 
