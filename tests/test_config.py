@@ -17,13 +17,13 @@ from gsbench.config import CONF, Config
 from gsbench.config_key import Key, declared, described, extended, joins, key
 from gsbench.config_roles import facts, flat, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError
+from gsbench.gates.hook import GATES
 from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.run.checks import check_config
 from gsbench.run.setup import BACKGROUNDS, LEAST_GAUSSIANS
 from gsbench.scenes import RESIZES
 from gsbench.train.density.control import RULES
-from gsbench.train.gating import GATES
 from gsbench.train.optim import OPTIMIZERS
 
 KEYS = declared(Config)

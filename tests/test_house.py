@@ -16,8 +16,9 @@ FLOORS = (
     "kernels",
     "scenes raster",
     "models measure",
-    "effects",
-    "train report fetch",
+    "train fetch",
+    "gates",
+    "report",
     "stability",
     "run",
     "launch view",
@@ -31,7 +32,7 @@ VAGUE_NAMES: dict[str, int] = {
     "benchmarks": 30,
     "docs/site": 21,
     "gsbench": 6,
-    "gsbench/effects": 34,
+    "gsbench/gates": 35,
     "gsbench/fetch": 5,
     "gsbench/kernels": 40,
     "gsbench/measure": 14,
@@ -40,7 +41,7 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/report": 13,
     "gsbench/run": 27,
     "tests": 6,
-    "tests/effects": 37,
+    "tests/gates": 37,
     "tests/models": 53,
     "tests/report": 30,
     "tests/run": 36,
@@ -94,21 +95,27 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return next((cycle for name in graph if (cycle := visit(name, []))), [])
 
 
-def folder(module: str) -> str:
-    """The folder of a module, or "" for a command (`__main__`) and a loose file beside the folders."""
+def folder(module: str, graph: dict[str, set[str]]) -> str:
+    """The folder of a module, or "" for a command and a loose file beside the folders."""
     first = [*module.split("."), ""][1]
-    return first if first in FLOOR and not module.endswith(".__main__") else ""
+    return first if first in FLOOR and not is_of_command(module, graph) else ""
+
+
+def is_of_command(module: str, graph: dict[str, set[str]]) -> bool:
+    """Whether a module is a command (`__main__`), or only commands import it."""
+    importers = [name for name in graph if module in graph[name]] or [""]
+    return module.endswith(".__main__") or all(name.endswith(".__main__") for name in importers)
 
 
 def height(module: str, graph: dict[str, set[str]]) -> float:
     """The floor of a module in a graph without circles.
 
-    A command (`__main__`) is above all. A loose file is half a floor above the highest floor that it imports from.
+    A command is above all. A loose file is half a floor above the highest floor that it imports from.
     """
-    if module.endswith(".__main__"):
+    if is_of_command(module, graph):
         return math.inf
-    if folder(module):
-        return FLOOR[folder(module)]
+    if room := folder(module, graph):
+        return FLOOR[room]
     return math.floor(max((height(imported, graph) for imported in graph[module]), default=-1)) + 0.5
 
 
@@ -118,7 +125,9 @@ def upward(graph: dict[str, set[str]]) -> list[str]:
         f"{name} imports {imported}"
         for name in graph
         for imported in graph[name]
-        if folder(name) and folder(name) != folder(imported) and height(imported, graph) >= height(name, graph)
+        if (room := folder(name, graph))
+        and room != folder(imported, graph)
+        and height(imported, graph) >= height(name, graph)
     ]
 
 

@@ -1,6 +1,6 @@
 """Define the base class of models in which single Gaussians can be made independent of time, direction or AGR.
 
-AGR is the neural refinement of 7DGS. `gsbench.effects.gate` chooses these Gaussians. A model that supports this says so
+AGR is the neural refinement of 7DGS. `gsbench.gates.gate` chooses these Gaussians. A model that supports this says so
 in its own class statement, `class Model(GatedModel, gates=True)`.
 """
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from gsbench import kernels, models
+from gsbench.gates.hook import Gating
 from gsbench.measure import record as records
 from gsbench.measure.images import Pixels, write_png
 from gsbench.measure.provenance import provenance
@@ -33,7 +34,6 @@ from gsbench.run.setup import build, check_start, load_scene, trained_start
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.placement import gaussians_to_standard
-from gsbench.train.gating import Gating
 from gsbench.train.hooks.choices import Choices, lengths_of
 from gsbench.train.loop import Trainer
 

@@ -12,8 +12,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import Config, ModelConfig
-from gsbench.effects import choose, messages
 from gsbench.errors import InputError
+from gsbench.gates import messages
+from gsbench.gates.screen import import_compiler, screen_time
 from gsbench.measure.record import ModelComparison, TimeScreen
 from gsbench.measure.speed import Effort
 from gsbench.run import progress
@@ -129,10 +130,10 @@ def resolve(this: Run, scene: Scene) -> Resolved:
     """
     if not is_auto(this.config):
         return Resolved(this.config)
-    choose.import_compiler()
+    import_compiler()
     effort = Effort()
     with effort:
-        screen = choose.screen(scene, this.config.seed, this.config.raster.backend)
+        screen = screen_time(scene, this.config.seed, this.config.raster.backend)
         config = with_candidate(this.config, "static" if screen.decision == "off" else "moving")
     resolved = Resolved(config, screen, effort)
     model = f"{config.model.name}{' with AGR' if config.agr else ''}"

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsbench.config import Config
-from gsbench.effects import messages
+from gsbench.gates import messages
 from gsbench.measure.record import LengthChoice
 from gsbench.run.auto_model import Resolved
 from gsbench.run.candidates import Candidates, Result, best, highest

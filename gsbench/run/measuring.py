@@ -8,8 +8,8 @@ import numpy.typing as npt
 from torch import Tensor
 
 from gsbench.config import Config
-from gsbench.effects import picture
 from gsbench.errors import one_line
+from gsbench.gates import picture
 from gsbench.measure.images import Pixels, strip
 from gsbench.measure.quality import Quality, evaluate, evenly
 from gsbench.measure.record import Cost, Region, ViewScore

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gsbench.effects import messages
 from gsbench.errors import InputError, one_line, printable
+from gsbench.gates import messages
 from gsbench.measure import record as records
 from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.curve import FALL, Curve

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.effects.gate import most_cost
-from gsbench.effects.picture import cost_colors, effect_set_colors
+from gsbench.gates.gate import most_cost
+from gsbench.gates.picture import cost_colors, effect_set_colors
 from gsbench.kernels.tape import Differentiable, Tape
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.measure.speed import Laps

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jinja2
 import numpy as np
 
-from gsbench.effects.messages import EFFECT_SETS
-from gsbench.effects.picture import COLOURS
+from gsbench.gates.messages import EFFECT_SETS
+from gsbench.gates.picture import COLOURS
 from gsbench.measure.images import ERROR_SCALE, ROUNDING_SCALE, data_url, inferno
 from gsbench.stability.float32_error import Float32Error
 from gsbench.view.controls import ShownImage

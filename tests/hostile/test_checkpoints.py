@@ -16,9 +16,9 @@ import torch
 from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.errors import InputError
+from gsbench.gates.finished import gate_finished
 from gsbench.measure import record
 from gsbench.run.load import load_run, scene_of
-from gsbench.run.regate import gate_run
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes.points import random_points
 from gsbench.train import checkpoint
@@ -136,8 +136,8 @@ HOSTILE_STATES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "a tensor that claims 4 TB": lambda state: replaced(
         state, ("model", "splats.means"), lambda _: torch.zeros(1).expand(10**12, 3)
     ),
-    "gates as a tensor": lambda state: {**state, "hooks": state["hooks"] | {"gating": torch.zeros(3)}},
-    "gates as a list": lambda state: {**state, "hooks": state["hooks"] | {"gating": [1]}},
+    "gates as a tensor": lambda state: {**state, "hooks": state["hooks"] | {"gates": torch.zeros(3)}},
+    "gates as a list": lambda state: {**state, "hooks": state["hooks"] | {"gates": [1]}},
     "a container in itself": lambda state: endless(state),
     "text for a state": lambda state: {**state, "model": "splats.means"},
     "a key that is a tensor": lambda state: {**state, "density": {torch.zeros(1): 1}},
@@ -206,7 +206,7 @@ def test_a_checkpoint_names_no_package_to_import(folder: Path, tmp_path: Path, m
         scene_of(run)
     (tmp_path / record.FILE_NAME).write_bytes((folder / record.FILE_NAME).read_bytes())
     with pytest.raises(InputError, match="names 'pkg://evil'"):
-        gate_run(tmp_path, 0.05)
+        gate_finished(tmp_path, 0.05)
     assert "evil" not in sys.modules
     assert scene_of(run, config["data"]["root"]).name == "square"  # what the user names is taken
     for names in ({"name": "../square"}, {"released_as": "/etc"}, {"released_as": "a/../.."}):

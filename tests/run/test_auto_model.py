@@ -11,10 +11,9 @@ from tiny_run import overrides, run_here, write_moving_square
 from tiny_training import compose, moving_square
 
 from gsbench.config import TrainConfig
-from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, ModelComparison, Record, TimeScreen
-from gsbench.run import trackers
+from gsbench.run import auto_model, trackers
 from gsbench.run.auto_model import candidates, check_candidates, check_compare, resolve
 from gsbench.run.candidates import FOLDER
 from gsbench.run.identity import Run
@@ -56,7 +55,7 @@ def test_a_scene_that_may_move_has_a_model_with_time(
     decision: str, model: str, agr: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches an undecided scene that loses its motion, AGR in a static model, and a screen for a model with a name."""
-    monkeypatch.setattr(choose, "screen", lambda *_: TimeScreen(decision, "said", None, None, None, 0.0))
+    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen(decision, "said", None, None, None, 0.0))
     for words, chosen in (
         (("auto", 10), (model, agr, decision)),
         (("auto", 10, "agr=false"), (model, False, decision)),
@@ -200,7 +199,7 @@ def test_a_candidate_that_fails_loses(square: Path, tmp_path: Path, monkeypatch:
 
 def test_a_static_scene_is_not_compared(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches models with time that are trained on a scene which the screen calls static."""
-    monkeypatch.setattr(choose, "screen", lambda *_: TimeScreen("off", "static", None, None, None, 0.0))
+    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen("off", "static", None, None, None, 0.0))
     record, folder = run_here(*overrides(square, tmp_path, *COMPARED))
     assert record.on_demand is not None
     assert record.on_demand.comparison is None

@@ -10,12 +10,11 @@ from tiny_run import overrides, run_here, write_moving_square
 from tiny_training import compose, moving_square
 
 from gsbench.config import Config
-from gsbench.effects import choose
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, LengthChoice, Record, TimeScreen
 from gsbench.models import GaussianModel
 from gsbench.report.sections.curves import events
-from gsbench.run import checks, load
+from gsbench.run import auto_model, checks, load
 from gsbench.run.candidates import FOLDER
 from gsbench.run.lengths import lengths
 from gsbench.run.setup import build
@@ -154,7 +153,7 @@ def test_the_model_that_auto_chose_has_several_lengths(
     square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches lengths of another model than the screen chose, and seconds of the screen that are lost."""
-    monkeypatch.setattr(choose, "screen", lambda *_: TimeScreen("off", "said", None, None, None, 5.0))
+    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen("off", "said", None, None, None, 5.0))
     record, folder = run_here(*overrides(square, tmp_path, *RUN, "model=auto"))
     assert choice_in(record).kept == 20
     assert not record.effects.time

@@ -11,8 +11,8 @@ from test_wiring import trainer
 from tiny_training import compose, moving_square
 
 from gsbench.errors import InputError
+from gsbench.gates.hook import Gating
 from gsbench.run.checks import check_scene, check_values
-from gsbench.train.gating import Gating
 from gsbench.train.hooks.early_stop import EarlyStop
 from gsbench.train.loop import Trainer
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsbench.effects.messages import EFFECT_SETS
-from gsbench.effects.picture import COLOURS
+from gsbench.gates.messages import EFFECT_SETS
+from gsbench.gates.picture import COLOURS
 from gsbench.models.effect_sets import NAMES
 from gsbench.scenes import Camera, View
 from gsbench.stability.float32_error import Float32Error

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsbench.effects.gate import most_cost
+from gsbench.gates.gate import most_cost
 from gsbench.measure.images import error_image, to_bytes
 from gsbench.measure.quality import psnr, quantise
 from gsbench.models import cameras

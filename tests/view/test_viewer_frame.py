@@ -13,9 +13,9 @@ from models.small import lively
 
 from gsbench import kernels
 from gsbench.config import Config
-from gsbench.effects import picture
-from gsbench.effects.gate import most_cost
 from gsbench.errors import InputError
+from gsbench.gates import picture
+from gsbench.gates.gate import most_cost
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import Pixels, rounding_image, to_bytes

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsbench.effects.messages import EFFECT_SETS, of_comparison, reason
+from gsbench.gates.messages import EFFECT_SETS, of_comparison, reason
 from gsbench.measure.record import Gate, Record
 from gsbench.report import stats
 from gsbench.report.frame import Results

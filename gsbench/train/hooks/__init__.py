@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LossTerm = tuple[
     float, "Callable[[CameraTime, int], Tensor]"
 ]  # weight, and the term [] of a view of the batch by its index
-ELSEWHERE = ("gsbench.train.gating",)  # modules of hooks outside of this folder, which act last
+ELSEWHERE = ("gsbench.gates.hook",)  # modules of hooks outside of this folder, which act last
 
 
 class Training(Protocol):

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import torch
 
-from gsbench.effects.gate import effect_sets_of
-from gsbench.effects.sensitivity import MOST_VIEWS
+from gsbench.gates.gate import effect_sets_of
+from gsbench.gates.sensitivity import MOST_VIEWS
 from gsbench.measure.quality import evenly
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import DIRECTION

@@ -13,18 +13,18 @@ from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides, write_moving_square
 from tiny_training import compose, moving_square
 
-from gsbench.effects import __main__ as command
-from gsbench.effects.direction import without_direction
-from gsbench.effects.sensitivity import probe
+from gsbench.gates import __main__ as command
+from gsbench.gates import hook
+from gsbench.gates.direction import without_direction
+from gsbench.gates.hook import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become, shape_of
+from gsbench.gates.sensitivity import probe
 from gsbench.measure import record
 from gsbench.measure.record import Gate
 from gsbench.run.load import load_run
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
-from gsbench.train import gating
 from gsbench.train.batches import generator
-from gsbench.train.gating import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become, shape_of
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import NO_FACTORS
 from gsbench.train.renderer import Renderer
@@ -56,12 +56,12 @@ def end(one: Trainer) -> dict[str, object]:
 def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings of a test are short."""
     monkeypatch.setattr("gsbench.schedule.STEPS_TO_RECOVER", 20)
-    monkeypatch.setattr("gsbench.train.gating.LEAST_IN_TRAINING", 10)
+    monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", 10)
 
 
 def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a checkpoint that lacks what a gate decided: broken off after the gate, and gone on from there."""
-    monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 3.0)
+    monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 3.0)
     whole = trainer("effects.gate=both")
     expected = end(whole)
     assert whole.hook(Gating).gates[0].step == 60
@@ -87,7 +87,7 @@ def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a gate in training of a model that needs all of its Gaussians, and one that is left out in silence."""
     one = trainer("effects.gate=both")
-    monkeypatch.setattr("gsbench.train.gating.LEAST_IN_TRAINING", len(one.model) * 100)
+    monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", len(one.model) * 100)
     end(one)
     assert [gate.step for gate in one.hook(Gating).gates if gate.step is not None] == []
     assert "at step 60 the model has" in one.hook(Gating).notes[0]
@@ -95,8 +95,8 @@ def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
-    monkeypatch.setattr("gsbench.train.gating.LOSS_WITH_AGR", 20.0)
-    monkeypatch.setattr("gsbench.effects.budget.SHARES", (0.2,))
+    monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 20.0)
+    monkeypatch.setattr("gsbench.gates.budget.SHARES", (0.2,))
     one = trainer("effects.gate=both")
     one.run(lambda _: None, "test", lambda: one.step < 61)
     effect_sets = one.model.effect_sets
@@ -157,9 +157,9 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
     """Catches a loss measured on the views that the gate was fitted to, or on those that the run is evaluated by."""
     probed: list[list[View]] = []
     checked: list[list[View]] = []
-    monkeypatch.setattr(gating, "probe", lambda _, views, *__, **___: probed.append(views))
+    monkeypatch.setattr(hook, "probe", lambda _, views, *__, **___: probed.append(views))
     monkeypatch.setattr(Renderer, "psnr", lambda _, __, views: 30.0 + len(checked.append(views) or views))
-    monkeypatch.setattr(gating, "gate_within", lambda model, _, __, measure, ___: measure(model) and None)
+    monkeypatch.setattr(hook, "gate_within", lambda model, _, __, measure, ___: measure(model) and None)
     one, square = trainer("effects.gate=end"), moving_square(views=17)
     views, every_eighth = square.train, square.train[::8]
     others = [view for i, view in enumerate(views) if i % 8]
@@ -251,7 +251,7 @@ def test_auto_and_a_gate_after_the_fact(
     (old,) = tmp_path.glob("dnerf/square/7dgs,*/seed0")
     kept = {path.name: path.read_bytes() for path in old.iterdir()}
     halves: list[bool] = []
-    monkeypatch.setattr(gating, "probe", lambda *x, **y: (halves.append(y["by_halves"]), probe(*x, **y))[1])
+    monkeypatch.setattr(hook, "probe", lambda *x, **y: (halves.append(y["by_halves"]), probe(*x, **y))[1])
     capsys.readouterr()
     assert command.main(["--checkpoint", str(old), "--budget-db", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -1,8 +1,8 @@
 """Test whether a scene needs time, or simplify the Gaussians of a trained model, or draw what its Gaussians depend on.
 
-python -m gsbench.effects SCENE_FOLDER [--json]
-python -m gsbench.effects --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
-python -m gsbench.effects --picture RUN_FOLDER --out FILE.png [--camera 0] [--time 0.5] [--data-root PATH]
+python -m gsbench.gates SCENE_FOLDER [--json]
+python -m gsbench.gates --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
+python -m gsbench.gates --picture RUN_FOLDER --out FILE.png [--camera 0] [--time 0.5] [--data-root PATH]
 """
 
 import argparse
@@ -13,9 +13,9 @@ from typing import Any
 from gsbench import scenes
 from gsbench.as_json import as_json
 from gsbench.config_roles import facts
-from gsbench.effects import messages
-from gsbench.effects.choose import screen
 from gsbench.errors import InputError, one_line
+from gsbench.gates import messages
+from gsbench.gates.screen import screen_time
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 
@@ -25,7 +25,7 @@ Answer = tuple[dict[str, Any], list[str]]  # the result of a command for JSON, a
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return 0, or 2 after printing one line to stderr if an input is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m gsbench.effects", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m gsbench.gates", description=__doc__.partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
     parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
@@ -58,10 +58,10 @@ def main(arguments: list[str] | None = None) -> int:
         elif asked.picture is not None:
             result, lines = _draw(asked.picture, asked.camera, asked.time, asked.data_root, asked.out)
         else:
-            found = screen(scenes.load(asked.scene), asked.seed)
+            found = screen_time(scenes.load(asked.scene), asked.seed)
             result, lines = {"time": found}, [messages.of_screen(found)]
     except (InputError, OSError) as error:
-        print(f"gsbench.effects: {one_line(error)}", file=sys.stderr)
+        print(f"gsbench.gates: {one_line(error)}", file=sys.stderr)
         return 2
     print(as_json(result) if asked.json else "\n".join(lines))
     return 0
@@ -76,9 +76,9 @@ def _whole(text: str) -> int:
 
 
 def _gate(folder: Path, budget_db: float, data_root: str | None) -> Answer:
-    from gsbench.run.regate import gate_run  # imported here, because the test for time needs no training code
+    from gsbench.gates.finished import gate_finished  # imported here, because the test for time needs no training code
 
-    record, new = gate_run(folder, budget_db, data_root)
+    record, new = gate_finished(folder, budget_db, data_root)
     said = messages.lines(record.on_demand) if record.on_demand else []
     return {"on_demand": record.on_demand, "written": new}, [*said, f"Written: {new}"]
 
@@ -87,7 +87,7 @@ def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, 
     """Draw the Gaussians of a run by effect set, from the camera of an evaluated view, at a time or at that view's."""
     import torch
 
-    from gsbench.effects.picture import draw
+    from gsbench.gates.picture import draw
     from gsbench.measure.images import write_png
     from gsbench.run.checks import evaluated_views
     from gsbench.run.load import load_run, scene_of
@@ -105,4 +105,4 @@ def _draw(folder: Path, camera: int, time: float | None, data_root: str | None, 
 
 
 if __name__ == "__main__":
-    end_with("gsbench.effects", main)
+    end_with("gsbench.gates", main)

@@ -33,7 +33,7 @@ RADIUS = 0.4  # half width of the cube of initial points, as a part of the dista
 Array = NDArray[np.float64]
 
 
-def leftovers(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
+def residual_products(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
     """Fit a static 3DGS to V views for STEPS steps, and return the scalar products of the views' gradients, [V, V].
 
     The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit.

@@ -10,11 +10,11 @@ from test_sensitivity import BLACK, OPTIONS, SIZE, N, slice_of, trained_a_little
 from torch import Tensor
 from worlds import camera
 
-from gsbench.effects.budget import gate_within
-from gsbench.effects.direction import share_with_direction
-from gsbench.effects.gate import apply, choose
-from gsbench.effects.sensitivity import Sensitivity, probe
 from gsbench.errors import InputError
+from gsbench.gates.budget import gate_within
+from gsbench.gates.direction import share_with_direction
+from gsbench.gates.gate import apply, choose
+from gsbench.gates.sensitivity import Sensitivity, probe
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.exact_views import capped
 from gsbench.measure.quality import psnr

@@ -9,9 +9,9 @@ import pytest
 import torch
 from test_sensitivity import BLACK, N, trained_a_little, views_of
 
-from gsbench.effects.gate import apply, choose, effect_sets_of
-from gsbench.effects.sensitivity import probe
-from gsbench.effects.visible import seen_times, share_asleep
+from gsbench.gates.gate import apply, choose, effect_sets_of
+from gsbench.gates.sensitivity import probe
+from gsbench.gates.visible import seen_times, share_asleep
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import render

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from worlds import World, appearing, brightening, camera, filmed, moving, rigged, small_mover, still
 
-from gsbench.effects import rig
-from gsbench.effects.choose import screen
-from gsbench.effects.places import find_places
+from gsbench.gates import fixed_camera_test
+from gsbench.gates.screen import screen_time
+from gsbench.gates.shared_viewpoints import group_by_viewpoint
 from gsbench.scenes.scene import Scene
 
 Seen = Callable[[Tensor, float], Tensor]
@@ -45,7 +45,7 @@ def darkening(image: Tensor, moment: float) -> Tensor:
 @pytest.mark.parametrize("seen", [None, noisy(), drifting, flickering, noisy(drifting), noisy(flickering)])
 def test_a_still_rig_is_off(seen: Seen | None) -> None:
     """Catches noise, rounding to 8 bits, an exposure that drifts (and saturates) or flickers, taken for a change."""
-    found = screen(rigged(still, seen=seen))
+    found = screen_time(rigged(still, seen=seen))
     assert found.decision == "off", found
     assert "exposure and noise only" in found.reason
 
@@ -57,7 +57,7 @@ def test_a_still_rig_is_off(seen: Seen | None) -> None:
 def test_a_rig_sees_motion(world: World, places: int, views: int, together: bool) -> None:
     """Catches "off" or "undecided" on a rig, one of four cameras, one whose cameras fire together, or one with so many
     views that only some of them are compared: their times must be those of these views."""
-    found = screen(rigged(world, places, views, together=together))
+    found = screen_time(rigged(world, places, views, together=together))
     assert found.decision == "on", found
     assert found.p is not None
     assert found.free is None
@@ -66,8 +66,8 @@ def test_a_rig_sees_motion(world: World, places: int, views: int, together: bool
 @pytest.mark.parametrize("seen", [noisy(), noisy(drifting), noisy(flickering)])
 def test_exposure_hides_no_motion(seen: Seen) -> None:
     """Catches a gain and an offset that take the mover out with the exposure."""
-    assert screen(rigged(moving, seen=seen)).decision == "on"
-    assert screen(rigged(small_mover, seen=seen)).decision == "on"
+    assert screen_time(rigged(moving, seen=seen)).decision == "on"
+    assert screen_time(rigged(small_mover, seen=seen)).decision == "on"
 
 
 def test_what_is_rare_or_small_is_never_off() -> None:
@@ -75,7 +75,7 @@ def test_what_is_rare_or_small_is_never_off() -> None:
     for scene in (rigged(appearing), rigged(appearing, seen=noisy()), rigged(still, seen=noisy(darkening)),
                   rigged(appearing, views=3), rigged(moving, views=2), rigged(moving, 4, 4),
                   rigged(small_mover, 8, 3)):  # fmt: skip
-        assert screen(scene).decision != "off"
+        assert screen_time(scene).decision != "off"
 
 
 def test_shuffled_times_are_undecided() -> None:
@@ -83,7 +83,7 @@ def test_shuffled_times_are_undecided() -> None:
     scene = rigged(moving)
     order = torch.randperm(len(scene.train), generator=torch.Generator().manual_seed(5)).tolist()
     train = [replace(view, time=scene.train[i].time) for view, i in zip(scene.train, order, strict=True)]
-    found = screen(replace(scene, train=train))
+    found = screen_time(replace(scene, train=train))
     assert found.decision == "undecided"
     assert "differ" in found.reason
 
@@ -91,7 +91,7 @@ def test_shuffled_times_are_undecided() -> None:
 @pytest.mark.parametrize("together", [False, True])
 def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave."""
-    monkeypatch.setattr(rig, "PERMUTATIONS", 199)
+    monkeypatch.setattr(fixed_camera_test, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     times = [np.linspace(0, 1, 8) if together else np.sort(random.random(8)) for _ in range(6)]
     patterns = [random.standard_normal(30) for _ in times]
@@ -103,7 +103,7 @@ def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> N
             own = light if together else random.standard_normal(8)
             images = np.outer(own, pattern) + 0.3 * random.standard_normal((8, 30))
             means.append(images - images.mean(0))
-        low += rig._slow(means, times, k)[0] <= 0.05
+        low += fixed_camera_test._slow(means, times, k)[0] <= 0.05
     assert low / 300 == pytest.approx(0.05, abs=0.035)
 
 
@@ -113,20 +113,20 @@ def _both(fixed: Scene, loose: Scene) -> Scene:
 
 def test_mixed_captures_are_asked_both_ways() -> None:
     """Catches a capture of standing and of wandering cameras that is judged by one kind alone."""
-    found = screen(_both(rigged(moving, 4, 12), filmed(moving, 36)))
+    found = screen_time(_both(rigged(moving, 4, 12), filmed(moving, 36)))
     assert found.decision == "on"
     assert "together p" in found.reason
-    assert screen(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 48))).decision == "off"
-    assert screen(_both(rigged(still, 3, 6), filmed(moving, 36))).decision == "on"
-    assert screen(_both(rigged(moving, 3, 6), filmed(still, 24, orbit=True))).decision != "off"
+    assert screen_time(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 48))).decision == "off"
+    assert screen_time(_both(rigged(still, 3, 6), filmed(moving, 36))).decision == "on"
+    assert screen_time(_both(rigged(moving, 3, 6), filmed(still, 24, orbit=True))).decision != "off"
 
 
 def test_cameras_that_are_held_are_never_off() -> None:
     """Catches nine harmonics for places that move a little: each has a misfit of its own, which drowned time."""
     scene = rigged(moving, 6, 10, shake=0.005)
-    assert len(find_places(scene.train, scene.extent).held) == 6
-    assert screen(scene).decision != "off"
-    assert screen(rigged(still, 6, 10, shake=0.005)).decision == "undecided"
+    assert len(group_by_viewpoint(scene.train, scene.extent).held) == 6
+    assert screen_time(scene).decision != "off"
+    assert screen_time(rigged(still, 6, 10, shake=0.005)).decision == "undecided"
 
 
 @pytest.mark.parametrize(("width", "height"), [(24, 48), (48, 24)])
@@ -142,7 +142,7 @@ def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
                 time=moment)
         for azimuth in (0.0, 1.5, 3.0, 4.5) for view, moment in zip(scene.train, (0.0, 0.5, 1.0), strict=False)
     ]  # fmt: skip
-    assert [len(place) for place in find_places(turned, scene.extent).held] == [3] * 4
+    assert [len(place) for place in group_by_viewpoint(turned, scene.extent).held] == [3] * 4
 
 
 def test_places_are_told_by_their_cameras() -> None:
@@ -151,11 +151,11 @@ def test_places_are_told_by_their_cameras() -> None:
     random = torch.Generator().manual_seed(0)
     train = [replace(v, camera=replace(v.camera, viewmat=v.camera.viewmat + 1e-6 * torch.randn(4, 4, generator=random)))
              for v in scene.train]  # fmt: skip
-    assert sorted(map(len, find_places(train, scene.extent).fixed)) == [4] * 4
+    assert sorted(map(len, group_by_viewpoint(train, scene.extent).fixed)) == [4] * 4
     lens = torch.tensor([[1.1], [1.1], [1.0]])
     zoomed = [replace(v, camera=replace(v.camera, K=v.camera.K * lens)) if v.time > 0.5 else v for v in train]
-    assert sorted(map(len, find_places(zoomed, scene.extent).fixed)) == [2] * 8
+    assert sorted(map(len, group_by_viewpoint(zoomed, scene.extent).fixed)) == [2] * 8
     for orbit in (False, True):
         film = filmed(still, 60, orbit=orbit)
         before = [view for view in film.train if view.time < 1]  # an orbit ends where it began
-        assert len(find_places(before, film.extent).other) == 59
+        assert len(group_by_viewpoint(before, film.extent).other) == 59

@@ -1,6 +1,7 @@
 """Decide before a training, by a permutation test, whether a scene changes with time.
 
-If several images come from the same camera position, they are compared with one another (gsbench.effects.rig).
+If several images come from the same camera position, they are compared with one another
+(gsbench.gates.fixed_camera_test).
 
 For other views, a static 3DGS is fitted in a few steps. If the scene moves, the gradients of the views' squared errors
 with respect to the means of the Gaussians change slowly with time. The test measures the share of these gradients that
@@ -17,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsbench.effects.leftovers import camera_basis, leftovers, smaller
-from gsbench.effects.places import Places, find_places
-from gsbench.effects.rig import compare_places
-from gsbench.effects.waves import Array, evidence
 from gsbench.errors import InputError
+from gsbench.gates.fixed_camera_test import compare_images
+from gsbench.gates.permutation_test import Array, evidence
+from gsbench.gates.shared_viewpoints import Viewpoints, group_by_viewpoint
+from gsbench.gates.static_fit_residuals import camera_basis, residual_products, smaller
 from gsbench.measure.record import TimeScreen
 from gsbench.scenes import Scene, View
 
@@ -42,7 +43,7 @@ class ScreenResult:
     free: float | None = None
 
 
-def screen(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
+def screen_time(scene: Scene, seed: int = 0, backend: str = "auto") -> TimeScreen:
     """Decide whether a scene changes with time, from its training views, which are reduced to a small size.
 
     Args:
@@ -78,7 +79,7 @@ def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
         return ScreenResult(UNDECIDED, "all training views have the same time")
     if len(views) < LEAST_VIEWS:
         return ScreenResult(UNDECIDED, f"{len(views)} training views are too few; {LEAST_VIEWS} are needed")
-    places = find_places(views, scene.extent)
+    places = group_by_viewpoint(views, scene.extent)
     answers = []
     if places.fixed:
         answers.append(_of_fixed(views, places, seed))
@@ -87,9 +88,9 @@ def _answer(scene: Scene, seed: int, backend: str) -> ScreenResult:
     return answers[0] if len(answers) == 1 else _both(*answers)
 
 
-def _of_fixed(views: Sequence[View], places: Places, seed: int) -> ScreenResult:
+def _of_fixed(views: Sequence[View], places: Viewpoints, seed: int) -> ScreenResult:
     """Test for change with time by comparing the images that were taken from the same camera position."""
-    found = compare_places(views, places.fixed, seed)
+    found = compare_images(views, places.fixed, seed)
     count = len(places.fixed)
     where = f"the images of each of {count} camera positions" if count > 1 else "the images of the camera's position"
     if not found.changed:
@@ -107,7 +108,7 @@ def _percent(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else "less than 1%"
 
 
-def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenResult:
+def _of_loose(scene: Scene, places: Viewpoints, seed: int, backend: str) -> ScreenResult:
     """Test for change with time by the residuals of a static 3DGS, fitted to views without a common camera position."""
     numbers = [*(v for place in places.held for v in place)] if places.held else places.other
     views = [smaller(scene.train[v]) for v in numbers]
@@ -117,7 +118,7 @@ def _of_loose(scene: Scene, places: Places, seed: int, backend: str) -> ScreenRe
         held.append(list(range(start, start + len(place))))
         start += len(place)
     camera = _dummies(held) if held else camera_basis(views)
-    found = evidence(leftovers(views, scene, seed, backend), times, camera, seed, held or None)
+    found = evidence(residual_products(views, scene, seed, backend), times, camera, seed, held or None)
     if found.free < LEAST_FREE:
         reason = (f"the camera moves along with time, so that only {found.free:.0%} of a slow change can be told from "
                   f"its motion; {LEAST_FREE:.0%} are needed")  # fmt: skip

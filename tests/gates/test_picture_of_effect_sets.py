@@ -8,10 +8,10 @@ import pytest
 import torch
 from tiny_run import gsbench, overrides, write_moving_square
 
-from gsbench.effects import picture
-from gsbench.effects.__main__ import main
-from gsbench.effects.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
-from gsbench.effects.messages import EFFECT_SETS
+from gsbench.gates import picture
+from gsbench.gates.__main__ import main
+from gsbench.gates.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
+from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build

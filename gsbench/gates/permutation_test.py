@@ -24,7 +24,7 @@ class Evidence:
 
 
 def evidence(
-    leftovers: Array,  # [V, V] Gram matrix of the views' gradients
+    residual_products: Array,  # [V, V] Gram matrix of the views' gradients
     times: Array,  # [V] in [0, 1]
     camera: Array,  # [V, B] what the camera explains, with a constant
     seed: int,
@@ -33,7 +33,7 @@ def evidence(
     """Test whether the gradients of V views follow slow cosines of time (Freedman and Lane 1983).
 
     Args:
-        leftovers: the scalar products of the gradients of all pairs of views.
+        residual_products: the scalar products of the gradients of all pairs of views.
         times: the times of the views.
         camera: functions of the camera; their influence on gradients and cosines is removed by linear regression.
         seed: the seed of the random permutations.
@@ -45,7 +45,7 @@ def evidence(
     free = float(np.square(own).sum() / max(np.square(waves).sum(), 1e-300))
     slow = _range(own)
     residual = np.eye(len(times)) - known @ known.T
-    gram = residual @ leftovers @ residual
+    gram = residual @ residual_products @ residual
     total = float(np.trace(gram))
     random = np.random.default_rng(seed)
 

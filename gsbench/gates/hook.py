@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from gsbench.config import Config
-from gsbench.effects.budget import gate_within
-from gsbench.effects.direction import share_with_direction, without_direction
-from gsbench.effects.sensitivity import MOST_VIEWS, probe
-from gsbench.effects.visible import seen_times, share_asleep
 from gsbench.errors import InputError, did_you_mean
+from gsbench.gates.budget import gate_within
+from gsbench.gates.direction import share_with_direction, without_direction
+from gsbench.gates.sensitivity import MOST_VIEWS, probe
+from gsbench.gates.visible import seen_times, share_asleep
 from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
@@ -61,7 +61,7 @@ def become(model: GaussianModel, shape: Shape) -> None:
 class Gating(Hook):
     """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
 
-    name = "gating"
+    name = "gates"
 
     def __init__(self, training: Training) -> None:
         """Choose the views from which the errors of simplified Gaussians are predicted, and the views for PSNR."""

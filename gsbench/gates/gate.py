@@ -3,7 +3,7 @@
 A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
 removed. For each Gaussian, the rule chooses the simplification that minimises cost + lambda error. The cost is the
 rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared error
-(gsbench.effects.sensitivity). lambda is the same for all Gaussians. It is chosen so that the errors add up to a given
+(gsbench.gates.sensitivity). lambda is the same for all Gaussians. It is chosen so that the errors add up to a given
 bound.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.effects.sensitivity import Sensitivity
+from gsbench.gates.sensitivity import Sensitivity
 from gsbench.models import GaussianModel
 from gsbench.models.appearance import MOST_PACKED, at_most, order_of
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets

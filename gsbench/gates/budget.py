@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsbench.effects.gate import apply, choose
-from gsbench.effects.sensitivity import Sensitivity
+from gsbench.gates.gate import apply, choose
+from gsbench.gates.sensitivity import Sensitivity
 from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel

@@ -6,6 +6,7 @@ from pathlib import Path
 from gsbench.config import EffectsConfig
 from gsbench.config_roles import Plain, training_hash
 from gsbench.errors import InputError
+from gsbench.gates.hook import Gating
 from gsbench.measure import record as records
 from gsbench.measure.record import Record
 from gsbench.run.attempt import Attempt
@@ -15,10 +16,9 @@ from gsbench.run.load import own_root, typed_config
 from gsbench.run.run import write
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
-from gsbench.train.gating import Gating
 
 
-def gate_run(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
+def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
     """Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them.
 
     The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and

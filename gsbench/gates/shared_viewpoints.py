@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsbench.effects.leftovers import center_of
+from gsbench.gates.static_fit_residuals import center_of
 from gsbench.scenes import View
 
 SAME = 1e-4  # largest shift within a position, in units of the longer side: less than a tenth of a pixel of 800
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Places:
+class Viewpoints:
     """Hold the views from each camera position, as indices into a list of views."""
 
     fixed: list[list[int]]  # groups of at least two views from exactly the same position
@@ -32,7 +32,7 @@ class Places:
         return sorted([v for place in self.held for v in place] + self.other)
 
 
-def find_places(views: Sequence[View], extent: float) -> Places:
+def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
     """Group views by the camera position from which they were taken.
 
     Args:
@@ -49,7 +49,7 @@ def find_places(views: Sequence[View], extent: float) -> Places:
             if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span]  # fmt: skip
     held = near if 2 * sum(map(len, near)) > len(loose) else []
     inside = {v for group in held for v in group}
-    return Places(fixed, held, [v for v in loose if v not in inside])
+    return Viewpoints(fixed, held, [v for v in loose if v not in inside])
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]

@@ -11,11 +11,11 @@ import pytest
 import torch
 from worlds import World, brightening, filmed, moving, small_mover, still
 
-from gsbench.effects import __main__ as command
-from gsbench.effects import choose, leftovers, waves
-from gsbench.effects.choose import screen
-from gsbench.effects.waves import evidence
 from gsbench.errors import InputError
+from gsbench.gates import __main__ as command
+from gsbench.gates import permutation_test, screen, static_fit_residuals
+from gsbench.gates.permutation_test import evidence
+from gsbench.gates.screen import screen_time
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Scene
 
@@ -27,7 +27,7 @@ EMBEDDED = Path(__file__).resolve().parents[2] / "gsbench/scenes/sample"
 )
 def test_known_worlds(world: World, decision: str) -> None:
     """Catches a test that finds time in a static scene, or misses motion in 2 % of the image or light that changes."""
-    found = screen(filmed(world))
+    found = screen_time(filmed(world))
     assert found.decision == decision, found
     assert found.free is not None
     assert found.free > 0.7
@@ -38,10 +38,10 @@ def test_imports_are_no_seconds_of_the_screen() -> None:
     code = """
 import sys, time
 from worlds import filmed, still
-from gsbench.effects import choose
+from gsbench.gates.screen import screen_time
 clock, loaded = time.perf_counter, []
 time.perf_counter = lambda: (loaded.append(set(sys.modules)), clock())[1]
-choose.screen(filmed(still))
+screen_time(filmed(still))
 print(len([name for name in loaded[-1] - loaded[0] if name.startswith("torch._dynamo")]))
 """
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
@@ -53,7 +53,7 @@ print(len([name for name in loaded[-1] - loaded[0] if name.startswith("torch._dy
 def test_shuffled_times_are_no_time() -> None:
     """Catches a test that sees motion wherever images differ: at shuffled times nothing is slow."""
     shuffled = torch.randperm(48, generator=torch.Generator().manual_seed(5)) / 47
-    assert screen(filmed(moving, times=shuffled)).decision == "off"
+    assert screen_time(filmed(moving, times=shuffled)).decision == "off"
 
 
 def test_flicker_that_is_not_slow_is_no_time() -> None:
@@ -65,35 +65,35 @@ def test_flicker_that_is_not_slow_is_no_time() -> None:
         world = still(0.0)
         return world._replace(colors=world.colors * (0.5 + next(moments)))
 
-    assert screen(filmed(flicker)).decision == "off"
+    assert screen_time(filmed(flicker)).decision == "off"
 
 
 def test_an_orbit_decides_nothing() -> None:
     """Catches an answer where the camera moves along with time, so that either may explain the images."""
     for world in (still, moving):
-        found = screen(filmed(world, orbit=True))
+        found = screen_time(filmed(world, orbit=True))
         assert found.decision == "undecided"
         assert found.free is not None
-        assert found.free < choose.LEAST_FREE
+        assert found.free < screen.LEAST_FREE
         assert "camera moves along" in found.reason
 
 
 def test_what_is_too_little_to_tell() -> None:
     """Catches a verdict from few views, from one time, or from none."""
     few, one = filmed(moving, views=8), filmed(moving, views=16, times=torch.full((16,), 0.5))
-    assert screen(few).decision == "undecided"
-    assert "too few" in screen(few).reason
-    assert screen(one).decision == "undecided"
-    assert "the same time" in screen(one).reason
+    assert screen_time(few).decision == "undecided"
+    assert "too few" in screen_time(few).reason
+    assert screen_time(one).decision == "undecided"
+    assert "the same time" in screen_time(one).reason
     timeless = Scene(**{**vars(one), "train": [type(v)(**{**vars(v), "time": None}) for v in one.train]})
-    assert screen(timeless).decision == "off"
+    assert screen_time(timeless).decision == "off"
     with pytest.raises(InputError, match="expected training views"):
-        screen(Scene(**{**vars(one), "train": []}))
+        screen_time(Scene(**{**vars(one), "train": []}))
 
 
 def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a permutation test that is wrong too often: leftovers that only the camera explains."""
-    monkeypatch.setattr(waves, "PERMUTATIONS", 199)
+    monkeypatch.setattr(permutation_test, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     camera = random.standard_normal((40, 9))
     gradients = camera @ random.standard_normal((9, 50)) * 3 + random.standard_normal((40, 50))
@@ -114,7 +114,7 @@ def test_the_waves_that_are_looked_for(wave: int, found: bool) -> None:
 def test_the_answer_is_that_of_its_seed() -> None:
     """Catches a draw that is not the seed's."""
     scene = filmed(moving, views=16)
-    first, second = screen(scene, 3), screen(scene, 3)
+    first, second = screen_time(scene, 3), screen_time(scene, 3)
     assert (first.p, first.z, first.free) == (second.p, second.z, second.free)
 
 
@@ -136,11 +136,11 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
 def test_five_hundred_views_take_no_more_than_their_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a screen that draws the views of a long film more often: a fit of the same steps, and each view once."""
     drawn = []
-    draw = leftovers.rasterize_slice
-    monkeypatch.setattr(leftovers, "rasterize_slice", lambda *x: drawn.append(1) or draw(*x))
+    draw = static_fit_residuals.rasterize_slice
+    monkeypatch.setattr(static_fit_residuals, "rasterize_slice", lambda *x: drawn.append(1) or draw(*x))
     counts = {}
     for views in (100, 500):
         drawn.clear()
-        assert screen(filmed(moving, views=views)).decision == "on"
+        assert screen_time(filmed(moving, views=views)).decision == "on"
         counts[views] = len(drawn)
     assert counts[500] - counts[100] == 400

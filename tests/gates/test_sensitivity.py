@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from worlds import camera
 
-from gsbench.effects.sensitivity import probe
+from gsbench.gates.sensitivity import probe
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
@@ -96,7 +96,7 @@ def test_prediction_against_brute_force(name: str) -> None:
     seen = [model.slice(query) for query in queries]
     for simplification in simplifications_of(model, queries, seen):
         true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
-        # The image is linear in opacities and colours, and not in what moves (gsbench/effects/sensitivity.py).
+        # The image is linear in opacities and colours, and not in what moves (gsbench/gates/sensitivity.py).
         linear = simplification.raw is None or simplification.order is not None
         # One that changes places in depth with another is predicted at 0.38 of its error.
         least_rank, least_share = (0.98, 0.5) if linear else (0.92 if name == "4dgs" else 0.95, 0.35)

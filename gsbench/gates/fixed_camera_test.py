@@ -1,6 +1,6 @@
 """Test whether images that were taken from the same camera position change with time.
 
-Differences of exposure are removed first (gsbench.effects.exposure). Then there are two tests:
+Differences of exposure are removed first (gsbench.gates.exposure). Then there are two tests:
 
 - Does anything change? Each block of pixels is divided into two halves by a chess-board pattern. Noise is independent
   in the two halves, so the product of their means is zero on average. For a change of the scene it is positive. The
@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.effects.exposure import LEVEL_8_BIT, changes
-from gsbench.effects.waves import PERMUTATIONS, compare, slow_waves
+from gsbench.gates.exposure import LEVEL_8_BIT, changes
+from gsbench.gates.permutation_test import PERMUTATIONS, compare, slow_waves
 from gsbench.scenes import View
 
 LONG_SIDE = 100  # size of the compared images; every k-th pixel is taken, since noise of neighbours may be correlated
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PlaceComparison:
+class FixedCameraResult:
     """Hold the result of comparing the images from the same camera position with one another."""
 
     changed: float  # share of the blocks of pixels that change, over all positions
@@ -40,7 +40,7 @@ class PlaceComparison:
     z: float | None  # z-score of slow change with time
 
 
-def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> PlaceComparison:
+def compare_images(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> FixedCameraResult:
     """Test whether images from the same camera position differ, and whether they change slowly with time.
 
     Args:
@@ -59,9 +59,9 @@ def compare_places(views: Sequence[View], places: Sequence[Sequence[int]], seed:
             means.append(halves.mean(0).reshape(len(chosen), -1).astype(np.float64))
             times.append(np.array([views[v].time for v in chosen], dtype=np.float64))
     if not changed or not means:
-        return PlaceComparison(changed / blocks, None, None)
+        return FixedCameraResult(changed / blocks, None, None)
     p, z = _slow(means, times, seed)
-    return PlaceComparison(changed / blocks, p, z)
+    return FixedCameraResult(changed / blocks, p, z)
 
 
 def _spread(ordered: list[int], most: int, start: float) -> list[int]:

@@ -1,7 +1,7 @@
 """Draw three panels: a rendered image, what each Gaussian depends on, and the rendering cost of each pixel.
 
 In the second panel, the colour of a Gaussian shows whether it depends on time, direction and AGR (the neural
-refinement). In the third, the time that each Gaussian takes in a frame (constants of gsbench.effects.gate) is
+refinement). In the third, the time that each Gaussian takes in a frame (constants of gsbench.gates.gate) is
 alpha-composited like a colour. Bright yellow is a Gaussian with AGR and the full SH degree, black is no cost.
 """
 
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.effects.gate import cost_of, effect_sets_of, most_cost
-from gsbench.effects.messages import EFFECT_SETS
+from gsbench.gates.gate import cost_of, effect_sets_of, most_cost
+from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
