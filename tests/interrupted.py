@@ -43,13 +43,13 @@ def run_through_kills(
 
 def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Count the training steps of all runs from now on, under "all"."""
-    steps, descend = Counter[str](), Trainer._descend
+    steps, descend = Counter[str](), Trainer.train_step
 
     def counted(self: Trainer) -> None:
         steps["all"] += 1
         descend(self)
 
-    monkeypatch.setattr(Trainer, "_descend", counted)
+    monkeypatch.setattr(Trainer, "train_step", counted)
     return steps
 
 

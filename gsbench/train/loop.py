@@ -41,7 +41,7 @@ class Trainer(TrainingParts):
                 with self.effort, self.stages.running():
                     camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
                     with fitting_threads(len(self.model), camera.width * camera.height // factor**2):
-                        self._descend()
+                        self.train_step()
                 measured = self.schedule.measures(self.step)
                 if measured:
                     self._measure()
@@ -65,8 +65,8 @@ class Trainer(TrainingParts):
                 hook.at_end()
         save(self.state_dict())
 
-    def _descend(self) -> None:
-        """Do one training step on a batch of views: compute gradients, update parameters, control the density."""
+    def train_step(self) -> None:
+        """Do one training step on a batch of views: gradients, parameters, density, and hooks in between."""
         step, stages = self.step, self.stages
         self.model.set_active(self.schedule.active(step))
         views = self.batches.at(step, self.schedule.resolution(step))

@@ -35,13 +35,7 @@ class Penalty(ABC):
     needs: ClassVar[tuple[str, ...]] = ()  # what the model must observe, of "time", "direction"
 
     def __init__(self, model: GaussianModel, seed: int, frames: int) -> None:
-        """Make the penalty of a training.
-
-        Args:
-            model: the model, with Gaussians.
-            seed: the seed of the run, from which all random numbers are drawn.
-            frames: the number of different times of the training views.
-        """
+        """Make the penalty of an initialised model; `frames` is the number of different times of training views."""
         self.model = model
         self.seed = seed
         self.frames = frames
@@ -52,17 +46,15 @@ class Penalty(ABC):
 
     def prepare(self, step: int, first: View) -> None:
         """Act once in a step before its views are rendered; `first` is the first view of the batch."""
-        return
 
     def reindex(self) -> None:
         """Act after Gaussians were added, removed or reordered."""
-        return
 
     def state_dict(self) -> dict[str, Any]:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        return
+        """Restore a `state_dict`; raise InputError if it is not valid."""
 
 
 class MeanOpacity(Penalty):
@@ -97,7 +89,6 @@ class Strain(Penalty):
     needs = ("time",)
 
     def __init__(self, model: GaussianModel, seed: int, frames: int) -> None:
-        """Start without neighbours."""
         super().__init__(model, seed, frames)
         self.step = 0
         self.searched = 0  # the step of the last search
@@ -138,7 +129,6 @@ class Strain(Penalty):
         return strains.sum(0).sum() / pairs.numel()
 
     def reindex(self) -> None:
-        """Forget the neighbours."""
         self.neighbours = None
 
     def state_dict(self) -> dict[str, Any]:

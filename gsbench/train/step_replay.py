@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -28,11 +28,6 @@ class Observed(NamedTuple):
     time: float | Tensor | None
     target: Tensor  # [H, W, 3] floats in [0, 1] or 8 bits
 
-    @classmethod
-    def of(cls, view: View) -> Observed:
-        """Take it from a view."""
-        return cls(view.camera, view.time, view.target)
-
     def copy(self) -> Observed:
         """Return a copy in memory of its own, which `overwrite` changes."""
         camera = self.camera.clone()
@@ -40,7 +35,7 @@ class Observed(NamedTuple):
         return Observed(camera, time, self.target.clone())
 
     def overwrite(self, other: Observed) -> None:
-        """Take the values of another view of the same size."""
+        """Take the values of another view of the same signature."""
         self.camera.overwrite(other.camera)
         self.target.copy_(other.target)
         if isinstance(self.time, Tensor) and other.time is not None:
@@ -52,41 +47,29 @@ class Observed(NamedTuple):
         return self.camera.width, self.camera.height, self.time is None, self.target.shape, self.target.dtype
 
 
-class _StagedRecording:
-    """Records the blocks `with staged(name): ...`, and also times each one as a stage."""
+class _RecordedView(Generic[Result]):
+    """The recorded work on one view, stage by stage, what it reads, and the result that a repetition overwrites."""
 
-    def __init__(self, stages: Stages) -> None:
-        self._stages = stages
-        self._blocks: list[tuple[str, Recording]] = []
+    def __init__(self, work: Callable[[Observed, Stages], Result], observed: Observed, stages: Stages) -> None:
+        """Do the work on a copy of `observed`, and record it."""
+        self._observed = observed.copy()
+        self._recordings: list[tuple[str, Recording]] = []  # by stage
 
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        with self._stages(name), Recording() as recording:
-            self._blocks.append((name, recording))
-            yield
+        @contextmanager
+        def recorded(stage: str) -> Iterator[None]:
+            with stages(stage), Recording() as recording:
+                self._recordings.append((stage, recording))
+                yield
 
-    @property
-    def is_repeatable(self) -> bool:
-        return all(recording.is_repeatable for _, recording in self._blocks)
-
-    def repeat(self, stages: Stages) -> None:
-        for name, recording in self._blocks:
-            with stages(name):
-                recording.repeat()
-
-
-@dataclass(frozen=True)
-class _Recorded(Generic[Result]):
-    """The recorded work on one view: what it reads, the recording, and the result that a repetition overwrites."""
-
-    observed: Observed
-    work: _StagedRecording
-    result: Result
+        self.result = work(self._observed, recorded)
+        self.is_repeatable = all(recording.is_repeatable for _, recording in self._recordings)
 
     @torch.no_grad()
     def repeat(self, observed: Observed, stages: Stages) -> Result:
-        self.observed.overwrite(observed)
-        self.work.repeat(stages)
+        self._observed.overwrite(observed)
+        for stage, recording in self._recordings:
+            with stages(stage):
+                recording.repeat()
         return self.result
 
 
@@ -96,46 +79,37 @@ class StepReplay(Generic[Result]):
     def __init__(self) -> None:
         """Start without a recording."""
         self._signature: Hashable = None
-        self._recorded: dict[int, _Recorded[Result]] = {}  # by the index of the view in the batch
+        self._recorded: list[_RecordedView[Result]] = []  # one for each view of a batch
         self._is_repeatable = True
 
     def __call__(
         self,
         signature: Hashable,
         views: Sequence[View],
-        see: Callable[[int, Observed, Stages], Result],
-        of_all: Callable[[Callable[[int, Stages], Result]], list[Result]],
+        work: Callable[[int, Observed, Stages], Result],
+        of_all: Callable[[Callable[[int, Stages], Any]], list[Any]],
     ) -> list[Result]:
         """Return the results of all views; a later call overwrites the tensors in them.
 
         Args:
             signature: all that the work depends on, except values of tensors; None: it must not be recorded.
             views: the views of the batch.
-            see: does the work on one view, given its index. All calculations must be inside of stages.
-            of_all: calls a function for each index of a view, and returns the results.
+            work: does the work on one view, whose index is its first argument. All calculations are inside of stages.
+            of_all: calls a function for each index of a view, and returns the results in this order.
         """
-        observed = [Observed.of(view) for view in views]
+        observed = [Observed(view.camera, view.time, view.target) for view in views]
         signature = None if signature is None else (signature, *[view.signature for view in observed])
         is_new = signature is None or signature != self._signature
         if is_new:
-            self._signature, self._recorded, self._is_repeatable = signature, {}, True
-        if self._recorded:
-            recorded = self._recorded
+            self._signature, self._recorded, self._is_repeatable = signature, [], True
+        if recorded := self._recorded:
             try:
                 return of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
             except OutdatedError:
-                self._recorded = {}
+                self._recorded = []
         if is_new or not self._is_repeatable:
-            return of_all(lambda index, stages: see(index, observed[index], stages))
-        recordings: dict[int, _Recorded[Result]] = {}
-
-        def record(index: int, stages: Stages) -> Result:
-            copied, work = observed[index].copy(), _StagedRecording(stages)
-            recordings[index] = _Recorded(copied, work, see(index, copied, work))
-            return recordings[index].result
-
-        results = of_all(record)
-        self._is_repeatable = all(recorded.work.is_repeatable for recorded in recordings.values())
-        if self._is_repeatable:
-            self._recorded = recordings
-        return results
+            return of_all(lambda index, stages: work(index, observed[index], stages))
+        recorded = of_all(lambda index, stages: _RecordedView(partial(work, index), observed[index], stages))
+        self._is_repeatable = all(view.is_repeatable for view in recorded)
+        self._recorded = recorded if self._is_repeatable else []
+        return [view.result for view in recorded]

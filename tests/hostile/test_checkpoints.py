@@ -92,7 +92,7 @@ def check(seeds: range, folder: Path) -> int:
         try:
             fitted.load_state_dict(state)
             fitted.model.set_active(fitted.schedule.active(5))
-            fitted._descend()  # a tensor of the wrong shape that was accepted would crash here
+            fitted.train_step()  # a tensor of the wrong shape that was accepted would crash here
         except InputError as error:
             refused += "\n" not in str(error)
         except Exception as error:

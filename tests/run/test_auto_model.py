@@ -149,7 +149,7 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_comparison(
     monkeypatch.setitem(trackers.TRACKERS, "json", Tracked)
     record, folder = run_here(*words)
     assert sent == [*(point.iteration for point in record.curve), STEPS], "a tracker lacks the steps of the comparison"
-    monkeypatch.setattr(Trainer, "_descend", lambda _: pytest.fail("trained again"))
+    monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained again"))
     again, _ = run_here(*words)
     assert again == record
     assert "finished before, kept" in capsys.readouterr().out
@@ -176,7 +176,7 @@ def test_resume_false_starts_every_candidate_over(
 
 def test_a_candidate_that_fails_loses(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a run that fails because some of its candidates did: on scene10_texture 6DGS prunes all Gaussians."""
-    descend = Trainer._descend
+    descend = Trainer.train_step
 
     def diverging(self: Trainer) -> None:
         if self.config.model.name == "4dgs" and self.step == 5:
@@ -185,14 +185,14 @@ def test_a_candidate_that_fails_loses(square: Path, tmp_path: Path, monkeypatch:
         if self.config.model.name == "6dgs":
             self.rows.select(torch.zeros(0, dtype=torch.int64))
 
-    monkeypatch.setattr(Trainer, "_descend", diverging)
+    monkeypatch.setattr(Trainer, "train_step", diverging)
     record, _ = run_here(*overrides(square, tmp_path, *COMPARED))
     comparison = comparison_in(record)
     reasons = {candidate.name: candidate.reason for candidate in comparison.candidates}
     assert reasons.pop("6dgs").startswith("no Gaussian is left")
     assert reasons == {"7dgs": None, "4dgs": "step 5: a loss of nan", "7dgs_noagr": None}
     assert comparison.chosen == "7dgs_noagr"
-    monkeypatch.setattr(Trainer, "_descend", lambda _: (_ for _ in ()).throw(DivergedError("all")))
+    monkeypatch.setattr(Trainer, "train_step", lambda _: (_ for _ in ()).throw(DivergedError("all")))
     failed, _ = run_here(*overrides(square, tmp_path / "all", *COMPARED))
     assert (failed.status, failed.on_demand) == ("diverged", None)
 

@@ -48,7 +48,7 @@ def again(tmp_path: Path, data: Path, done, monkeypatch: pytest.MonkeyPatch, cap
 
     def repeat(*more: str, change: object = None, trains: bool = False) -> tuple[Record, str]:
         if not trains:
-            monkeypatch.setattr(Trainer, "_descend", no_step)
+            monkeypatch.setattr(Trainer, "train_step", no_step)
         if callable(change):
             change(repeat.folder)
         capfd.readouterr()

@@ -123,7 +123,7 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
     """Catches a second call that trains, and a record that loses the choice when images are measured again."""
     words = overrides(square, tmp_path, *RUN)
     record, folder = run_here(*words)
-    monkeypatch.setattr(Trainer, "_descend", lambda _: pytest.fail("trained again"))
+    monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained again"))
     assert run_here(*words)[0] == record
     (folder / FILE_NAME).unlink()
     measured, _ = run_here(*words)
@@ -133,14 +133,14 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
 
 def test_a_length_that_fails_loses(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a run that fails because one length did: on a rig of the suite, 3DGS prunes all Gaussians at 2,000."""
-    descend, failing = Trainer._descend, {10, 40}
+    descend, failing = Trainer.train_step, {10, 40}
 
     def diverging(self: Trainer) -> None:
         if self.config.train.iterations in failing and self.step == 5:
             raise DivergedError("step 5: a loss of nan")
         descend(self)
 
-    monkeypatch.setattr(Trainer, "_descend", diverging)
+    monkeypatch.setattr(Trainer, "train_step", diverging)
     found = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
     assert [one.reason for one in found.tried] == ["step 5: a loss of nan", None, "step 5: a loss of nan"]
     assert found.kept == 20

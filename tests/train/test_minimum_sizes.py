@@ -119,5 +119,5 @@ def test_every_step_of_a_training_holds_it() -> None:
     scene = replace(square, train=[replace(v, time=t) for v, t in zip(square.train, (0.0, 1.0) * 50, strict=False)])
     fitted = trainer("freetime", "effects.gate=off", scene=scene)
     fitted.model.splats["durations"].data.fill_(-9.0)
-    fitted._descend()
+    fitted.train_step()
     assert fitted.model.splats["durations"].detach().exp().min() == pytest.approx(0.5)

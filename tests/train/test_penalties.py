@@ -205,13 +205,13 @@ def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
         torch.set_num_threads(count)
         fitted = trainer(name, *WEIGHT, "train.refine_from=0", "train.batch_size=3")
         for fitted.step in range(6):
-            fitted._descend()
+            fitted.train_step()
         found.append((fitted.finite_check.loss, fitted.model.pack()))
     assert found[0][0] == found[1][0]
     assert all(torch.equal(x, found[1][1][key]) for key, x in found[0][1].items())
     plain = trainer(name, "train.batch_size=3", "train.refine_from=0")
     for plain.step in range(6):
-        plain._descend()
+        plain.train_step()
     assert plain.finite_check.loss != found[0][0]
 
 

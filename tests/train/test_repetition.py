@@ -66,7 +66,7 @@ def test_a_view_with_more_intersections_is_not_repeated(repeats: list[int], monk
         monkeypatch.setattr(Step, "_signature", signature)
         fitted, losses = trainer("3dgs", "train.batch_size=1", scene=scene), []
         for fitted.step in range(24):
-            fitted._descend()
+            fitted.train_step()
             losses.append(fitted.finite_check.loss)
         found.append(losses)
     assert found[0] == found[1]
@@ -77,13 +77,13 @@ def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: list[int])
     """Catches a training that goes on with NaN, because the rasterizer's check was not repeated."""
     fitted = trainer("7dgs")
     for fitted.step in range(4):
-        fitted._descend()
+        fitted.train_step()
     assert repeats[0] > 0
     with torch.no_grad():
         fitted.model.splats["means"][0, 0] = math.nan
     fitted.step = 4
     with pytest.raises(DivergedError, match="step 4"):
-        fitted._descend()
+        fitted.train_step()
 
 
 def test_an_attribute_of_a_model_may_change(repeats: list[int]) -> None:
@@ -97,8 +97,8 @@ def test_an_attribute_of_a_model_may_change(repeats: list[int]) -> None:
 
     own |= {"light": 1.0, "shade": brighter}
     for fitted.step in range(5):
-        fitted._descend()
+        fitted.train_step()
     assert repeats[0] > 0
     own["light"] = 0.5
-    fitted._descend()
+    fitted.train_step()
     assert light[-1] == 0.5

@@ -53,7 +53,7 @@ def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
     means = fitted.model.splats["means"]
     seen = []
     fitted.optimizer.step = lambda *_: seen.append(means.grad)  # type: ignore[method-assign]
-    fitted._descend()
+    fitted.train_step()
     assert means.grad is not None
     return (
         means.grad.clone(),
@@ -155,7 +155,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     fitted.optimizer.step = lambda _, drawn, __: moved.append(drawn)  # type: ignore[method-assign]
     for step in (0, 1):
         fitted.step = step
-        fitted._descend()
+        fitted.train_step()
     assert all(drawn.tolist() == [True] * 3 + [False] * (N - 3) for drawn in moved)
     assert len(moved) == 2
 
@@ -166,7 +166,7 @@ def test_counts_are_kept_while_gaussians_are_densified() -> None:
     stop, counted = fitted.schedule.densify_stop, []
     fitted.density.rule.accumulate = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
     for fitted.step in (stop - 2, stop - 1, stop, stop + 1):
-        fitted._descend()
+        fitted.train_step()
     assert counted == [stop - 2, stop - 1]
     assert fitted.schedule.densifies(stop - 1)
 
@@ -180,7 +180,7 @@ def test_large_gaussians_go_once_opacities_were_reset() -> None:
     fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
     for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
         fitted.step = step
-        fitted._descend()
+        fitted.train_step()
     assert asked == [False, False, True]
 
 
@@ -191,7 +191,7 @@ def test_children_of_every_densification_are_drawn_anew() -> None:
     fitted.density.rule.densify = lambda random, *_: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
     fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
     for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
-        fitted._descend()
+        fitted.train_step()
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
@@ -207,7 +207,7 @@ def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbench.train.optim.adam_all", note)
     for step in (0, 50, 99):
         fitted.step = step
-        fitted._descend()
+        fitted.train_step()
         for name, parameters in fitted.model.groups().items():
             rate = rate_at(fitted.config.model.lr[name], step, fitted.config.train, fitted.scene.extent)
             assert all(given[p.data_ptr()] == rate for p in parameters if p.data_ptr() in given), name
@@ -299,7 +299,7 @@ def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
         with torch.no_grad():
             sizes[:, 4:] = -20.0
         fitted.step = step
-        fitted._descend()
+        fitted.train_step()
         held = fitted.model.splats["log_diagonal"].detach()[:, 4:].amin(1)
         assert len(held) == len(fitted.hook(MinimumScale).least)
         if step == 0:
@@ -339,7 +339,7 @@ def with_fake_clock(fitted: Trainer, now: list[float], patch: pytest.MonkeyPatch
         return 20.0
 
     patch.setattr(time, "perf_counter", lambda: now[0])
-    patch.setattr(fitted, "_descend", step)
+    patch.setattr(fitted, "train_step", step)
     patch.setattr(fitted, "psnr", measure)
     return fitted
 
@@ -377,7 +377,7 @@ def test_early_steps_see_small_images() -> None:
     fitted.gradients = lambda views, penalties: looked.extend(views) or real(views, penalties)  # type: ignore[assignment]
     half = fitted.schedule.scaled(15_000)
     for fitted.step in (0, half - 1, half):
-        fitted._descend()
+        fitted.train_step()
     width = fitted.scene.train[0].camera.width
     assert [view.camera.width for view in looked] == [width // 2] * 2 + [width]
     small, full = looked[0], next(view for view in fitted.scene.train if view.name == looked[0].name)
@@ -390,7 +390,7 @@ def test_early_steps_see_small_images() -> None:
 def test_the_lightest_gaussians_go_and_moments_follow() -> None:
     """Catches the heaviest that go, a weight of the wrong rows, and moments or counts of other Gaussians."""
     fitted = trainer("3dgs", "train.densify.thin_to=0.5")
-    fitted._descend()
+    fitted.train_step()
     model, N = fitted.model, len(fitted.model)
     weights = blend_weights(model, fitted.scene.train, fitted.renderer.antialias)
     kept = weights.argsort(descending=True, stable=True)[: round(N / 2)].sort().values

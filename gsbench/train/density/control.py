@@ -45,7 +45,6 @@ class DensityControl:
     """Call the densification rule of a training when the schedule says so, and thin the Gaussians once after it."""
 
     def __init__(self, rows: Rows, scene: Scene, config: Config, schedule: Schedule, renderer: Renderer) -> None:
-        """Make the rule that `train.densify.kind` names, for the initial Gaussians."""
         train = config.train
         check_kind(train.densify.kind)
         score = ErrorScore(rows.model, scene.train, renderer, train.ssim_weight)
@@ -96,14 +95,12 @@ class DensityControl:
                        f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
 
 
-def gaussian_limit(limit: int | None, views: Sequence[View], initial: int) -> int:
-    """Return the largest number of Gaussians at full resolution: `limit`, or one that follows from the pixels.
-
-    Args:
-        limit: `train.densify.max_gaussians`.
-        views: the training views.
-        initial: the number of Gaussians at the start.
-    """
+def gaussian_limit(
+    limit: int | None,  # train.densify.max_gaussians
+    views: Sequence[View],  # of the training
+    initial: int,  # number of Gaussians at the start
+) -> int:
+    """Return the largest number of Gaussians at full resolution: `limit`, or one that follows from the pixels."""
     if limit is not None:
         return limit
     pixels = sum(view.camera.width * view.camera.height for view in views)

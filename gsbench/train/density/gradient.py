@@ -29,7 +29,6 @@ class GradientDensification(DensificationRule):
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
     ) -> None:
-        """Start with gradient sums of zero."""
         super().__init__(rows, config, min_opacity, views, score)
         self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
@@ -42,14 +41,7 @@ class GradientDensification(DensificationRule):
         self.times_visible = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
-    def accumulate(
-        self,
-        drawn: Tensor,  # [C, N] bool
-        g_means2d: Tensor,  # [C, N, 2] per pixel
-        width: int,
-        height: int,
-        views: int,
-    ) -> None:
+    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
         """Add the norms of the gradients of the 2D means in one view, in units of half the image (NDC)."""
         x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
         self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)

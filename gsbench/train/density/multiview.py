@@ -74,14 +74,7 @@ class ErrorScore:
     """
 
     def __init__(self, model: GaussianModel, views: Sequence[View], renderer: Renderer, ssim_weight: float) -> None:
-        """Store the model and the views.
-
-        Args:
-            model: the model whose Gaussians are scored.
-            views: the training views at full resolution.
-            renderer: renders views with the settings of the training.
-            ssim_weight: the weight w of 1 - SSIM in the loss.
-        """
+        """Store the training views at full resolution, and the weight w of 1 - SSIM in the loss."""
         self.model = model
         self.views = views
         self.renderer = renderer

@@ -31,15 +31,14 @@ class DensificationRule(ABC):
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
     ) -> None:
-        """Prepare the rule for a training.
+        """Prepare the rule for a training of an initialised model.
 
         Args:
-            rows: the Gaussians of the initialised model; the rule adds and removes Gaussians through this object.
+            rows: the Gaussians of the model; the rule adds and removes Gaussians through this object.
             config: the thresholds of densification.
             min_opacity: the opacity below which a Gaussian may be pruned.
             views: the number of training views, which is the length of an epoch.
-            score: renders training views to score the Gaussians, for rules that call it in `densify`. It is their only
-                access to the views.
+            score: renders training views to score the Gaussians, for rules that call it in `densify`.
         """
         self.rows = rows
         self.model = rows.model
@@ -64,34 +63,22 @@ class DensificationRule(ABC):
 
     def accumulate(
         self,
-        drawn: Tensor,  # [C, N] bool
-        g_means2d: Tensor,  # [C, N, 2] per pixel
-        width: int,
+        drawn: Tensor,  # [C, N] bool: which Gaussians were not culled
+        g_means2d: Tensor,  # [C, N, 2] gradient of the loss, a mean over the batch, per pixel
+        width: int,  # of the image, pixels
         height: int,
-        views: int,
+        views: int,  # in the batch
     ) -> None:
-        """Accumulate the gradients of the 2D means in one view of a batch; by default they are not used.
-
-        Args:
-            drawn: which Gaussians were not culled.
-            g_means2d: the gradient of the loss, a mean over the batch, with respect to the 2D means.
-            width: the width of the image, pixels.
-            height: the height of the image, pixels.
-            views: the number of views in the batch.
-        """
-        return
+        """Accumulate the gradients of the 2D means in one view of a batch; by default they are not used."""
 
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move means by noise after a step, where `adds_noise`; `rate` is the learning rate of means, world units."""
-        return
 
     def reset_opacities(self) -> None:
         """Lower all opacities, if the rule does this; the training calls this method at fixed intervals."""
-        return
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
         """Reorder per-Gaussian state after Gaussians were added or removed, see `gsbench.train.hooks.Hook.reindex`."""
-        return
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the rule has accumulated, for the checkpoint."""
@@ -99,4 +86,3 @@ class DensificationRule(ABC):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`; raise InputError if the number of Gaussians differs."""
-        return

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from gsbench.errors import InputError
@@ -26,9 +27,8 @@ if TYPE_CHECKING:
     from gsbench.train.renderer import Renderer
     from gsbench.train.rows import Rows
 
-LossTerm = tuple[
-    float, "Callable[[CameraTime, int], Tensor]"
-]  # weight, and the term [] of a view of the batch by its index
+# A weight, and the term [] of a view of the batch by its index.
+LossTerm = tuple[float, "Callable[[CameraTime, int], Tensor]"]
 ELSEWHERE = ("gsbench.gates.hook",)  # modules of hooks outside of this folder, which act last
 
 
@@ -140,6 +140,16 @@ class Hook:
     def results(self) -> dict[str, Any]:
         """Return what the hook adds to the record of the run: fields of `Record`, others join `Record.parts`."""
         return {}
+
+
+def check_excludes(key: str, config: Config, excluded: dict[str, str]) -> None:
+    """Raise InputError if another key is set too; `excluded` maps the keys that `key` excludes to reasons."""
+    for other, reason in excluded.items():
+        value = attrgetter(other)(config)
+        if value is not None and value is not False:
+            unset = "false" if value is True else "null"
+            raise InputError(f"{key}: expected {other}={unset}, {reason}, got {str(value).lower()}: leave one of the "
+                             f"two out")  # fmt: skip
 
 
 def check_choice_on_val(key: str, what: str, scene: Scene, config: Config) -> None:

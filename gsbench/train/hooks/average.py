@@ -41,7 +41,6 @@ class Average(Hook):
     name = "average"
 
     def __init__(self, training: Training) -> None:
-        """Start without means."""
         super().__init__(training)
         start = cast(AverageKey, training.config.train).average_from
         self.start = None if start is None else training.schedule.scaled(start)

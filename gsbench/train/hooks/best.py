@@ -26,12 +26,10 @@ class Best(Hook):
     measures = True
 
     def __init__(self, training: Training) -> None:
-        """Start without a measurement."""
         super().__init__(training)
         self.scores = Scores()
 
     def after_measuring(self, finished: int, psnr: float) -> float:
-        """Measure the evaluated split if PSNR on val is the best so far."""
         scores, leaks = self.scores, self.training.config.protocol.best_on_test
         is_best = psnr >= rank(scores.val)  # a NaN is never the best
         if leaks or is_best:

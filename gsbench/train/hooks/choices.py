@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from gsbench.config_key import joins, key
 from gsbench.errors import InputError
-from gsbench.train.hooks import Hook, Training, check_choice_on_val
+from gsbench.train.hooks import Hook, Training, check_choice_on_val, check_excludes
 
 if TYPE_CHECKING:
     from gsbench.config import Config
@@ -38,7 +38,6 @@ class Choices(Hook):
     measures = True
 
     def __init__(self, training: Training) -> None:
-        """Start without a choice."""
         super().__init__(training)
         self.chosen = ChosenOnVal()
 
@@ -51,13 +50,10 @@ class Choices(Hook):
         if iterations < parts:
             raise InputError(f"train.lengths={lengths}: expected at least {parts} iterations to "
                              f"halve {lengths - 1} times, got train.iterations={iterations}")  # fmt: skip
-        if config.effects.compare:
-            raise InputError("train.lengths: expected effects.compare=false, which compares models of one length: "
-                             "leave one of the two out")  # fmt: skip
+        check_excludes("train.lengths", config, {"effects.compare": "which compares models of one length"})
 
     @classmethod
     def check_scene(cls, scene: Scene, config: Config) -> None:
-        """Raise InputError if no length can be chosen on val."""
         if lengths_of(config) is not None:
             check_choice_on_val("lengths", "length", scene, config)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from gsbench.config_key import joins, key
 from gsbench.errors import InputError
 from gsbench.measure.exact_views import rank
-from gsbench.train.hooks import Hook, Training, check_choice_on_val
+from gsbench.train.hooks import Hook, Training, check_choice_on_val, check_excludes
 
 if TYPE_CHECKING:
     from gsbench.config import Config
@@ -39,7 +39,6 @@ class EarlyStop(Hook):
     measures = True
 
     def __init__(self, training: Training) -> None:
-        """Start without a kept state."""
         super().__init__(training)
         patience = _patience(training.config)
         self.wait = None if patience is None else max(1, round(patience * training.config.train.iterations))
@@ -50,28 +49,19 @@ class EarlyStop(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        others = {
-            "lengths": "which chooses among whole trainings",
-            "average_from": "whose average ends a training (+recipe=long)",
-        }
-        if _patience(config) is None:
-            return
-        if config.effects.compare:
-            raise InputError("train.patience: expected effects.compare=false, as a candidate of model=auto must not "
-                             "end before they are compared: leave one of the two out")  # fmt: skip
-        for other, why in others.items():
-            if (value := getattr(config.train, other)) is not None:
-                raise InputError(f"train.patience: expected train.{other}=null, {why}, got {value}: leave one of the "
-                                 f"two out")  # fmt: skip
+        if _patience(config) is not None:
+            check_excludes("train.patience", config, {
+                "effects.compare": "as a candidate of model=auto must not end before they are compared",
+                "train.lengths": "which chooses among whole trainings",
+                "train.average_from": "whose average ends a training (+recipe=long)",
+            })  # fmt: skip
 
     @classmethod
     def check_scene(cls, scene: Scene, config: Config) -> None:
-        """Raise InputError if no iteration can be chosen on val."""
         if _patience(config) is not None:
             check_choice_on_val("patience", "iteration", scene, config)
 
     def after_measuring(self, finished: int, psnr: float) -> float:
-        """Keep the state of the training if PSNR on val is the best so far."""
         training, self._last = self.training, finished
         iterations = training.config.train.iterations
         if self.wait is None or not training.schedule.is_complete(finished - 1):
@@ -82,13 +72,11 @@ class EarlyStop(Hook):
         return psnr
 
     def stops(self, finished: int) -> bool:
-        """Return whether the best PSNR on val is `train.patience` old."""
         if self.wait is None or self._best is None:
             return False
         return finished - max(self._best[0], self.training.schedule.densify_stop) >= self.wait
 
     def at_end(self) -> None:
-        """End the training with the Gaussians of the iteration that had the best PSNR on val."""
         if self.wait is None or self._best is None:
             return
         from gsbench.measure.record import Stop

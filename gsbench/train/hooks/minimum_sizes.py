@@ -24,7 +24,6 @@ class MinimumScale(Hook):
     name = "minimum_scale"
 
     def __init__(self, training: Training) -> None:
-        """Compute the minimum scales of the initial Gaussians."""
         import torch
 
         super().__init__(training)
@@ -42,7 +41,6 @@ class MinimumScale(Hook):
         self.least = LEAST_PIXELS * pixel
 
     def after_update(self, step: int) -> None:
-        """Raise the scales that are below their minimum."""
         self.training.model.hold_sizes(self.least)
 
     def after_density(self, step: int) -> None:
@@ -82,6 +80,5 @@ class MinimumLifetime(Hook):
         self.least = LEAST_GAPS * float(times.diff().median()) if has_gaps else None
 
     def after_update(self, step: int) -> None:
-        """Raise the lifetimes that are below the minimum."""
         if self.least is not None:
             self.training.model.hold_lifetimes(self.least)

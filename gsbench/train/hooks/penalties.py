@@ -55,7 +55,6 @@ class Penalties(Hook):
     name = "penalties"
 
     def __init__(self, training: Training) -> None:
-        """Make the penalties of a training."""
         from gsbench.train.regularisers import PENALTIES
 
         super().__init__(training)
@@ -83,7 +82,6 @@ class Penalties(Hook):
                                  f"set {key}.weight=0")  # fmt: skip
 
     def loss_terms(self, step: int, views: Sequence[View]) -> Sequence[LossTerm]:
-        """Return the penalties that are active at a step."""
         terms: list[LossTerm] = []
         for name, penalty in self.active.items():
             weighted = self.weighted[name]
