@@ -15,9 +15,11 @@ SOURCES = sorted((ROOT / "gsbench").rglob("*.py"))
 
 
 def pointers_in(source: str) -> list[str]:
-    """What the calls in a source give as `docs=`."""
-    calls = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
-    return [ast.literal_eval(word.value) for call in calls for word in call.keywords if word.arg == "docs"]
+    """What the calls in a source give as `docs=`, as text or by a constant of the module."""
+    nodes = list(ast.walk(ast.parse(source)))
+    constants = {ast.unparse(node.targets[0]): node.value for node in nodes if isinstance(node, ast.Assign)}
+    words = [word.value for node in nodes if isinstance(node, ast.Call) for word in node.keywords if word.arg == "docs"]
+    return [ast.literal_eval(constants.get(ast.unparse(word), word)) for word in words]
 
 
 def missing(pointer: str) -> bool:
@@ -39,6 +41,7 @@ def test_a_test_of_pointers_finds_them() -> None:
     """Catches a walk that sees no pointer, and a check that accepts any."""
     assert sum(len(pointers_in(path.read_text())) for path in SOURCES) > 30
     assert pointers_in("raise InputError(f'{x}', docs='data.md#fetching') from None") == ["data.md#fetching"]
+    assert pointers_in("PAGE = 'data.md'\nraise InputError('no images', docs=PAGE)") == ["data.md"]
     assert not missing("data.md#fetching")
     assert missing("data.md#fetched")
     assert missing("datum.md")
