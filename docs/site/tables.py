@@ -3,8 +3,6 @@
 `make docs` runs it; a test fails where a block is not what this writes.
 """
 
-import inspect
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +18,7 @@ from gsbench.models.base import GaussianModel
 from gsbench.report import blocks
 from gsbench.run.setup import build
 from gsbench.scenes.scene import Points
+from gsbench.usage import first_sentence
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = ROOT / "results" / "published"
@@ -39,16 +38,14 @@ def models() -> str:
 
 
 def row_of(path: Path) -> str:
-    """Return the row of one file of conf/model/."""
+    """Return the row of one file of conf/model/: what `--help` says of it, and facts of the model."""
     composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", f"model={path.stem}"])
     name = f"[`{path.stem}`](../conf/model/{path.name})"
-    about = " ".join(re.findall("^# (.*)", path.read_text(), re.MULTILINE))
+    about = first_sentence(path)
     if composed.model.candidates:
         chosen = " or ".join(f"`{one.name}`" for one in composed.model.candidates.values())
         return f"| {name} | {about} | what the chosen one does: {chosen} | |"
     model = find(composed.model.name)
-    if path.stem == composed.model.name:
-        about = (inspect.getdoc(inspect.getmodule(model)) or "").partition("\n")[0]
     observes = " and ".join(model.observes) or "neither"
     return f"| {name} | {about} | {observes} | {numbers(composed)} |"
 
