@@ -1,5 +1,6 @@
 """Kill a run after some of its checkpoints, count its steps, and compare the states of two runs bit by bit."""
 
+import copy
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_training import train
 
 from gsbench.measure.record import Record
 from gsbench.train import checkpoint
@@ -51,6 +53,21 @@ def counted_steps(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     monkeypatch.setattr(Trainer, "train_step", counted)
     return steps
+
+
+def assert_resumes(start: Callable[[], Trainer], step: int) -> tuple[Trainer, Trainer]:
+    """Check that a training which goes on from its state after some steps ends with the bits of one that never stopped.
+
+    Returns:
+        The whole training, and the one that stopped.
+    """
+    whole, stopped = train(start()), train(start(), until=step)
+    assert stopped.step == step
+    resumed = start()
+    resumed.load_state_dict(copy.deepcopy(stopped.state_dict()))
+    ends = [checkpoint.without_times(trainer.state_dict()) for trainer in (whole, train(resumed))]
+    assert_same_bits(*ends)
+    return whole, stopped
 
 
 def bits(folder: Path) -> dict[str, Any]:

@@ -24,7 +24,6 @@ from gsbench.run.checks import check_config
 from gsbench.run.setup import BACKGROUNDS, LEAST_GAUSSIANS
 from gsbench.scenes import RESIZES
 from gsbench.train.density.control import RULES
-from gsbench.train.optim import OPTIMIZERS
 
 KEYS = declared(Config)
 OF_HYDRA = ("defaults", "hydra")  # keys of YAML files that are not keys of a config
@@ -79,7 +78,7 @@ def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
 
 def test_facts_are_those_of_the_code() -> None:
     """Catches a choice that the code does not have, and one that is refused though it has it."""
-    choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "optim": OPTIMIZERS, "effects.gate": GATES,
+    choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "effects.gate": GATES,
                "train.densify.kind": RULES, "model.gate": GATES}  # fmt: skip
     for name, known in choices.items():
         assert set(KEYS[name].choices) == set(known), name

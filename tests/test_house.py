@@ -40,13 +40,12 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/raster": 1,
     "gsbench/report": 13,
     "gsbench/run": 27,
-    "tests": 6,
+    "tests": 5,
     "tests/gates": 37,
-    "tests/models": 53,
+    "tests/models": 52,
     "tests/report": 30,
     "tests/run": 36,
     "tests/slurm": 13,
-    "tests/train": 29,
 }
 
 

@@ -1,6 +1,7 @@
 """A training small enough for a test: its settings, and a scene of a few pixels in memory."""
 
 import math
+from dataclasses import replace
 
 import hydra
 import torch
@@ -8,7 +9,10 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF, Config, register_schema
+from gsbench.run.setup import build
 from gsbench.scenes.scene import Camera, Points, Scene, View
+from gsbench.train.batches import generator
+from gsbench.train.loop import Trainer
 
 SIZE = 16  # pixels a side
 VIEWS = 12
@@ -47,3 +51,21 @@ def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Sce
     g = torch.Generator().manual_seed(0)
     points = Points(torch.rand(POINTS, 3, generator=g) * 1.6 - 0.8, torch.rand(POINTS, 3, generator=g))
     return Scene("moving-square", train, [], train, (0.0, 0.0, 0.0), 4.4, points, "of tests/tiny_training.py")
+
+
+def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
+    """A trainer of 100 steps at step 0, of the moving square with three views of val and two of test by default."""
+    config = compose(model, 100, *overrides)
+    if scene is None:
+        square = moving_square()
+        scene = replace(square, val=square.train[:3], test=square.train[3:5])
+    built = build(config)
+    assert scene.points is not None
+    built.initialise(scene.points, scene.extent, generator(config.seed))
+    return Trainer(built, scene, scene.test, config)
+
+
+def train(trainer: Trainer, until: int | None = None) -> Trainer:
+    """Train to the end or until so many steps are finished, save nothing, and return the trainer."""
+    trainer.run(lambda _: None, "square", lambda: trainer.step != until)
+    return trainer

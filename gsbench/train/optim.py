@@ -22,7 +22,6 @@ from gsbench.train.checkpoint import tensor
 if TYPE_CHECKING:  # config.py needs hydra, which a machine that checks kernels may lack
     from gsbench.config import LearningRate, ModelConfig, TrainConfig
 
-OPTIMIZERS = ("adam", "sparse_adam")
 BETAS, EPS = (0.9, 0.999), 1e-15
 NO_FACTORS: Mapping[str, float] = {}
 COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
@@ -66,34 +65,23 @@ class Optimizer:
     def step(
         self,
         step: int,
-        drawn: Tensor | None,  # [N] bool
-        factors: Mapping[str, float] = NO_FACTORS,
+        drawn: Tensor | None,  # [N] bool: which Gaussians are visible in the batch; for sparse_adam
+        factors: Mapping[str, float] = NO_FACTORS,  # of the learning rates, by group
     ) -> None:
         """Update the parameters that have a gradient, then delete the gradients.
 
         On a GPU nothing is updated if an earlier gradient was not finite (`skip` is 1).
-
-        Args:
-            step: the step, which determines the learning rates.
-            drawn: which Gaussians are visible in the batch; only `sparse_adam` needs it.
-            factors: factors of the learning rates, by group.
         """
         rates = self.rates_at(step, factors)
-        is_native = self._is_native()
-        by_kernel: list[tuple[nn.Parameter, float]] = []
-        rest_has_gradients = False
-        for name, parameters in self.groups.items():
-            if self.is_sparse and name in self.model.splats:
-                assert drawn is not None
-                self._step_rows(parameters[0], rates[name], drawn)
-            for parameter in parameters:
-                if parameter.grad is not None and is_native:
-                    by_kernel.append((parameter, rates[name]))
-                elif parameter.grad is not None:
-                    rest_has_gradients = True
-        if by_kernel:
-            self._step_all(by_kernel)
-        if rest_has_gradients:
+        if self.is_sparse:
+            assert drawn is not None
+            for name, parameter in self.model.splats.items():
+                self._step_rows(parameter, rates[name], drawn)
+        rated = [(p, rates[name]) for name, group in self.groups.items() for p in group if p.grad is not None]
+        means = self.model.splats["means"]  # the device and the type of all parameters
+        if rated and means.is_cpu and self.model.backend.serves(means) and self.skip is None:
+            self._step_all(rated)
+        elif rated:
             for group in self.torch_adam.param_groups:
                 group["lr"] = rates[group["name"]]
             if self.skip is not None:
@@ -105,11 +93,6 @@ class Optimizer:
         """Return the learning rate of each group at a step, multiplied by the factors of some groups."""
         return {name: rate_at(rate, step, self.train, self.extent) * factors.get(name, 1.0)
                 for name, rate in self.rates.items()}  # fmt: skip
-
-    def _is_native(self) -> bool:
-        """Return whether the CPU kernel, not torch, updates the parameters; all have one device and type."""
-        means = self.model.splats["means"]
-        return means.device.type == "cpu" and self.model.backend.serves(means) and self.skip is None
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
         """Return Adam's step count and moments of a parameter; create them with zeros if they do not exist."""

@@ -10,10 +10,8 @@ from raster.cases import case
 from test_raster import assert_gradients_close, differentiate
 from torch import Tensor
 
-from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import backward_by_splat
-from gsbench.train.optim import adam_reference
 
 EVERY_PIXEL = torch.ones(()).bool()
 
@@ -37,23 +35,6 @@ def test_order_of_threads_does_not_matter(
         results.append([output.image, output.alpha, loss, *torch.autograd.grad(loss, image), *gradients.values()])
     for x, y in zip(*results, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(1,), (700, 1, 3), (300, 28)])
-@pytest.mark.parametrize("step", [1.0, 30_000.0])
-def test_adam_updates_what_was_drawn(shape: tuple[int, ...], step: float, cuda_device: str) -> None:
-    """Catches a wrong row of a wide parameter, a bias correction lost to cancellation, and rows that should rest."""
-    random = torch.Generator().manual_seed(0)
-    g, p, m = (torch.randn(shape, generator=random) for _ in range(3))
-    v, drawn = torch.rand(shape, generator=random), torch.rand(shape[0], generator=random) < 0.7
-    expected = p.double(), m.double(), v.double()
-    adam_reference(expected[0], g.double(), expected[1], expected[2], drawn, 0.01, [0.9, 0.999], 1e-15,
-                   torch.tensor(step))  # fmt: skip
-    actual = [x.clone().to(cuda_device) for x in (p, g, m, v, drawn, torch.tensor(step))]
-    adam(*actual[:5], 0.01, [0.9, 0.999], 1e-15, actual[5])
-    for index, want in zip((0, 2, 3), expected, strict=True):
-        torch.testing.assert_close(actual[index].cpu().double(), want, rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(actual[index].cpu()[~drawn], (p, g, m, v)[index][~drawn], rtol=0, atol=0)
 
 
 def test_out_of_memory_names_the_buffer_and_the_process_lives_on(

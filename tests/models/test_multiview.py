@@ -1,25 +1,22 @@
 """Densification by scores of several views: the scores themselves, who is cloned or pruned by them, and resuming."""
 
-import copy
 import math
 from dataclasses import replace
 
 import pytest
 import torch
 from small import started
-from tiny_training import compose, moving_square
+from tiny_training import moving_square, train, trainer
 
 from gsbench.config import DensifyConfig
 from gsbench.kernels.backends import REFERENCE
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import rasterize_slice, render
-from gsbench.run.setup import build as build_for
 from gsbench.scenes.scene import Points, View
 from gsbench.train.batches import generator
 from gsbench.train.density.multiview import LEAST_IMPORTANCE, VIEWS, ErrorScore, MultiviewDensification, drawn_once
 from gsbench.train.density.rule import Scores
 from gsbench.train.hooks.minimum_sizes import MinimumScale
-from gsbench.train.loop import Trainer
 from gsbench.train.losses import photometric
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
@@ -207,37 +204,12 @@ def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def trainer(name: str, *overrides: str) -> Trainer:
-    """A trainer at its step 0 of a training by this rule, with rounds every 10 steps until step 50 of 60."""
-    config, scene = compose(name, 60, *ROUNDS, *overrides), moving_square()
-    scene = replace(scene, val=scene.train[:1])
-    made = build_for(config)
-    assert scene.points is not None
-    made.initialise(scene.points, scene.extent, generator(config.seed))
-    return Trainer(made, scene, scene.test, config)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_model_trains_by_it(name: str) -> None:
     """Catches a model whose slices give no blend weights, and state of the training that does not follow the rows."""
-    fitted = trainer(name)
-    before, stops = len(fitted.model), iter([True] * 20 + [False])
-    fitted.run(lambda _: None, name, lambda: next(stops))
-    model = fitted.model
+    fitted = trainer(name, *ROUNDS)
+    before = len(fitted.model)
+    model = train(fitted, until=21).model
     assert len(model) > before
     assert len(model) == len(fitted.hook(MinimumScale).least) == len(fitted.density.rule.unseen)  # type: ignore[attr-defined]
     assert all(parameter.isfinite().all() for parameter in model.parameters())
-
-
-def test_a_training_continues_from_a_checkpoint() -> None:
-    """Catches random numbers, scores or counts of this rule that a checkpoint does not have."""
-    whole, part, resumed = (trainer("7dgs", "model.min_opacity=0.09") for _ in range(3))  # some are pruned
-    whole.run(lambda _: None, "whole")
-    stops = iter([True] * 24 + [False])
-    part.run(lambda _: None, "part", lambda: next(stops))
-    assert part.step == 25
-    resumed.load_state_dict(copy.deepcopy(part.state_dict()))
-    resumed.run(lambda _: None, "resumed")
-    assert len(whole.model) > len(part.model)
-    for name, value in whole.model.pack().items():
-        assert torch.equal(value, resumed.model.pack()[name]), name

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 import torch
-from test_wiring import trainer
+from tiny_training import train, trainer
 
 from gsbench.errors import InputError
 from gsbench.train.hooks.average import Average
 
 
-def average_of(start: int | None, steps: int = 100, *, first: int = 0) -> Average:
+def average_of(start: int, steps: int = 100, *, first: int = 0) -> Average:
     """Two parameters that count steps, with an average from step `start` on; as a PSNR, small steps score high."""
     model = torch.nn.ParameterDict({"a": torch.zeros(3), "b": torch.zeros(())})
     train = SimpleNamespace(average_from=start, iterations=100)
@@ -62,13 +62,6 @@ def test_the_last_parameters_stay_where_the_mean_is_no_better(psnr: float) -> No
     assert parameters(average) == ([99.0] * 3, -99.0)
 
 
-def test_without_a_start_nothing_changes() -> None:
-    """Catches an option that is on for everybody."""
-    average = average_of(None)
-    assert average.after_measuring(100, -99.0) == -99.0
-    assert parameters(average) == ([99.0] * 3, -99.0)
-
-
 def test_it_starts_anew_when_gaussians_change() -> None:
     """Catches means of rows that are others now."""
     average = average_of(50, steps=75)
@@ -107,5 +100,5 @@ def test_parameters_are_averaged_where_val_may_choose(split: str, views: bool, k
     fitted.psnr = lambda views: (  # type: ignore[method-assign]
         last.pop(0) if fitted.step == 99 and last and views is fitted.scene.val else real(views)
     )
-    fitted.run(lambda _: None, "square")
+    train(fitted)
     assert (fitted.hook(Average).kept, fitted.hook(Average).count) == (kept, 0)

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_wiring import trainer
-from tiny_training import moving_square
+from tiny_training import moving_square, trainer
 
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import render

@@ -1,12 +1,11 @@
 """What a model brings to a training of its own: a network, a penalty, a static first stage, and points with times."""
 
-import copy
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
-from test_wiring import trainer
-from tiny_training import compose, moving_square
+from interrupted import assert_resumes
+from tiny_training import compose, moving_square, train, trainer
 from torch import Tensor, nn
 
 from gsbench.config import LearningRate
@@ -65,21 +64,16 @@ def deformed(*words: str) -> Trainer:
 
 def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times() -> None:
     """Catches a network that never learns or that a checkpoint lacks, a penalty without effect, and no warm-up."""
-    whole = deformed()
-    model: Any = whole.model
+    start = deformed()
+    model: Any = start.model
     assert model.started_at.shape == (len(model),)
-    whole.run(lambda _: None, "warm-up", lambda: whole.step < 30)
+    train(start, until=30)
     assert model.active.warms_up
     assert not model.field.weight.any(), "the penalty alone has no gradient by a weight of zero"
     assert model.field.bias[0] > 0.1, "the penalty has a gradient in the warm-up"
-    state = copy.deepcopy(whole.state_dict())
-    whole.run(lambda _: None, "rest")
+    model = assert_resumes(deformed, 30)[0].model
     assert not model.active.warms_up
     assert model.field.weight.any()
-    resumed = deformed()
-    resumed.load_state_dict(state)
-    resumed.run(lambda _: None, "resumed")
-    assert all(torch.equal(x, resumed.model.pack()[name]) for name, x in whole.model.pack().items())
 
 
 def test_a_warm_up_is_not_an_end() -> None:

@@ -1,14 +1,13 @@
 """The motion regulariser by hand, its gradient, its random numbers and neighbours, and how it is refused."""
 
-import copy
 import math
 from typing import Any
 
 import pytest
 import torch
+from interrupted import assert_resumes, assert_same_bits
 from models.small import seeded
-from tiny_training import compose
-from train.test_wiring import trainer
+from tiny_training import compose, trainer
 
 from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel, build
@@ -200,37 +199,28 @@ def test_neighbours_at_the_edge(place: str) -> None:
 @pytest.mark.parametrize("name", ["7dgs", "4dgs", "dgs"])
 def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
     """Catches draws that depend on the order of threads, and gradients that threads add in any order."""
-    found = []
+    ends = []
     for count in (1, 2):
         torch.set_num_threads(count)
         fitted = trainer(name, *WEIGHT, "train.refine_from=0", "train.batch_size=3")
         for fitted.step in range(6):
             fitted.train_step()
-        found.append((fitted.finite_check.loss, fitted.model.pack()))
-    assert found[0][0] == found[1][0]
-    assert all(torch.equal(x, found[1][1][key]) for key, x in found[0][1].items())
+        ends.append((fitted.finite_check.loss, fitted.model.pack()))
+    assert_same_bits([*ends[0]], [*ends[1]])
     plain = trainer(name, "train.batch_size=3", "train.refine_from=0")
     for plain.step in range(6):
         plain.train_step()
-    assert plain.finite_check.loss != found[0][0]
+    assert plain.finite_check.loss != ends[0][0]
 
 
 def test_neighbours_continue_from_a_checkpoint() -> None:
     """Catches neighbours that a resumed training searches anew, and gets others."""
     words = (*WEIGHT, "train.densify.start=0", "train.densify.stop=20", "train.densify.every=10",
              "train.iterations=40", "train.recipe_iterations=40")  # fmt: skip
-    whole, part = trainer("7dgs", *words), trainer("7dgs", *words)
-    whole.run(lambda _: None, "whole")
-    stops = iter([True] * 24 + [False])
-    part.run(lambda _: None, "part", lambda: next(stops))
-    state = copy.deepcopy(part.state_dict())
+    stopped = assert_resumes(lambda: trainer("7dgs", *words), 25)[1]
+    state = stopped.state_dict()
     assert state["hooks"]["penalties"]["strain"]["searched"] == 20
-    resumed = trainer("7dgs", *words)
-    resumed.load_state_dict(state)
-    resumed.run(lambda _: None, "resumed")
-    for name, value in whole.model.pack().items():
-        assert torch.equal(value, resumed.model.pack()[name]), name
-    state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(part.model)
+    state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(stopped.model)
     with pytest.raises(InputError, match="neighbours"):
         trainer("7dgs", *words).load_state_dict(state)
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from interrupted import assert_same_bits
-from test_resume import comparable_state
+from test_checkpoint import comparable_state
 from tiny_run import command, environment
 from tiny_training import compose, moving_square
 from torch import Tensor
@@ -53,12 +53,12 @@ class OtherProcessor(TorchDispatchMode):
     changed = 0
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        found = function(*args, **(kwargs or {}))
-        if function.overloadpacket.__name__.rstrip("_") in OF_MKL and found.dtype == torch.float32:
-            third = torch.arange(found.numel()).reshape(found.shape) % 3 == 0
-            found.copy_(torch.where(third, torch.nextafter(found, torch.tensor(torch.inf)), found))
+        result = function(*args, **(kwargs or {}))
+        if function.overloadpacket.__name__.rstrip("_") in OF_MKL and result.dtype == torch.float32:
+            third = torch.arange(result.numel()).reshape(result.shape) % 3 == 0
+            result.copy_(torch.where(third, torch.nextafter(result, torch.tensor(torch.inf)), result))
             self.changed += 1
-        return found
+        return result
 
 
 def test_the_last_bits_of_mkl_are_changed() -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from tqdm import tqdm
 
 from gsbench.config import Config
-from gsbench.errors import InputError, did_you_mean
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.batches import generator
@@ -35,18 +34,11 @@ RULES: dict[str, type[DensificationRule]] = {
 }
 
 
-def check_kind(kind: str) -> None:
-    """Raise InputError if `kind` is not the name of a densification rule."""
-    if kind not in RULES:
-        raise InputError(f"train.densify.kind '{kind}' is not known. {did_you_mean(kind, RULES)}")
-
-
 class DensityControl:
     """Call the densification rule of a training when the schedule says so, and thin the Gaussians once after it."""
 
     def __init__(self, rows: Rows, scene: Scene, config: Config, schedule: Schedule, renderer: Renderer) -> None:
         train = config.train
-        check_kind(train.densify.kind)
         score = ErrorScore(rows.model, scene.train, renderer, train.ssim_weight)
         self.rule = RULES[train.densify.kind](rows, train.densify, config.model.min_opacity, len(scene.train), score)
         self.rows = rows

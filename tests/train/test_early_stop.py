@@ -1,14 +1,12 @@
 """`train.patience`: the iteration with the best PSNR on val is kept, and a training that no longer gains stops."""
 
-import copy
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_same_bits
-from test_wiring import trainer
-from tiny_training import compose, moving_square
+from interrupted import assert_resumes, assert_same_bits
+from tiny_training import compose, moving_square, train, trainer
 
 from gsbench.errors import InputError
 from gsbench.gates.hook import Gating
@@ -32,9 +30,7 @@ def with_val(psnr: dict[int, float], *more: str) -> Trainer:
 
 def parameters_at(iteration: int) -> list[torch.Tensor]:
     """The parameters after so many iterations of a training without patience."""
-    fitted = trainer("7dgs", *PATIENT, "train.patience=null", "effects.gate=off")
-    fitted.run(lambda _: None, "square", lambda: fitted.step < iteration)
-    assert fitted.step == iteration
+    fitted = train(trainer("7dgs", *PATIENT, "train.patience=null", "effects.gate=off"), until=iteration)
     return [p.detach().clone() for p in fitted.model.parameters()]
 
 
@@ -56,8 +52,7 @@ def test_a_training_stops_after_its_best_and_keeps_it(best: int) -> None:
 
 def test_a_training_that_gains_to_the_end_is_that_without_patience() -> None:
     """Catches a training that patience changes where it has nothing to do, such as one without its average."""
-    fitted = with_val({}, "effects.gate=off")
-    fitted.run(lambda _: None, "square")
+    fitted = train(with_val({}, "effects.gate=off"))
     assert fitted.hook(EarlyStop).stop is not None
     assert (fitted.hook(EarlyStop).stop.kept, fitted.hook(EarlyStop).stop.iteration) == (100, 100)
     assert_same_bits([p.data for p in fitted.model.parameters()], [p.data for p in parameters_at(100)])
@@ -65,29 +60,20 @@ def test_a_training_that_gains_to_the_end_is_that_without_patience() -> None:
 
 def test_a_training_is_not_over_before_it_is_measured_again() -> None:
     """Catches a patience shorter than the time between two measurements that stops a training which still gains."""
-    fitted = with_val({}, "effects.gate=off", "train.curve_points=4", "train.patience=0.05")
-    fitted.run(lambda _: None, "square")
+    fitted = train(with_val({}, "effects.gate=off", "train.curve_points=4", "train.patience=0.05"))
     assert [point.iteration for point in fitted.curve.points] == [25, 50, 75, 100]
 
 
 def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
     """Catches gates at the end whose rows are those of the last iteration: more Gaussians than the kept one has."""
-    fitted = with_val({40: 50.0})
-    fitted.run(lambda _: None, "square")
+    fitted = train(with_val({40: 50.0}))
     assert 0 < len(fitted.model) <= len(parameters_at(40)[0])
     assert fitted.hook(Gating).gates
 
 
 def test_a_killed_run_keeps_the_same_iteration() -> None:
     """Catches a checkpoint that has lost the best iteration, or how long ago it was."""
-    whole, killed, resumed = (with_val({60: 50.0}, "effects.gate=off") for _ in range(3))
-    ends: list[dict[str, Any]] = []
-    for fitted, goes_on in ((whole, lambda: True), (killed, lambda: killed.step < 67)):
-        fitted.run(lambda state: ends.append(copy.deepcopy(state)), "square", goes_on)
-    resumed.load_state_dict(ends[-1])
-    resumed.run(lambda _: None, "square")
-    assert resumed.hook(EarlyStop).stop == whole.hook(EarlyStop).stop
-    assert_same_bits([p.data for p in resumed.model.parameters()], [p.data for p in whole.model.parameters()])
+    assert_resumes(lambda: with_val({60: 50.0}, "effects.gate=off"), 67)
 
 
 @pytest.mark.parametrize(

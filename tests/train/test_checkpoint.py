@@ -12,13 +12,15 @@ from pathlib import Path
 import pytest
 import torch
 from forked import Forked
-from interrupted import assert_same_bits
+from interrupted import assert_resumes, assert_same_bits
 from tiny_run import gsbench, overrides, run_here, write_moving_square
+from tiny_training import trainer
 
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
+from gsbench.train.hooks.average import Average
 
 RUN = (
     "model=7dgs",
@@ -71,8 +73,8 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
         while step < start + 12 and time.monotonic() < deadline:
             assert process.poll() is None, "the run ended before it could be killed"
             time.sleep(0.01)
-            found = list((tmp_path / "broken").rglob(checkpoint.FILE_NAME))
-            step = checkpoint.read(found[0]).state["step"] if found else 0
+            saved = list((tmp_path / "broken").rglob(checkpoint.FILE_NAME))
+            step = checkpoint.read(saved[0]).state["step"] if saved else 0
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed_at.append(step)
@@ -93,6 +95,26 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, whole:
     (log,) = (tmp_path / "broken").rglob("curve.jsonl")
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [p.iteration for p in scores[1].curve]
+
+
+ROUNDS = ("train.densify.start=0", "train.densify.stop=50", "train.densify.every=10", "train.iterations=60",
+          "train.recipe_iterations=60", "train.refine_from=0")  # fmt: skip
+
+
+def test_relocation_and_averages_continue_from_a_checkpoint() -> None:
+    """Catches random numbers or sums of relocation and of averages that a checkpoint does not have."""
+    words = (*ROUNDS, "train.densify.kind=mcmc", "train.average_from=40")
+    whole, stopped = assert_resumes(lambda: trainer("7dgs", *words), 55)
+    assert len(whole.model) > len(trainer("7dgs", *words).model)
+    assert stopped.hook(Average).count == 1  # of step 50: it started anew with the round before
+    assert whole.hook(Average).count == 0
+
+
+def test_scores_of_several_views_continue_from_a_checkpoint() -> None:
+    """Catches random numbers, scores or counts of FastGS' rule that a checkpoint does not have."""
+    words = (*ROUNDS, "train.densify.kind=multiview", "train.densify.grad_threshold=1e-6", "model.min_opacity=0.09")
+    whole, stopped = assert_resumes(lambda: trainer("7dgs", *words), 25)
+    assert len(whole.model) > len(stopped.model)
 
 
 def test_a_reloaded_checkpoint_measures_the_same(square: Path, whole: Path, tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ from gsbench.train.batches import batch, generator
 
 def test_every_view_is_seen_once_an_epoch() -> None:
     """Catches sampling with replacement, and batches that lose views where an epoch ends within them."""
-    seen = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
+    order = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
     for epoch in range(15):
-        assert sorted(seen[7 * epoch : 7 * epoch + 7]) == list(range(7))
-    assert seen[:7] != seen[7:14]
+        assert sorted(order[7 * epoch : 7 * epoch + 7]) == list(range(7))
+    assert order[:7] != order[7:14]
 
 
 def test_batches_depend_on_seed_and_step_alone() -> None:

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 from interrupted import assert_same_bits
-from test_wiring import trainer
-from tiny_training import moving_square
+from tiny_training import moving_square, train, trainer
 
 from gsbench.kernels.recording import Recording
 from gsbench.train.checkpoint import without_times
@@ -33,8 +32,7 @@ def repeats(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def trained(fitted: Trainer) -> object:
-    fitted.run(lambda _: None, "a training")
-    return without_times(fitted.state_dict())
+    return without_times(train(fitted).state_dict())
 
 
 @pytest.mark.usefixtures("threads")
@@ -45,11 +43,11 @@ def test_a_training_has_the_same_bits(
 ) -> None:
     """Catches work of a step that depends on something that neither the signature has nor a repetition reads again."""
     torch.set_num_threads(threads_used)
-    given = trained(trainer(model, *overrides))
+    replayed = trained(trainer(model, *overrides))
     assert repeats[0] > 4 * 50
     monkeypatch.setattr(Step, "_signature", lambda *_: None)
     repeats[0] = 0
-    assert_same_bits(given, trained(trainer(model, *overrides)))
+    assert_same_bits(replayed, trained(trainer(model, *overrides)))
     assert repeats[0] == 0
 
 
@@ -61,23 +59,22 @@ def test_a_view_with_more_intersections_is_not_repeated(repeats: list[int], monk
     viewmat[2, 3] *= 0.2
     train = [square.train[0]] * 3 + [replace(near, camera=replace(near.camera, viewmat=viewmat))]
     scene = replace(square, train=train, val=square.train[:3], test=square.train[3:5])
-    found = []
+    all_losses = []
     for signature in (Step._signature, lambda *_: None):
         monkeypatch.setattr(Step, "_signature", signature)
         fitted, losses = trainer("3dgs", "train.batch_size=1", scene=scene), []
         for fitted.step in range(24):
             fitted.train_step()
             losses.append(fitted.finite_check.loss)
-        found.append(losses)
-    assert found[0] == found[1]
+        all_losses.append(losses)
+    assert all_losses[0] == all_losses[1]
     assert 0 < repeats[0] < 4 * 22
 
 
 def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: list[int]) -> None:
     """Catches a training that goes on with NaN, because the rasterizer's check was not repeated."""
     fitted = trainer("7dgs")
-    for fitted.step in range(4):
-        fitted.train_step()
+    train(fitted, until=4)
     assert repeats[0] > 0
     with torch.no_grad():
         fitted.model.splats["means"][0, 0] = math.nan
@@ -89,16 +86,16 @@ def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: list[int])
 def test_an_attribute_of_a_model_may_change(repeats: list[int]) -> None:
     """Catches a model of another author whose option, which a schedule of its own changes, is read only once."""
     fitted = trainer("3dgs")
-    shade, light, own = fitted.model.shade, [], vars(fitted.model)
+    shade, light, attributes = fitted.model.shade, [], vars(fitted.model)
 
     def brighter(*arguments: Any) -> torch.Tensor:
-        light.append(own["light"])
+        light.append(attributes["light"])
         return shade(*arguments) * light[-1]
 
-    own |= {"light": 1.0, "shade": brighter}
+    attributes |= {"light": 1.0, "shade": brighter}
     for fitted.step in range(5):
         fitted.train_step()
     assert repeats[0] > 0
-    own["light"] = 0.5
+    attributes["light"] = 0.5
     fitted.train_step()
     assert light[-1] == 0.5

@@ -1,0 +1,169 @@
+"""What a training does around its steps: the curve, resets, seconds, the progress bar, and the rates of each step."""
+
+import re
+import time
+from typing import Any
+
+import pytest
+import torch
+from tiny_run import ROOT
+from tiny_training import compose, train, trainer
+
+from gsbench.errors import InputError
+from gsbench.kernels.adam import adam_all
+from gsbench.measure.curve import Point
+from gsbench.measure.speed import StageClock
+from gsbench.run.checks import check_values
+from gsbench.train.hooks import hook_types
+from gsbench.train.hooks.best import Best
+from gsbench.train.loop import Trainer
+from gsbench.train.optim import rate_at
+
+
+def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
+    """Catches a curve measured on test, and a best on val that stores val's own score."""
+    fitted = trainer()
+    scores = {id(fitted.scene.val): [20.0, 21.0, 20.5], id(fitted.views): [15.0, 14.0, 16.0]}
+    fitted.psnr = lambda views: scores[id(views)].pop(0)  # type: ignore[method-assign]
+    for step in (0, 1, 2):
+        fitted.step = step
+        fitted._measure()
+    assert [point.psnr_val for point in fitted.curve.points] == [20.0, 21.0, 20.5]
+    assert isinstance(fitted.curve.last, Point)
+    best = fitted.hook(Best).scores
+    assert (best.val, best.eval_at_best_val, best.eval) == (21.0, 14.0, None)
+
+
+def test_opacities_are_reset_when_the_schedule_says() -> None:
+    """Catches a reset that is never called, is called every step, leaves any of Adam's two moments, or lowers far."""
+    fitted = trainer()
+    fitted.schedule.resets = lambda step: step == 1  # type: ignore[method-assign]
+    opacities = fitted.model.splats["opacities"]
+    with torch.no_grad():
+        opacities.fill_(2.0)
+    ceiling = 2 * fitted.config.model.min_opacity
+    for step in (0, 1):
+        fitted.run(lambda _: None, "a step", goes_on=lambda: False)
+        assert (opacities.max().sigmoid().item() == pytest.approx(ceiling, rel=1e-3)) == (step == 1)
+    state = fitted.optimizer.moments[opacities]
+    assert not state["exp_avg"].any()
+    assert not state["exp_avg_sq"].any()
+
+
+def test_a_point_of_the_curve_is_measured_before_a_reset() -> None:
+    """Catches a curve, and a best on val, of models whose opacities were lowered a moment ago."""
+    fitted = trainer()
+    fitted.schedule.resets = fitted.schedule.measures = lambda _: True  # type: ignore[method-assign]
+    opacities = fitted.model.splats["opacities"]
+    with torch.no_grad():
+        opacities.fill_(2.0)
+    fitted.psnr = lambda _: opacities.max().sigmoid().item()  # type: ignore[method-assign]
+    fitted.run(lambda _: None, "a step", goes_on=lambda: False)
+    assert fitted.curve.last.psnr_val > 0.5  # type: ignore[union-attr, operator]
+    assert opacities.max().sigmoid() <= 2.001 * fitted.config.model.min_opacity
+
+
+def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches rates that are set once, or rates to another parameter: those of a step reach Adam."""
+    fitted, rates = trainer("7dgs"), {}
+
+    def note(parameters: list[torch.Tensor], *arguments: Any) -> None:
+        rates.update({p.data_ptr(): rate for p, rate in zip(parameters, arguments[4], strict=True)})
+        adam_all(parameters, *arguments)
+
+    monkeypatch.setattr("gsbench.train.optim.adam_all", note)
+    for step in (0, 50, 99):
+        fitted.step = step
+        fitted.train_step()
+        for name, parameters in fitted.model.groups().items():
+            rate = rate_at(fitted.config.model.lr[name], step, fitted.config.train, fitted.scene.extent)
+            assert all(rates[p.data_ptr()] == rate for p in parameters if p.data_ptr() in rates), name
+        assert len(rates) >= 10
+
+
+def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a bar that says neither, and one that waits for a GPU at every step to say it."""
+    fitted = trainer("3dgs", "train.curve_points=4")
+    reads = []
+    seconds = StageClock.seconds.fget
+    assert seconds is not None
+    monkeypatch.setattr(StageClock, "seconds", property(lambda clock: reads.append(1) or seconds(clock)))
+    train(fitted)
+    assert len(reads) == 4 + 1  # the points of the curve, and the checkpoint at the end
+    last = capsys.readouterr().err.split("\r")[-1]
+    assert fitted.curve.progress in last
+    assert re.search(r"\d+ s of training, val \d+\.\d\d dB \([+-]\d", last)
+
+
+def with_fake_clock(fitted: Trainer, now: list[float], patch: pytest.MonkeyPatch) -> Trainer:
+    """A trainer whose steps take 2 s in a stage and 1 s around it, and whose measuring takes 100 s."""
+
+    def work(seconds: float) -> None:
+        now[0] += seconds
+
+    def step() -> None:
+        work(0.75)
+        with fitted.stages("loss"):
+            work(2.0)
+        work(0.25)
+
+    def measure(_: object) -> float:
+        work(100.0)
+        return 20.0
+
+    patch.setattr(time, "perf_counter", lambda: now[0])
+    patch.setattr(fitted, "train_step", step)
+    patch.setattr(fitted, "psnr", measure)
+    return fitted
+
+
+def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches Python between stages that no second holds, val, checkpoints and reports that are held to be training,
+    a curve of another clock, and a stopped run that loses seconds or counts them twice."""
+    now = [0.0]
+    saved: list[dict[str, Any]] = []
+
+    def save(state: dict[str, Any]) -> None:
+        now[0] += 1000.0
+        saved.append(state)
+
+    def goes_on() -> bool:
+        now[0] += 10_000.0
+        return fitted.step != 3
+
+    settings = ("3dgs", "train.iterations=10", "train.curve_points=5", "train.densify.stop=0")
+    for _ in range(2):  # the second training continues the first, which ends after three steps
+        fitted = with_fake_clock(trainer(*settings), now, monkeypatch)
+        if saved:
+            fitted.load_state_dict(saved[-1])
+        fitted.run(save, "square", goes_on)
+    assert fitted.step == 10
+    assert fitted.stages.seconds == pytest.approx({"loss": 20.0, "other": 10.0})
+    assert [(p.iteration, p.seconds) for p in fitted.curve.points] == [(n, 3.0 * n) for n in (2, 4, 6, 8, 10)]
+
+
+def test_every_hook_is_in_the_table_of_the_docs() -> None:
+    """Catches a hook that no page names."""
+    page = (ROOT / "docs/adding_a_training_option.md").read_text()
+    assert [hook.name for hook in hook_types() if f"`{hook.name}`" not in page] == []
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
+        ("train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
+        ("train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
+        ("train.coarse=[[2,3000],[4,15000]]", "factors falling and steps rising"),
+        ("train.coarse=[[1,3000]]", "expected pairs (factor above 1"),
+        ("train.coarse=[[]]", "expected pairs (factor above 1"),
+        ("train.coarse=[[4,3000,1]]", "expected pairs (factor above 1"),
+    ],
+)
+def test_faulty_schedules_are_refused(word: str, message: str) -> None:
+    """Catches a typo that trains by another rule than was asked for."""
+    with pytest.raises(InputError) as refused:
+        check_values(compose("3dgs", 100, word))
+    assert message in str(refused.value)

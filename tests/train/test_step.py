@@ -1,0 +1,139 @@
+"""The gradients of a step: a mean over views, sums of any number of threads, images in bytes, penalties."""
+
+import itertools
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from tiny_training import moving_square, trainer
+
+from gsbench.kernels.backends import AUTO, REFERENCE, Backend
+from gsbench.scenes.scene import View
+from gsbench.train.hooks.penalties import Penalties, PenaltiesConfig
+from gsbench.train.regularisers import PENALTIES
+from gsbench.train.step import Sums, ViewResult, add_up, deal
+
+
+def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Of the means, and of the 2D means as density control collected it; and the loss. All views are one view."""
+    square = moving_square()
+    fitted = trainer("3dgs", f"train.batch_size={batch}", scene=replace(square, train=square.train[:1] * 4))
+    means = fitted.model.splats["means"]
+    fitted.optimizer.step = lambda *_: None  # type: ignore[method-assign]
+    fitted.train_step()
+    assert means.grad is not None
+    return (
+        means.grad.clone(),
+        fitted.density.rule.gradient / fitted.density.rule.times_visible.clamp(min=1),
+        fitted.finite_check.loss,
+    )
+
+
+def test_a_batch_is_a_mean() -> None:
+    """Catches a loss summed over the batch, and a density gradient that is not scaled back to one view."""
+    single, four = gradient_of_a_step(1), gradient_of_a_step(4)
+    torch.testing.assert_close(four[0], single[0], rtol=1e-4, atol=1e-8)
+    torch.testing.assert_close(four[1], single[1], rtol=1e-4, atol=1e-8)
+    assert single[1].max() > 0
+    assert four[2] == pytest.approx(single[2], rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", [AUTO, REFERENCE], ids=lambda backend: backend.name)
+def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a step that makes floats of an image in 8 bits for the kernel, and other gradients by its bytes."""
+    square = moving_square()
+    in_bytes = [replace(view, pixels=(255 * view.image).round().to(torch.uint8)) for view in square.train]
+    gradients = []
+    for views in (in_bytes, [replace(view, pixels=view.image) for view in in_bytes]):
+        fitted = trainer("3dgs", scene=replace(square, train=views))
+        fitted.model.backend = backend
+        with monkeypatch.context() as patch:
+            patch.setattr(View, "image", property(lambda _: pytest.fail("a float copy")))
+            fitted.gradients(views[:2])
+        gradients.append([p.grad for p in fitted.model.splats.values()])
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+
+
+def summed(views: int, workers: int) -> torch.Tensor:
+    """The gradient of a batch of views; many numbers, since each order of sums rounds some of them its added way."""
+    bounds = [views * worker // workers for worker in range(workers + 1)]
+    each = torch.randn(views, 1000, generator=torch.Generator().manual_seed(views))
+    sums: list[Sums] = deal(views, bounds)
+    for added, value in zip(sums, each, strict=True):
+        added[0] = added[0] + value if 0 in added else value.clone()
+    return add_up(sums)[0]
+
+
+@pytest.mark.parametrize("views", range(1, 10))
+def test_any_number_of_workers_gives_the_same_bits(views: int) -> None:
+    """Catches views of one worker that are added to each other before those in front of them."""
+    sums = [summed(views, workers) for workers in range(1, views + 1)]
+    assert all(torch.equal(a, b) for a, b in itertools.pairwise(sums))
+
+
+def test_two_workers_hold_two_sums_and_one_view_has_one() -> None:
+    """Catches a gradient of the whole model for each view, which takes memory and time to zero, and an empty half."""
+    sums = deal(8, [0, 4, 8])
+    assert len({id(added) for added in sums}) == 2
+    assert sums[3] is sums[0]
+    assert sums[7] is sums[4]
+    only = deal(1, [0, 1])
+    only[0][5] = torch.ones(2)
+    assert add_up(only)[5] is only[0][5]
+
+
+def test_what_any_view_of_the_batch_saw_is_moved() -> None:
+    """Catches sparse_adam that moves what the last view saw alone, or the first."""
+    fitted = trainer("3dgs", "train.batch_size=3", "optim=sparse_adam")
+    N = len(fitted.model)
+    drawn = torch.zeros(3, 1, N, dtype=torch.bool)
+    for view in range(3):
+        drawn[view, 0, view] = True  # each view sees the Gaussian of its number
+    results = [ViewResult(torch.ones(()), of_view, torch.zeros(1, N, 2), {}) for of_view in drawn]
+    fitted.gradients = lambda *_: results  # type: ignore[assignment]
+    moved = []
+    fitted.optimizer.step = lambda _, drawn, __: moved.append(drawn)  # type: ignore[method-assign]
+    for step in (0, 1):
+        fitted.step = step
+        fitted.train_step()
+    assert all(drawn.tolist() == [True] * 3 + [False] * (N - 3) for drawn in moved)
+    assert len(moved) == 2
+
+
+def test_early_steps_see_small_images() -> None:
+    """Catches a resolution that is not the schedule's, a camera that does not shrink with its image, or its centre."""
+    fitted = trainer("3dgs", "train.coarse=[[2,15000]]", "train.batch_size=1")
+    looked: list[View] = []
+    real = fitted.gradients
+    fitted.gradients = lambda views, penalties: looked.extend(views) or real(views, penalties)  # type: ignore[assignment]
+    half = fitted.schedule.scaled(15_000)
+    for fitted.step in (0, half - 1, half):
+        fitted.train_step()
+    width = fitted.scene.train[0].camera.width
+    assert [view.camera.width for view in looked] == [width // 2] * 2 + [width]
+    small, full = looked[0], next(view for view in fitted.scene.train if view.name == looked[0].name)
+    assert list(small.image.shape[:2]) == [small.camera.height, small.camera.width]
+    torch.testing.assert_close(small.camera.K[:2], full.camera.K[:2] / 2)
+    torch.testing.assert_close(small.image[3, 5], full.image[6:8, 10:12].mean((0, 1)))
+    assert not fitted.batches._reduced, "small images that no later step needs"
+
+
+def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
+    """Catches a penalty that acts always or never, or that is added once for each view of a batch."""
+    words = ("train.batch_size=2", "train.penalties.opacity.weight=3.0", "train.penalties.opacity.start=15000")
+    plain, penalised = trainer("3dgs", "train.batch_size=2"), trainer("3dgs", *words)
+    start = penalised.schedule.scaled(15_000)
+    for step, acts in ((start - 2, False), (start - 1, True)):
+        gradients = []
+        for fitted in (plain, penalised):
+            views = fitted.scene.train[:2]
+            fitted.gradients(views, fitted.hook(Penalties).loss_terms(step, views))
+            gradients.append(fitted.model.splats["opacities"].grad)
+        opacities = torch.sigmoid(plain.model.splats["opacities"].detach())
+        expected = 3.0 * opacities * (1 - opacities) / len(opacities)
+        torch.testing.assert_close(gradients[1] - gradients[0], expected * acts, rtol=1e-3, atol=1e-7)
+
+
+def test_every_penalty_has_its_settings() -> None:
+    """Catches a penalty without a weight in the config, and a weight that nothing reads."""
+    assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
