@@ -17,7 +17,6 @@ from gsbench.config import CONF, Config
 from gsbench.config_key import Key, declared, described, extended, joins, key
 from gsbench.config_roles import facts, flat, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError
-from gsbench.gates.hook import GATES
 from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.run.checks import check_config
@@ -78,8 +77,7 @@ def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
 
 def test_facts_are_those_of_the_code() -> None:
     """Catches a choice that the code does not have, and one that is refused though it has it."""
-    choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "effects.gate": GATES,
-               "train.densify.kind": RULES, "model.gate": GATES}  # fmt: skip
+    choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "train.densify.kind": RULES}
     for name, known in choices.items():
         assert set(KEYS[name].choices) == set(known), name
     assert KEYS["train.curve_points"].high == MAX_POINTS

@@ -1,6 +1,10 @@
 """Test whether images that were taken from the same camera position change with time.
 
-Differences of exposure are removed first (gsbench.gates.exposure). Then there are two tests:
+Differences of exposure are removed first. The model of an image of a static scene is y = clip(a x + b). The colours x
+are the same for all images, and each image and channel has a gain a and an offset b. Gains and offsets are fitted by
+least absolute deviations (Schlossmacher 1973), so objects that move through less than half of the image are outliers
+and do not change the fit. x is the median of (y - b) / a over the images without saturated pixels, so x may exceed 1.
+The residuals are noise or a change of the scene. Then there are two tests:
 
 - Does anything change? Each block of pixels is divided into two halves by a chess-board pattern. Noise is independent
   in the two halves, so the product of their means is zero on average. For a change of the scene it is positive. The
@@ -18,8 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsbench.gates.exposure import LEVEL_8_BIT, changes
-from gsbench.gates.permutation_test import PERMUTATIONS, compare, slow_waves
+from gsbench.gates.permutation_test import PERMUTATIONS, Array, compare, slow_waves
 from gsbench.scenes import View
 
 LONG_SIDE = 100  # size of the compared images; every k-th pixel is taken, since noise of neighbours may be correlated
@@ -27,8 +30,16 @@ BLOCKS = 20  # number of blocks along the longer side
 FAR_ABOVE = 20.0  # a block changes if its energy is above this times that of noise
 MOST_VIEWS = 240  # largest number of images of all positions; of more images, evenly spaced ones are used
 LEAST_AT_A_PLACE = 3  # least number of images from a position; the statistic is the same for two images in any order
+LEVEL_8_BIT = 1 / 255
+ROUNDS = 3  # how often gain and offset are fitted and x is computed again
+REWEIGHTINGS = 8  # iterations of the least absolute deviations
+FIT_PIXELS = 500  # number of pixels that the fit uses
+LEAST_PIXELS = 16  # with fewer valid pixels nothing is fitted
+BLACK = 0.01  # relative weight of an added black pixel: if all other pixels are alike, only a gain is fitted
+GAINS = (0.25, 4.0)  # range of the gain
 
-Array = NDArray[np.float64]
+Pixels = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -74,7 +85,7 @@ def _spread(ordered: list[int], most: int, start: float) -> list[int]:
     return [ordered[int((i + start) * len(ordered) / most)] for i in range(most)]
 
 
-def _pixels(view: View) -> NDArray[np.float32]:
+def _pixels(view: View) -> Pixels:
     """Return every k-th pixel of a view's image, so that its longer side has at most LONG_SIDE pixels."""
     step = -(-max(view.pixels.shape[:2]) // LONG_SIDE)
     pixels = view.pixels[step // 2 :: step, step // 2 :: step]
@@ -82,8 +93,8 @@ def _pixels(view: View) -> NDArray[np.float32]:
 
 
 def _halves(
-    images: NDArray[np.float32],  # [n, H, W, 3]
-) -> NDArray[np.float32]:  # [2, n, B, 3]
+    images: Pixels,  # [n, H, W, 3]
+) -> Pixels:  # [2, n, B, 3]
     """Divide each block of pixels into two halves by a chess-board pattern, and return the mean of each half."""
     n, height, width, channels = images.shape
     side = min(max(2, max(height, width) // BLOCKS), height, width)
@@ -96,8 +107,8 @@ def _halves(
 
 
 def _is_changed(
-    halves: NDArray[np.float32],  # [2, n, B, 3], of mean zero over the n images
-) -> NDArray[np.bool_]:  # [B]
+    halves: Pixels,  # [2, n, B, 3], of mean zero over the n images
+) -> Mask:  # [B]
     """Return which blocks of pixels change over the images by more than 1/255 and by far more than their noise.
 
     Args:
@@ -131,3 +142,94 @@ def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, flo
         waves = waves[np.concatenate([np.arange(len(moment))[None], ranks])].transpose(0, 2, 1)  # [1 + P, WAVES, n]
         total += ((waves @ (matrix @ matrix.T)) * waves).sum((1, 2)) / energy
     return compare(float(total[0]), total[1:])
+
+
+def changes(
+    images: Pixels,  # [n, H, W, 3] of one camera place, in [0, 1]
+) -> Pixels:  # [n, H, W, 3]
+    """Return the difference of each image from the mean image, after gain and offset of the exposure were removed.
+
+    The images come from the same camera position. A difference of at most three standard deviations of the noise is set
+    to zero if the value that gain and offset predict is saturated.
+    """
+    n, height, width, channels = images.shape
+    y = np.ascontiguousarray(images.transpose(0, 3, 1, 2), np.float32).reshape(n, channels, -1)
+    full = y >= 1 - LEVEL_8_BIT / 2
+    saturated = full | (y <= LEVEL_8_BIT / 2)
+    a, b = np.ones((n, channels, 1), np.float32), np.zeros((n, channels, 1), np.float32)
+    x, dead = np.sort(y, 0)[(n - 1) // 2], LEVEL_8_BIT
+    few = _fit_pixels(saturated)
+    y_few = y[..., few]
+    for _ in range(ROUNDS):
+        expected = a * x[:, few] + b
+        use = ~saturated[..., few] & (expected > dead) & (expected < 1 - dead)
+        a, b = _fit(y_few, x[:, few], use)
+        left = np.abs(y_few - a * x[:, few] - b)[use]
+        dead = LEVEL_8_BIT + (3 * 1.4826 * float(np.median(left)) if left.size else 0.0)
+        x = _static_image((y - b) / a, saturated, full[0])
+    expected = np.clip(a * x + b, 0, 1)
+    left = y - expected
+    left[((expected < dead) | (expected > 1 - dead)) & (np.abs(left) < dead)] = 0
+    left -= left.mean(0)
+    return np.ascontiguousarray(left.reshape(n, channels, height, width).transpose(0, 2, 3, 1))
+
+
+def _fit_pixels(
+    saturated: Mask,  # [n, 3, P]
+) -> NDArray[np.int64]:
+    """Choose the pixels for the fit of exposure: FIT_PIXELS of all, and up to FIT_PIXELS that no image saturates."""
+    inside = np.flatnonzero((~saturated.any(0)).any(0))
+    spaced = [every[:: max(1, -(-len(every) // FIT_PIXELS))] for every in (inside, np.arange(saturated.shape[2]))]
+    return np.unique(np.concatenate(spaced))
+
+
+def _fit(
+    y: Pixels,  # [n, 3, P]
+    x: Pixels,  # [3, P]
+    use: Mask,  # [n, 3, P]
+) -> tuple[Pixels, Pixels]:
+    """Fit gains a and offsets b, [n, 3, 1], of y = a x + b to the pixels in `use`, for n images and 3 channels.
+
+    A black pixel (x = y = 0) with a small weight is added, so that an image of one shade determines only a gain.
+    """
+    number = use.sum(-1, keepdims=True)
+    enough = number >= LEAST_PIXELS
+    y, x = np.pad(y, ((0, 0), (0, 0), (0, 1))), np.pad(x, ((0, 0), (0, 1)))
+    weights = np.concatenate([use, BLACK * number], -1).astype(np.float32)
+    weight = weights
+    for _ in range(REWEIGHTINGS):
+        weight = weight / np.maximum(weight.sum(-1, keepdims=True), 1e-9)
+        mean = (weight * x).sum(-1, keepdims=True)
+        weighted = weight * (x - mean)
+        slope = (weighted * y).sum(-1, keepdims=True) / np.maximum((weighted * x).sum(-1, keepdims=True), 1e-9)
+        a = np.clip(slope, *GAINS)
+        b = (weight * y).sum(-1, keepdims=True) - a * mean
+        weight = weights / np.maximum(np.abs(y - a * x - b), np.float32(LEVEL_8_BIT))
+    return _shared(a, enough, 1), _shared(b, enough, 0)
+
+
+def _shared(
+    values: Pixels,  # [n, 3, 1]
+    enough: Mask,  # [n, 3, 1]
+    otherwise: float,
+) -> Pixels:
+    """Replace a gain or offset that was fitted to too few pixels by the mean over the image's other channels."""
+    number = enough.sum(1, keepdims=True)
+    mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
+    return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)
+
+
+def _static_image(
+    values: Pixels,  # [n, 3, P] (y - b) / a
+    saturated: Mask,  # [n, 3, P]
+    full: Mask,  # [3, P] where the first image is saturated, whether it is white and not black
+) -> Pixels:  # [3, P]
+    """Return for each pixel the median over n images of its unsaturated values.
+
+    A pixel that is saturated in all images gets its largest value if it is white, and its smallest value if it is
+    black.
+    """
+    ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
+    number = (~saturated).sum(0)
+    middle = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]
+    return np.where(number > 0, middle, np.where(full, values.max(0), values.min(0)))

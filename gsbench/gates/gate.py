@@ -1,18 +1,22 @@
-"""Choose a simplification for each Gaussian of a model, and apply it.
+"""Choose a simplification for each Gaussian of a model, and apply as many as a loss of PSNR allows.
 
 A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-removed. For each Gaussian, the rule chooses the simplification that minimises cost + lambda error. The cost is the
-rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared error
-(gsbench.gates.sensitivity). lambda is the same for all Gaussians. It is chosen so that the errors add up to a given
-bound.
+removed. For each Gaussian i, the rule takes the simplification s that minimises cost(i, s) + lambda error(i, s). The
+cost is the rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared
+error (gsbench.gates.sensitivity). lambda is the same for all Gaussians.
 """
 
+import copy
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gsbench.gates.sensitivity import Sensitivity
+from gsbench.measure.exact_views import decides
+from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
 from gsbench.models.appearance import MOST_PACKED, at_most, order_of
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
@@ -28,34 +32,94 @@ COLORING = (13.0, 19.0, 23.0, 28.0)  # by SH degree, for each frequency of time
 LESS_TO_READ = 1.0  # saved if a Gaussian depends on only one of time and direction: it has fewer parameters to read
 BITS = {"time": TIME, "direction": DIRECTION}
 BISECTIONS = 32
+SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # shares of the squared error, tried in this order
+MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the allowed one: few views may underestimate it
 
 
 @dataclass(frozen=True)
 class ChosenSimplifications:
-    """Hold the simplification that was chosen for each Gaussian, such as independent of time, and the total error."""
+    """The simplification that was chosen for each Gaussian."""
 
     geometry: dict[str, Tensor]  # for each simplification by name: which Gaussians it is chosen for, [N] bool
     orders: Tensor  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`
     predicted: float  # predicted squared error that is added, as a share of the model's squared error
 
 
-def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
-    """Choose a simplification for each Gaussian so that the predicted errors add up to at most a given bound.
+@dataclass(frozen=True)
+class GatedCopy:
+    """A simplified copy of a model."""
 
-    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-    removed.
+    model: GatedModel
+    gate: Gate  # the decisions and measurements, for record.json
+    rows: Tensor  # [M] the index of each Gaussian in the former model
+    changed: Tensor  # [M] bool: whether the Gaussian was simplified
 
-    For Gaussian i, the simplification s minimises cost(i, s) + lambda error(i, s). The cost is the Gaussian's rendering
-    time in a frame (COSTS, COLORING), and the error is the predicted growth of the images' squared error. Bisection
-    finds the smallest lambda for which the errors stay within the bound.
+
+def gate_within(
+    model: GatedModel,
+    sensitivity: Sensitivity,
+    budget_db: float,
+    measure: Callable[[GaussianModel], float],
+    intervals: Tensor | None = None,  # [N, 2]
+) -> GatedCopy | None:
+    """Simplify as many Gaussians as the allowed loss of PSNR permits.
+
+    For each share in SHARES, from the largest, the function simplifies a copy of the model until the predicted errors
+    add up to this share of the model's squared error. It returns the first copy whose measured loss of PSNR is allowed,
+    or None. PSNR cannot decide, and the result is None, if it is capped in every view or not a number.
 
     Args:
+        model: the model, which does not change.
         sensitivity: the predicted error of each simplification of each Gaussian.
-        model: the model for which the errors were predicted.
+        budget_db: the largest allowed loss of PSNR, dB.
+        measure: returns the PSNR of a model in dB, on views that were not used for `sensitivity`.
+        intervals: the first and the last time at which AGR changes each Gaussian.
+    """
+    before = measure(model)
+    if not decides(before):
+        return None
+    for share in SHARES:
+        if _loss_db(share) > MOST_PREDICTED * budget_db:
+            continue
+        gated = copy.deepcopy(model)
+        choice = choose(sensitivity, gated, share)
+        rows, changed = apply(gated, sensitivity, choice, intervals)
+        loss = before - measure(gated)
+        if loss <= budget_db and len(gated):
+            counts = gated.count_by_effects() | {"removed": len(model) - len(gated)}
+            gate = Gate(share, _loss_db(choice.predicted), loss, counts, _count_by_order(gated),
+                        bytes_before=model.stored_bytes(), bytes=gated.stored_bytes())  # fmt: skip
+            return GatedCopy(gated, gate, rows, changed)
+    return None
+
+
+def _loss_db(share: float) -> float:
+    """Return the loss of PSNR if the squared error grows by a share of itself, dB."""
+    return 10 * math.log10(1 + share)
+
+
+def _count_by_order(model: GaussianModel) -> dict[str, int]:
+    """Count the Gaussians by the SH degree of the colour, and in 4DGS by the colour's number of frequencies in time."""
+    if model.effect_sets is None or model.effect_sets.orders is None:
+        return {}
+    values, counts = torch.unique(model.effect_sets.orders, return_counts=True)
+    orders = map(order_of, values.tolist())
+    names = [f"degree {order.degree}" + (f", {order.waves} waves" if order.waves > 1 else "") for order in orders]
+    return dict(zip(names, counts.tolist(), strict=True))
+
+
+def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
+    """Choose a simplification for each Gaussian so that the predicted errors add up to at most a bound.
+
+    Bisection finds the smallest lambda for which the errors stay within the bound.
+
+    Args:
+        sensitivity: the predicted error of each simplification of each Gaussian of the model.
+        model: the model, which does not change.
         budget: the bound, as a share of the model's squared error. For example 0.01 is a loss of 0.043 dB of PSNR.
     """
     now = effect_sets_of(model)
-    live = _live_cost(model, now)
+    live = _geometry_cost(model, now)
     none = torch.zeros_like(live)
     ways, errors = sensitivity.simplifications, sensitivity.errors
     geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.order is None}
@@ -66,10 +130,10 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     assert now.orders is not None
     orders = torch.stack([now.orders] + [at_most(now.orders, way.order) for way in ways if way.order is not None])
     hues = torch.stack([none] + [errors[way.name] for way in ways if way.order is not None])
-    shading = _shading(orders)
+    shading = _color_cost(orders)
 
-    def decide(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each Gaussian's best simplification (such as no time) and its error, if lambda weights the errors."""
+    def best(price: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the indices of each Gaussian's best form and colour order, and its error, if lambda is `price`."""
         shade, hue = (shading + price * hues).min(0)
         _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
         error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
@@ -78,19 +142,29 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     low, high = -60.0, 60.0  # bounds of log2(lambda)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        within = float(decide(2.0**middle)[2].sum()) <= budget * sensitivity.total
+        within = float(best(2.0**middle)[2].sum()) <= budget * sensitivity.total
         low, high = (low, middle) if within else (middle, high)
-    form, hue, error = decide(2.0**high)
+    form, hue, error = best(2.0**high)
     chosen = {name: form == i for i, name in enumerate(geometry)}
-    return ChosenSimplifications(
-        chosen, orders.gather(0, hue[None])[0], float(error.sum()) / max(sensitivity.total, 1e-300)
-    )
+    predicted = float(error.sum()) / max(sensitivity.total, 1e-300)
+    return ChosenSimplifications(chosen, orders.gather(0, hue[None])[0], predicted)
 
 
-def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
-    """Return the nanoseconds that conditioning and AGR (a network) take for each Gaussian in a frame, [N]."""
-    like = model.splats["opacities"].detach()
-    cost = torch.full_like(like, COSTS[STATIC])
+def cost_of(model: GaussianModel) -> Tensor:
+    """Return the nanoseconds that conditioning, AGR and colour take for each Gaussian in a frame, [N]."""
+    now = effect_sets_of(model)
+    assert now.orders is not None
+    return _geometry_cost(model, now) + _color_cost(now.orders)
+
+
+def most_cost(model: GaussianModel) -> float:
+    """Return the nanoseconds that a Gaussian with conditioning, AGR and full SH degree takes in a frame."""
+    return REFINING + SLICING + float(_color_cost(torch.tensor(model.full_order())))
+
+
+def _geometry_cost(model: GaussianModel, now: EffectSets) -> Tensor:
+    """Return the nanoseconds that conditioning and AGR take for each Gaussian in a frame, [N]."""
+    cost = torch.full_like(model.splats["opacities"].detach(), COSTS[STATIC])
     cost[: now.conditioned] = SLICING
     assert now.frozen is not None
     cost -= LESS_TO_READ * (now.frozen > 0)
@@ -98,26 +172,14 @@ def _live_cost(model: GaussianModel, now: EffectSets) -> Tensor:
     return cost
 
 
-def cost_of(model: GaussianModel) -> Tensor:
-    """Return the nanoseconds that conditioning, AGR (a network) and colour take for each Gaussian in a frame, [N]."""
-    now = effect_sets_of(model)
-    assert now.orders is not None
-    return _live_cost(model, now) + _shading(now.orders)
-
-
-def most_cost(model: GaussianModel) -> float:
-    """Return the nanoseconds that a Gaussian with conditioning, AGR (a network) and full SH degree takes in a frame."""
-    return REFINING + SLICING + float(_shading(torch.tensor(model.full_order())))
-
-
-def _shading(orders: Tensor) -> Tensor:
+def _color_cost(orders: Tensor) -> Tensor:
     """Return the nanoseconds to evaluate colours with the SH degrees and frequencies in time that `orders` encodes."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return what each Gaussian of a model depends on: time, direction, AGR (neural refinement), and its SH degree."""
+    """Return what each Gaussian of a model depends on, with no part of it None, but for `intervals`."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
@@ -136,9 +198,6 @@ def apply(
 ) -> tuple[Tensor, Tensor]:
     """Simplify each Gaussian of a model as chosen, and sort the Gaussians by what they still depend on.
 
-    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-    removed.
-
     Args:
         model: the model, which is changed in place.
         sensitivity: the parameters of each simplified Gaussian.
@@ -151,12 +210,12 @@ def apply(
     now = effect_sets_of(model)
     assert now.orders is not None
     assert now.frozen is not None
-    for simplification in sensitivity.simplifications:
-        if simplification.raw is None:
+    for way in sensitivity.simplifications:
+        if way.raw is None:
             continue
-        rows = choice.geometry[simplification.name] if simplification.order is None else (
-            (choice.orders != now.orders) & (choice.orders == at_most(now.orders, simplification.order)))  # fmt: skip
-        for key, value in simplification.raw.items():
+        rows = choice.geometry[way.name] if way.order is None else (
+            (choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order)))  # fmt: skip
+        for key, value in way.raw.items():
             model.splats[key].data[rows] = value[rows]
     place = torch.arange(len(model), device=now.orders.device)
     refined, static = place < now.refined, place >= now.conditioned
@@ -181,11 +240,10 @@ def apply(
     rows = order[~choice.geometry[REMOVED][order]]
     changed = (~choice.geometry[LIVE] | (choice.orders != now.orders))[rows]
     model.select(rows)
-    counts = [int((kind[rows] <= most).sum()) for most in (0, 1)]
-    own = now.intervals if intervals is None else intervals
-    own = None if own is None else own[rows[: counts[0]]].contiguous()
-    model.effect_sets = EffectSets(
-        counts[0], counts[1], choice.orders[rows].contiguous(), frozen[rows].contiguous(), own
-    )
+    n_refined, n_conditioned = (int((kind[rows] <= most).sum()) for most in (0, 1))
+    active = now.intervals if intervals is None else intervals
+    active = None if active is None else active[rows[:n_refined]].contiguous()
+    orders, frozen = choice.orders[rows].contiguous(), frozen[rows].contiguous()
+    model.effect_sets = EffectSets(n_refined, n_conditioned, orders, frozen, active)
     model.fill(model.effect_sets)
     return rows, changed

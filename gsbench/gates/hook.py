@@ -1,11 +1,12 @@
-"""Make Gaussians independent of time, direction or AGR (a network) if the images hardly change.
+"""Simplify Gaussians once after densification and once at the end of a training, if the images hardly change.
 
-This is done once after densification and once at the end of a training.
-The first simplification makes the rest of the training faster.
+A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
+removed. The first simplification makes the rest of the training faster.
 """
 
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,22 +14,21 @@ import torch
 from torch import Tensor
 
 from gsbench.config import Config
-from gsbench.errors import InputError, did_you_mean
-from gsbench.gates.budget import gate_within
-from gsbench.gates.direction import share_with_direction, without_direction
-from gsbench.gates.sensitivity import MOST_VIEWS, probe
-from gsbench.gates.visible import seen_times, share_asleep
+from gsbench.errors import InputError
+from gsbench.gates.gate import effect_sets_of, gate_within
+from gsbench.gates.sensitivity import MOST_VIEWS, probe, share_asleep, visible_times
 from gsbench.measure.exact_views import decides
+from gsbench.measure.quality import evenly
 from gsbench.measure.record import Direction, Gate
 from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
-from gsbench.models import GaussianModel
-from gsbench.models.effect_sets import EffectSets
-from gsbench.models.gated import as_gated
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.effect_sets import DIRECTION, EffectSets
+from gsbench.models.gated import as_gated, has_gates
+from gsbench.models.simplifications import STATIC, shares_of
 from gsbench.scenes import View
 from gsbench.train.hooks import Hook, Training
 
-GATES = ("off", "end", "both")
 # Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
 # largest losses from which the rest of the training recovers on every scene tried (docs/effects.md).
 LOSS_IN_TRAINING = 0.1
@@ -43,23 +43,23 @@ LAST_RATE = 0.1
 HELD_OUT = 8  # every 8th training view is held out to check PSNR, if the scene has no val split
 FEW = 12  # with fewer training views than this, none is held out
 
-Shape = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters, and the effects of each Gaussian
+GaussiansAndEffects = tuple[dict[str, Tensor], EffectSets | None]  # raw parameters, and the effects of each Gaussian
 
 
-def shape_of(model: GaussianModel) -> Shape:
+def gaussians_of(model: GaussianModel) -> GaussiansAndEffects:
     """Return the parameters of a model's Gaussians and what each depends on; `become` restores them."""
     return {name: x.data for name, x in model.splats.items()}, model.effect_sets
 
 
-def become(model: GaussianModel, shape: Shape) -> None:
-    """Replace the Gaussians of a model by those that `shape_of` returned for it or for another model."""
-    for name, value in shape[0].items():
+def become(model: GaussianModel, gaussians: GaussiansAndEffects) -> None:
+    """Replace the Gaussians of a model by those that `gaussians_of` returned for it or for another model."""
+    for name, value in gaussians[0].items():
         model.splats[name].data = value
-    model.effect_sets = shape[1]
+    model.effect_sets = gaussians[1]
 
 
 class Gating(Hook):
-    """Simplify Gaussians in a training: make them independent of time, direction or AGR (the neural refinement)."""
+    """Simplify Gaussians as `effects.gate` asks, and record what it changed."""
 
     name = "gates"
 
@@ -72,23 +72,15 @@ class Gating(Hook):
         self.direction: Direction | None = None
         scene = training.scene
         self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
-        if not scene.val or self.config.scene.eval_split == "val":
-            self.checked_on = "held-out training views"
-            if len(scene.train) < FEW:
-                self.checked_on = "the training views"
-                self.checked = scene.train
-                self.notes.append(f"{len(scene.train)} training views and no val split: the gate is checked on the "
-                                  f"training views, which says little")  # fmt: skip
-            else:
-                self.checked = scene.train[::HELD_OUT]
-                self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
-
-    @classmethod
-    def check(cls, config: Config) -> None:
-        """Raise InputError if `effects.gate` is not known."""
-        if config.effects.gate not in GATES:
-            raise InputError(f"effects.gate '{config.effects.gate}' is not known. "
-                             f"{did_you_mean(config.effects.gate, GATES)}")  # fmt: skip
+        if scene.val and self.config.scene.eval_split != "val":
+            return
+        if len(scene.train) < FEW:
+            self.checked, self.checked_on = scene.train, "the training views"
+            self.notes.append(f"{len(scene.train)} training views and no val split: the gate is checked on the "
+                              f"training views, which says little")  # fmt: skip
+        else:
+            self.checked, self.checked_on = scene.train[::HELD_OUT], "held-out training views"
+            self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
 
     @classmethod
     def check_model(cls, model: GaussianModel, config: Config) -> None:
@@ -97,10 +89,17 @@ class Gating(Hook):
             as_gated(model)
 
     def after_density(self, step: int) -> None:
-        """Simplify Gaussians once after densification, if `effects.gate=both`."""
-        if self.config.effects.gate == "both" and self.training.schedule.gates(step):
-            with self.training.stages("gate"):
-                self.in_training(step + 1)
+        """Simplify Gaussians once after densification, if `effects.gate=both`, unless the model has few Gaussians."""
+        if self.config.effects.gate != "both" or not self.training.schedule.gates(step):
+            return
+        with self.training.stages("gate"):
+            if len(self.model) < LEAST_IN_TRAINING:
+                self.notes.append(f"at step {step + 1} the model has {len(self.model)} Gaussians: of fewer than "
+                                  f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
+                return
+            most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
+            # Static Gaussians do not learn unused parameters. Those independent of only time or direction would.
+            self.simplify(step + 1, most, VIEWS_IN_TRAINING, by_halves=False)
 
     def at_end(self) -> None:
         """Simplify Gaussians after the training, unless `effects.gate=off`."""
@@ -118,55 +117,10 @@ class Gating(Hook):
         """
         training = self.training
         self.model.set_active(training.schedule.active(training.step - 1))
-        ungated = shape_of(self.model)
+        before = gaussians_of(self.model)
         with training.effort, training.stages("gate"):
             self.simplify(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
-        self.compare(ungated, training.views)
-
-    def in_training(self, step: int) -> None:
-        """Simplify Gaussians before a step, unless the model has few or PSNR on val would fall too much."""
-        if len(self.model) < LEAST_IN_TRAINING:
-            self.notes.append(f"at step {step} the model has {len(self.model)} Gaussians: of fewer than "
-                              f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
-            return
-        most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
-        # Static Gaussians do not learn unused parameters. Those that are independent of only time or direction would.
-        self.simplify(step, most, VIEWS_IN_TRAINING, by_halves=False)
-
-    def rate_factors(self, step: int) -> dict[str, float]:
-        """Return the factor of the learning rate of AGR, the neural refinement, at a step.
-
-        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
-        """
-        if not self.gates or self.gates[0].step is None:
-            return {}
-        begun, iterations = self.gates[0].step, self.config.train.iterations
-        return {"refinement": float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))}
-
-    def compare(self, ungated: Shape, views: list[View]) -> None:
-        """Measure how PSNR and frame time changed at the end, and how they would change without any direction.
-
-        Args:
-            ungated: the Gaussians before the gate at the end, from `shape_of`.
-            views: the views (test or val) on which results are measured.
-        """
-        if self.gates and self.gates[-1].step is None:
-            before = copy.deepcopy(self.model)
-            become(before, ungated)
-            loss, times = self._beside(before, self.model, views)
-            self.gates[-1] = replace(self.gates[-1], eval_loss_db=loss, frame_ms_before=times[0], frame_ms=times[1])
-        frozen = without_direction(self.model, self.probed)
-        if frozen is not None:
-            loss, times = self._beside(self.model, frozen, views)
-            self.direction = Direction(share_with_direction(self.model), loss, *times)
-
-    def _beside(self, model: GaussianModel, other: GaussianModel, views: list[View]) -> tuple[float, list[float]]:
-        """Return by how many dB PSNR is lower with `other` than with `model`, and the median frame times, ms."""
-        count = max(self.config.protocol.renders, len(views))
-        frames = [lambda i, shown=shown: self.renderer.image(shown, views[i % len(views)]) for shown in (model, other)]
-        times = time_in_turns(frames, count, synchroniser(self.config.device))
-        psnr = self.renderer.psnr
-        return psnr(model, views) - psnr(other, views), [frame.p50 for frame in times]
+        self.compare(before, training.views)
 
     @torch.no_grad()
     def simplify(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
@@ -179,39 +133,100 @@ class Gating(Hook):
             by_halves: whether a Gaussian may become independent of only one of time and direction.
         """
         started = time.perf_counter()
-        model, at_end = as_gated(self.model), step is None
+        model, when = as_gated(self.model), "at the end" if step is None else f"at step {step}"
         # In training AGR changes Gaussians at all times, because the times at which they are visible still change.
-        intervals = seen_times(model, self.probed) if at_end else None
+        intervals = visible_times(model, self.probed) if step is None else None
         hidden = None if intervals is None else intervals[:, 0].isinf()
         sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
-                         antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
-        gated = gate_within(
-            model, sensitivity, budget_db, lambda tried: self.renderer.psnr(tried, self.checked), intervals
-        )
+                            antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
+        gated = gate_within(model, sensitivity, budget_db, lambda x: self.renderer.psnr(x, self.checked), intervals)
         if gated is None:
-            when, before = "at the end" if at_end else f"at step {step}", self.renderer.psnr(model, self.checked)
+            before = self.renderer.psnr(model, self.checked)
             self.notes.append(
                 f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}" if decides(before) else
                 f"{when} nothing was simplified: a PSNR of {before:.0f} dB on {self.checked_on} cannot show a loss"
             )  # fmt: skip
             return
-        become(self.model, shape_of(gated.model))
+        become(self.model, gaussians_of(gated.model))
         self.training.rows.moved(gated.rows, gated.changed)
         seconds = time.perf_counter() - started
         self.gates.append(replace(gated.gate, step=step, checked_on=self.checked_on, seconds=seconds,
                                   asleep=share_asleep(self.model, self.probed)))  # fmt: skip
 
+    def rate_factors(self, step: int) -> dict[str, float]:
+        """Return the factor of the learning rate of AGR at a step.
+
+        The factor is 1 until Gaussians are simplified in training. Then it falls log-linearly to LAST_RATE at the end.
+        """
+        if not self.gates or self.gates[0].step is None:
+            return {}
+        begun, iterations = self.gates[0].step, self.config.train.iterations
+        return {"refinement": float(LAST_RATE ** (max(0, step - begun) / max(1, iterations - begun)))}
+
+    def compare(self, ungated: GaussiansAndEffects, views: list[View]) -> None:
+        """Measure how PSNR and frame time changed at the end, and how they would change without any direction.
+
+        Args:
+            ungated: the Gaussians before the gate at the end.
+            views: the views (test or val) on which results are measured.
+        """
+        if self.gates and self.gates[-1].step is None:
+            before = copy.deepcopy(self.model)
+            become(before, ungated)
+            loss, times = self._compare_models(before, self.model, views)
+            self.gates[-1] = replace(self.gates[-1], eval_loss_db=loss, frame_ms_before=times[0], frame_ms=times[1])
+        frozen = without_direction(self.model, self.probed)
+        if frozen is not None:
+            loss, times = self._compare_models(self.model, frozen, views)
+            self.direction = Direction(share_with_direction(self.model), loss, *times)
+
+    def _compare_models(
+        self, model: GaussianModel, other: GaussianModel, views: list[View]
+    ) -> tuple[float, list[float]]:
+        """Return by how many dB PSNR is lower with `other` than with `model`, and the median frame times, ms."""
+        count = max(self.config.protocol.renders, len(views))
+        frames = [lambda i, shown=shown: self.renderer.image(shown, views[i % len(views)]) for shown in (model, other)]
+        times = time_in_turns(frames, count, synchroniser(self.config.device))
+        psnr = self.renderer.psnr
+        return psnr(model, views) - psnr(other, views), [frame.p50 for frame in times]
+
     def state_dict(self) -> dict[str, Any]:
-        """Return what was simplified, and how PSNR and frame time changed."""
         direction = asdict(self.direction) if self.direction else None
         return {"gates": [asdict(gate) for gate in self.gates], "notes": list(self.notes), "direction": direction}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`; raise InputError if it is damaged."""
-        gates, notes = state["gates"], state["notes"]
+        gates, notes, direction = state["gates"], state["notes"], state["direction"]
         if not isinstance(gates, list) or not isinstance(notes, list) or not all(isinstance(x, str) for x in notes):
             raise InputError("checkpoint: expected lists of gates and notes")
         self.gates = [parse(Gate, gate, "checkpoint: gate") for gate in gates]
         self.notes = notes
-        direction = state["direction"]
         self.direction = parse(Direction, direction, "checkpoint: direction") if direction is not None else None
+
+
+@torch.no_grad()
+def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
+    """Return a copy of a model whose means and opacities ignore the view direction; None for a model without direction.
+
+    Direction is replaced by its mean over the training views. AGR, the dependence on time and the SH coefficients of
+    the colours stay.
+    """
+    if not has_gates(model) or "direction" not in model.observes:
+        return None
+    queries = [CameraTime.of(view.camera, view.time) for view in evenly(views, MOST_VIEWS)]
+    weights = shares_of([model.slice(query).opacities for query in queries])
+    frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
+    changed = copy.deepcopy(model)
+    name = "direction" if "direction" in frozen else STATIC
+    for key, value in frozen[name].items():
+        if key != "directions":  # these stay, because they are inputs of AGR
+            changed.splats[key].data = value.clone()
+    if name == STATIC:
+        changed.effect_sets = effect_sets_of(model)._replace(refined=0, conditioned=0, intervals=None)
+    return changed
+
+
+def share_with_direction(model: GaussianModel) -> float:
+    """Return the share of a model's Gaussians whose mean or opacity depends on the view direction."""
+    effect_sets = effect_sets_of(model)
+    assert effect_sets.frozen is not None
+    return float((effect_sets.frozen[: effect_sets.conditioned] & DIRECTION == 0).sum()) / max(1, len(model))

@@ -19,6 +19,7 @@ The last two cases are mixed with the weights w and 1 - w. Here w = exp(-d^2 / 4
 at a distance of d standard deviations.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.tape import Tape
 from gsbench.measure.quality import evenly
 from gsbench.models import CameraTime, GaussianModel
@@ -36,23 +38,19 @@ from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import REMOVED, Simplification, simplifications_of
 from gsbench.process.workers import side_by_side
-from gsbench.scenes import Camera, View
+from gsbench.scenes import View
 
 MOST_VIEWS = 60  # largest number of views; of more views, evenly spaced ones are used
 THIN = 0.02  # largest opacity of the simplified Gaussians that are rendered together with the present ones
 # The share of a transparent Gaussian's change that an opaque Gaussian at the same position hides. The root of the
 # integral of r^2 g^2 (1 - g)^2 over that of r^2 g^2 is 0.6 = 1 - HIDDEN for g = exp(-r^2 / 2).
 HIDDEN = 0.4
-OPACITY, COLOR = 12, slice(13, 16)  # columns of `_rows_of`
+OPACITY, COLOR = 12, slice(13, 16)  # columns of `_matrix_of`
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Hold the predicted growth of the images' squared error if a Gaussian is simplified, for each Gaussian.
-
-    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-    removed.
-    """
+    """The predicted growth of the images' squared error if a Gaussian is simplified, for each Gaussian."""
 
     simplifications: list[Simplification]
     errors: dict[str, Tensor]  # for each simplification by name: [N], summed over pixels, channels and views
@@ -63,7 +61,7 @@ class Sensitivity:
 def probe(
     model: GatedModel,
     views: Sequence[View],
-    background: Tensor,
+    background: Tensor,  # [3]
     *,
     seed: int = 0,
     most: int = MOST_VIEWS,
@@ -74,13 +72,10 @@ def probe(
 ) -> Sensitivity:
     """Predict how much the squared error of training views grows if a Gaussian is simplified, for each Gaussian.
 
-    A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-    removed.
-
     Args:
         model: the model, trained or in training.
         views: the training views.
-        background: the background colour, [3].
+        background: the background colour.
         seed: the seed of the random images g, which have the values 1 and -1.
         most: the largest number of views that are used, evenly spaced.
         draws: the number of random images g for each view; more draws reduce the variance.
@@ -88,142 +83,153 @@ def probe(
         by_halves: whether to include Gaussians that are independent of only one of time and direction.
         hidden: which Gaussians no training view shows.
     """
-    looked_at = evenly(views, most)
-    queries = [CameraTime.of(view.camera, view.time) for view in looked_at]
+    used = evenly(views, most)
+    queries = [CameraTime.of(view.camera, view.time) for view in used]
     workers = model.backend.workers(model.splats["means"])
-    seen = list(side_by_side(model.slice, queries, workers))
-    simplifications = simplifications_of(model, queries, seen, by_halves)
+    slices = list(side_by_side(model.slice, queries, workers))
+    simplifications = simplifications_of(model, queries, slices, by_halves)
     random = torch.Generator().manual_seed(seed)
-    seeds = torch.randint(2**62, (len(looked_at),), generator=random).tolist()
+    seeds = torch.randint(2**62, (len(used),), generator=random).tolist()
 
     def errors_in(v: int) -> tuple[float, list[Tensor]]:
         """Return the squared error of view `v`, and its growth by each simplification of each Gaussian."""
-        view = looked_at[v]
-        drawing = ViewRasterizer(model, view.camera, background, antialias)
-        here = drawing(seen[v])
-        residual = here.image - view.image
-        own = torch.Generator().manual_seed(seeds[v])
-        signs = [torch.randint(0, 2, residual.shape, generator=own).to(residual) * 2 - 1 for _ in range(draws)]
-        vectors = [residual, *signs]
-        products = here.products(vectors)
-        removed = -products[..., OPACITY] * seen[v].opacities
-        place = Place(model, queries[v], seen[v], _rows_of(seen[v]), here, products, vectors, removed)
-        return float(residual.square().sum()), [_error(one, place, drawing) for one in simplifications]
+        probed = ProbedView(model, used[v], queries[v], slices[v], background, antialias, draws, seeds[v])
+        return probed.squared_error, [probed.growth(simplification) for simplification in simplifications]
 
-    errors, total = {one.name: torch.zeros_like(seen[0].opacities) for one in simplifications}, 0.0
-    for squared, added in side_by_side(errors_in, range(len(looked_at)), workers):
+    errors, total = {way.name: torch.zeros_like(slices[0].opacities) for way in simplifications}, 0.0
+    for squared, added in side_by_side(errors_in, range(len(used)), workers):
         total += squared
         for simplification, error in zip(simplifications, added, strict=True):
             errors[simplification.name] += error
-    if len(looked_at) < len(views):  # a Gaussian that none of these views shows must not be simplified
+    if len(used) < len(views):  # a Gaussian that none of these views shows must not be simplified
         unknown = (errors[REMOVED] == 0) if hidden is None else (errors[REMOVED] == 0) & ~hidden
         errors = {name: torch.where(unknown, math.inf, error) for name, error in errors.items()}
     return Sensitivity(simplifications, errors, total)
 
 
 class Drawn(NamedTuple):
-    """Hold a rendered image, its 3D Gaussians, and the recorded kernel calls (tape) for backward passes."""
+    """A rendered image, its 3D Gaussians, and the recorded kernel calls for backward passes."""
 
-    at: Gaussians3D  # the 3D Gaussians
-    tape: Tape  # the operations of the rendering, for the backward pass
+    at: Gaussians3D
+    tape: Tape
     images: Tensor  # [1, H, W, 3]
     means2d: Tensor  # [N, 2] pixels
     radii: Tensor  # [N] pixels, three standard deviations; 0 for a culled Gaussian
 
-    @property
-    def image(self) -> Tensor:
-        """The rendered image [H, W, 3], without a gradient."""
-        return self.images[0].detach()
-
-    def products(self, vectors: list[Tensor]) -> Tensor:
-        """Return gradients of K products <image, vector> with respect to the Gaussians, [K, N, 16].
-
-        The 16 numbers of a Gaussian are mean, covariance factor, opacity and colour.
-        """
-        found = []
+    def products(self, vectors: list[Tensor]) -> Tensor:  # [K, N, 16]
+        """Return gradients of K products <image, vector> with respect to the Gaussians, as in `_matrix_of`."""
+        rows = []
         for vector in vectors:
             sums: dict[int, Tensor] = {}
             self.tape.backward(self.images, vector[None], tensors_of(self.at), sums)
-            found.append(_rows_of(Gaussians3D(*(sums[id(x)] for x in tensors_of(self.at)))))
-        return torch.stack(found)
+            rows.append(_matrix_of(Gaussians3D(*(sums[id(x)] for x in tensors_of(self.at)))))
+        return torch.stack(rows)
 
 
-class ViewRasterizer(NamedTuple):
-    """Rasterize 3D Gaussians for one camera, and record the kernel calls for backward passes."""
+class ProbedView:
+    """A view, its image by the present model, and the derivatives from which errors are predicted."""
 
-    model: GaussianModel
-    camera: Camera
-    background: Tensor
-    antialias: bool
+    def __init__(
+        self, model: GaussianModel, view: View, query: CameraTime, live: Gaussians3D, background: Tensor,
+        antialias: bool, draws: int, seed: int,
+    ) -> None:  # fmt: skip
+        """Draw the present Gaussians `live` of a view, and compute their scalar products; see `probe`."""
+        self.model, self.query, self.live = model, query, live
+        self.camera, self.background, self.antialias = view.camera, background, antialias
+        self.matrix, self.drawn = _matrix_of(live), self._draw(live)
+        residual = self.drawn.images[0].detach() - view.image
+        random = torch.Generator().manual_seed(seed)
+        signs = [torch.randint(0, 2, residual.shape, generator=random).to(residual) * 2 - 1 for _ in range(draws)]
+        self.vectors = [residual, *signs]  # K images [H, W, 3]: the residual r, then random signs g
+        self.products = self.drawn.products(self.vectors)
+        self.removed = -self.products[..., OPACITY] * live.opacities  # [K, N] <x, vector> of a removal
+        self.squared_error = float(residual.square().sum())
 
     @torch.enable_grad()
-    def __call__(self, gaussians: Gaussians3D) -> Drawn:
-        """Rasterize 3D Gaussians for the camera; return the image and the recorded kernel calls for backward passes."""
+    def _draw(self, gaussians: Gaussians3D) -> Drawn:
         at = Gaussians3D(*(x.detach().requires_grad_() for x in tensors_of(gaussians)))
         with Tape() as tape:
             output = rasterize_slice(at, self.camera, self.background, self.model.backend, self.antialias)
         return Drawn(at, tape, output.image, output.info.means2d[0].detach(), output.info.radii[0])
 
-
-class Place(NamedTuple):
-    """Hold a model's 3D Gaussians in one view, their image, and the derivatives from which errors are predicted."""
-
-    model: GaussianModel
-    query: CameraTime
-    live: Gaussians3D  # the present slice
-    rows: Tensor  # [N, 16], `live` as one matrix
-    drawn: Drawn  # the image of `live`
-    products: Tensor  # [K, N, 16] gradients of <image, vector>
-    vectors: list[Tensor]  # K images [H, W, 3]: the residual r, then random signs g
-    removed: Tensor  # [K, N] <x, vector> for the change x of the image by the removal of a Gaussian
-
-
-def _error(simplification: Simplification, here: Place, draw: ViewRasterizer) -> Tensor:
-    """Predict how much the squared error of one view grows if a Gaussian is simplified, for each Gaussian, [N].
-
-    Args:
-        simplification: the parameters of the simplified Gaussians.
-        here: the present 3D Gaussians and image of the view.
-        draw: the rasterizer of the view.
-    """
-    model, live = here.model, here.live
-    if simplification.raw is None:
-        return _grown(here.removed)
-    raw = dict(model.splats.items()) | simplification.raw
-    if simplification.order is not None:
-        colors = model.shade(raw, live.means, live.opacities, here.query)
-        return _grown((here.products[..., COLOR] * (colors - live.colors)).sum(-1))
-    whole = model.colored(model.slice_geometry(raw, here.query), raw, here.query)
-    N, n = len(live.means), simplification.rows
-    changed = Gaussians3D(*(x[:n] for x in tensors_of(whole)))
-    thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
-    pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
-    both = draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))
-    size = torch.maximum(here.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3
-    distance = (both.means2d[N:] - here.drawn.means2d[:n]) / (2 * size[:, None])
-    overlap = torch.exp(-distance.square().sum(-1))
-    shown = 1 - HIDDEN * live.opacities[:n] * overlap
-    scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # the image is linear in each opacity
-    thin_products = both.products(here.vectors)[:, N:]
-    there = thin_products * scale[:, None]
-    there[..., OPACITY] = thin_products[..., OPACITY] / shown
-    along = ((here.products[:, :n] + there) * (_rows_of(changed) - here.rows[:n])).sum(-1) / 2
-    added = there[..., OPACITY] * changed.opacities
-    error = overlap * _grown(along) + (1 - overlap) * _grown(here.removed[:, :n], added)
-    return F.pad(error, (0, N - n))
+    def growth(self, simplification: Simplification) -> Tensor:
+        """Predict how much the squared error of the view grows if a Gaussian is simplified, for each Gaussian, [N]."""
+        model, live = self.model, self.live
+        if simplification.raw is None:
+            return _growth_of(self.removed)
+        raw = dict(model.splats.items()) | simplification.raw
+        if simplification.order is not None:
+            colors = model.shade(raw, live.means, live.opacities, self.query)
+            return _growth_of((self.products[..., COLOR] * (colors - live.colors)).sum(-1))
+        whole = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
+        N, n = len(live.means), simplification.rows
+        changed = Gaussians3D(*(x[:n] for x in tensors_of(whole)))
+        thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
+        pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
+        both = self._draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))
+        size = torch.maximum(self.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3
+        distance = (both.means2d[N:] - self.drawn.means2d[:n]) / (2 * size[:, None])
+        overlap = torch.exp(-distance.square().sum(-1))
+        shown = 1 - HIDDEN * live.opacities[:n] * overlap
+        scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # the image is linear in each opacity
+        thin_products = both.products(self.vectors)[:, N:]
+        there = thin_products * scale[:, None]
+        there[..., OPACITY] = thin_products[..., OPACITY] / shown
+        along = ((self.products[:, :n] + there) * (_matrix_of(changed) - self.matrix[:n])).sum(-1) / 2
+        added = there[..., OPACITY] * changed.opacities
+        error = overlap * _growth_of(along) + (1 - overlap) * _growth_of(self.removed[:, :n], added)
+        return F.pad(error, (0, N - n))
 
 
-def _rows_of(gaussians: Gaussians3D) -> Tensor:
+def _matrix_of(gaussians: Gaussians3D) -> Tensor:
     """Concatenate mean, covariance factor, opacity and colour of each Gaussian to a matrix [N, 16]."""
     return torch.cat([x[:, None].flatten(1) for x in tensors_of(gaussians)], 1)
 
 
-def _grown(*changes: Tensor) -> Tensor:
+def _growth_of(*changes: Tensor) -> Tensor:
     """Compute the growth of the squared error, max(0, 2 <r, x>) + |x|^2, [N].
 
-    The change x of the image is a sum of changes that do not overlap. There is one argument [K, N] for each of these
-    changes: the scalar products of the change with the residual r, and with K - 1 images of random signs g, which
-    estimate |x|^2.
+    The change x of the image is a sum of changes that do not overlap. Each argument [K, N] has the scalar products of
+    such a change with the residual r, and with K - 1 images of random signs g, which estimate |x|^2.
     """
     products = torch.stack(changes)
     return (2 * products[:, 0].sum(0)).clamp(min=0) + products[:, 1:].square().mean(1).sum(0)
+
+
+@torch.no_grad()
+def visible_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N, 2]
+    """Return the first and the last time at which each Gaussian is visible in a training view, in [0, 1].
+
+    A Gaussian is visible in a view if its opacity at this time and direction is at least 1/255, with or without AGR.
+    The interval is extended on both sides by the largest gap between the times of neighbouring views. It is (inf, -inf)
+    for a Gaussian that is never visible.
+    """
+    unrefined = dict(model.splats.items())
+
+    def shown(view: View) -> Tensor:
+        query = CameraTime.of(view.camera, view.time)
+        opacities = model.slice_geometry(model.refined(query), query).opacities
+        if model.refines:
+            opacities = torch.maximum(opacities, model.slice_geometry(unrefined, query).opacities)
+        return opacities >= ALPHA_MIN
+
+    times = [view.time or 0.0 for view in views]
+    gap = max((later - earlier for earlier, later in itertools.pairwise(sorted(times))), default=0.0)
+    first = torch.full_like(model.splats["opacities"], math.inf)
+    last = -first
+    for time, visible in zip(times, side_by_side(shown, views, model.backend.workers(first)), strict=True):
+        first = torch.where(visible, first.clamp(max=time - gap), first)
+        last = torch.where(visible, last.clamp(min=time + gap), last)
+    return torch.stack([first, last], -1)
+
+
+def share_asleep(model: GaussianModel, views: Sequence[View]) -> float | None:
+    """Return the share of AGR's evaluations that are skipped because the Gaussian is invisible at the time of a view.
+
+    Return None if the times at which Gaussians are visible are unknown.
+    """
+    intervals = None if model.effect_sets is None else model.effect_sets.intervals
+    if intervals is None or not len(intervals):
+        return None
+    times = intervals.new_tensor([view.time or 0.0 for view in views])[:, None]
+    return float(((times < intervals[:, 0]) | (times > intervals[:, 1])).float().mean())

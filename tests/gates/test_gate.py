@@ -11,9 +11,8 @@ from torch import Tensor
 from worlds import camera
 
 from gsbench.errors import InputError
-from gsbench.gates.budget import gate_within
-from gsbench.gates.direction import share_with_direction
-from gsbench.gates.gate import apply, choose
+from gsbench.gates.gate import apply, choose, gate_within
+from gsbench.gates.hook import share_with_direction
 from gsbench.gates.sensitivity import Sensitivity, probe
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.exact_views import capped

@@ -15,8 +15,15 @@ from tiny_training import compose, moving_square
 
 from gsbench.gates import __main__ as command
 from gsbench.gates import hook
-from gsbench.gates.direction import without_direction
-from gsbench.gates.hook import LAST_RATE, LOSS_IN_TRAINING, LOSS_WITH_AGR, Gating, become, shape_of
+from gsbench.gates.hook import (
+    LAST_RATE,
+    LOSS_IN_TRAINING,
+    LOSS_WITH_AGR,
+    Gating,
+    become,
+    gaussians_of,
+    without_direction,
+)
 from gsbench.gates.sensitivity import probe
 from gsbench.measure import record
 from gsbench.measure.record import Gate
@@ -96,7 +103,7 @@ def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
     monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 20.0)
-    monkeypatch.setattr("gsbench.gates.budget.SHARES", (0.2,))
+    monkeypatch.setattr("gsbench.gates.gate.SHARES", (0.2,))
     one = trainer("effects.gate=both")
     one.run(lambda _: None, "test", lambda: one.step < 61)
     effect_sets = one.model.effect_sets
@@ -202,7 +209,7 @@ def fit(x: float) -> Gate:
 def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     """Catches a loss with the wrong sign, or of the wrong model: of the gate at the end, and of freezing direction."""
     one = trainer()
-    ungated, one.hook(Gating).gates = shape_of(one.model), [fit(0.1)]
+    ungated, one.hook(Gating).gates = gaussians_of(one.model), [fit(0.1)]
     before = one.psnr(one.views)
     faint = {name: x.clone() for name, x in ungated[0].items()} | {"opacities": ungated[0]["opacities"] - 1}
     become(one.model, (faint, None))

@@ -10,8 +10,7 @@ import torch
 from test_sensitivity import BLACK, N, trained_a_little, views_of
 
 from gsbench.gates.gate import apply, choose, effect_sets_of
-from gsbench.gates.sensitivity import probe
-from gsbench.gates.visible import seen_times, share_asleep
+from gsbench.gates.sensitivity import probe, share_asleep, visible_times
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import render
@@ -32,7 +31,7 @@ def test_when_a_gaussian_is_seen() -> None:
     views = views_of(model, 1)
     times = sorted(view.time for view in views if view.time is not None)
     gap = max(b - a for a, b in itertools.pairwise(times))
-    intervals = seen_times(model, views)
+    intervals = visible_times(model, views)
     shown = torch.zeros(N, len(views), dtype=torch.bool)
     for i, view in enumerate(views):
         query = CameraTime.of(view.camera, view.time)
@@ -56,7 +55,7 @@ def test_a_scene_without_times() -> None:
     """Catches a Gaussian of a still scene that is taken for hidden because there is no time."""
     model = trained_a_little("6dgs", 0)
     still = [replace(view, time=None) for view in views_of(model, 1)[:8]]
-    intervals = seen_times(model, still)
+    intervals = visible_times(model, still)
     assert not intervals[:, 0].isinf().all()
     assert set(intervals[:, 0].tolist()) <= {0.0, math.inf}
 
@@ -65,7 +64,7 @@ def test_agr_rests_unseen() -> None:
     """Catches intervals of other rows than their own, that change a training view, or that no checkpoint holds."""
     model = fleeting()
     views = views_of(model, 1)
-    intervals = seen_times(model, views)
+    intervals = visible_times(model, views)
     sensitivity = probe(model, views, BLACK)
     gated, resting = copy.deepcopy(model), copy.deepcopy(model)
     choice = choose(sensitivity, model, 0.0)
@@ -96,7 +95,7 @@ def test_what_no_view_shows_is_removed(most: int) -> None:
     """Catches a Gaussian that is kept, and refined, because the views that were probed are not all there are."""
     model = fleeting()
     views = views_of(model, 1)
-    hidden = seen_times(model, views)[:, 0].isinf()
+    hidden = visible_times(model, views)[:, 0].isinf()
     errors = probe(model, views, BLACK, most=most, hidden=hidden).errors["removed"]
     assert (errors[hidden] == 0).all()
     after = copy.deepcopy(model)

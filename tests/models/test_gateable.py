@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench import models
 from gsbench.errors import InputError
-from gsbench.gates.direction import without_direction
+from gsbench.gates.hook import without_direction
 from gsbench.models import registry
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
