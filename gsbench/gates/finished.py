@@ -1,25 +1,29 @@
-"""Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them; store a new run."""
+"""Simplify the Gaussians of a finished run into a new run, and draw what the Gaussians of a run depend on."""
 
 import copy
 from pathlib import Path
+
+import torch
 
 from gsbench.config import EffectsConfig
 from gsbench.config_roles import Plain, training_hash
 from gsbench.errors import InputError
 from gsbench.gates.hook import Gating
+from gsbench.gates.picture import draw
 from gsbench.measure import record as records
+from gsbench.measure.images import write_png
 from gsbench.measure.record import Record
 from gsbench.run.attempt import Attempt
-from gsbench.run.checks import check_folder
+from gsbench.run.checks import check_folder, evaluated_views
 from gsbench.run.identity import Run
-from gsbench.run.load import own_root, typed_config
+from gsbench.run.load import load_run, own_root, scene_of, typed_config
 from gsbench.run.run import write
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Remove time, direction or AGR (a network) from a finished run's Gaussians that do not need them.
+    """Remove time, direction or AGR from a finished run's Gaussians that do not need them.
 
     The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and
     direction from a Gaussian. This function may do that. Return the record and the folder of the new run.
@@ -36,8 +40,8 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     path = folder / checkpoint.FILE_NAME
     if not path.exists():
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none")
-    found = checkpoint.read(path)
-    plain: Plain = copy.deepcopy(found.config)
+    former = checkpoint.read(path)
+    plain: Plain = copy.deepcopy(former.config)
     gate = typed_config(plain, path).effects.gate
     if gate != "off":
         raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate={gate}")
@@ -55,17 +59,37 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
         model, scene = attempt.prepare()
     except InputError as error:
         raise InputError(f"{error}; if the data set is elsewhere now, name its folder by --data-root") from None
-    if scene.fingerprint != found.data:
+    if scene.fingerprint != former.data:
         raise InputError(f"{folder}: expected the data that it was trained on, {scene.name} has changed since")
     trainer = attempt.trainer(model, scene)
-    trainer.load_state_dict(found.state)
+    trainer.load_state_dict(former.state)
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
                          f"{config.train.iterations}: run it again, it continues from there")  # fmt: skip
     trainer.hook(Gating).finish(by_halves=True)
-    content = Checkpoint(training_hash(plain), found.data, trainer.state_dict(), plain, found.scene)
+    content = Checkpoint(training_hash(plain), former.data, trainer.state_dict(), plain, former.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)
     record = attempt.measure(trainer)
     write(record, new)
     attempt.draw()
     return record, new
+
+
+def draw_finished(
+    folder: Path, out: Path, camera: int = 0, time: float | None = None, data_root: str | None = None
+) -> None:
+    """Draw the Gaussians of a run by effect set, from the camera of an evaluated view, at a time or at that view's.
+
+    Raises:
+        InputError: the time is not in [0, 1], there is no such view, or the run cannot be loaded.
+    """
+    if time is not None and not 0 <= time <= 1:
+        raise InputError(f"--time: expected 0 to 1, got {time}")
+    run = load_run(folder)
+    scene = scene_of(run, data_root)
+    views = evaluated_views(scene, run.config.scene.eval_split)
+    if not 0 <= camera < len(views):
+        raise InputError(f"--camera: expected 0 to {len(views) - 1}, the evaluated views of {scene.name}, got {camera}")
+    view, background = views[camera], torch.tensor(scene.background)
+    when = view.time if time is None else time
+    write_png(draw(run.model, view.camera, when, background, run.config.raster.antialias), out)

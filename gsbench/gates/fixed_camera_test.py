@@ -29,7 +29,7 @@ LONG_SIDE = 100  # size of the compared images; every k-th pixel is taken, since
 BLOCKS = 20  # number of blocks along the longer side
 FAR_ABOVE = 20.0  # a block changes if its energy is above this times that of noise
 MOST_VIEWS = 240  # largest number of images of all positions; of more images, evenly spaced ones are used
-LEAST_AT_A_PLACE = 3  # least number of images from a position; the statistic is the same for two images in any order
+LEAST_OF_A_POSITION = 3  # least number of images from a position; the statistic is the same for two images in any order
 LEVEL_8_BIT = 1 / 255
 ROUNDS = 3  # how often gain and offset are fitted and x is computed again
 REWEIGHTINGS = 8  # iterations of the least absolute deviations
@@ -44,35 +44,34 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FixedCameraResult:
-    """Hold the result of comparing the images from the same camera position with one another."""
+    """The result of comparing the images from the same camera position with one another."""
 
     changed: float  # share of the blocks of pixels that change, over all positions
-    p: float | None  # p-value of slow change with time; None: nothing changes, or no position has enough images
-    z: float | None  # z-score of slow change with time
+    p: float | None = None  # p-value of slow change with time; None: nothing changes, or no position has enough images
+    z: float | None = None  # z-score of slow change with time
 
 
-def compare_images(views: Sequence[View], places: Sequence[Sequence[int]], seed: int) -> FixedCameraResult:
+def compare_images(views: Sequence[View], groups: Sequence[Sequence[int]], seed: int) -> FixedCameraResult:
     """Test whether images from the same camera position differ, and whether they change slowly with time.
 
     Args:
         views: the views, which have times.
-        places: for each camera position the indices of its views, at least two.
+        groups: for each camera position the indices of its views, at least two.
         seed: the seed of the random permutations.
     """
-    most = max(4, MOST_VIEWS // len(places))
+    most = max(4, MOST_VIEWS // len(groups))
     blocks, changed, means, times = 0, 0, [], []
-    for number, place in enumerate(places):
-        chosen = _spread(sorted(place, key=lambda v: views[v].time or 0.0), most, number / len(places))
-        halves = _halves(changes(np.stack([_pixels(views[v]) for v in chosen])))
+    for number, group in enumerate(groups):
+        chosen = _spread(sorted(group, key=lambda v: views[v].time or 0.0), most, number / len(groups))
+        halves = _halves(changes_of(np.stack([_pixels(views[v]) for v in chosen])))
         is_changed = _is_changed(halves)
         blocks, changed = blocks + len(is_changed), changed + int(is_changed.sum())
-        if len(chosen) >= LEAST_AT_A_PLACE:
+        if len(chosen) >= LEAST_OF_A_POSITION:
             means.append(halves.mean(0).reshape(len(chosen), -1).astype(np.float64))
             times.append(np.array([views[v].time for v in chosen], dtype=np.float64))
     if not changed or not means:
-        return FixedCameraResult(changed / blocks, None, None)
-    p, z = _slow(means, times, seed)
-    return FixedCameraResult(changed / blocks, p, z)
+        return FixedCameraResult(changed / blocks)
+    return FixedCameraResult(changed / blocks, *_test_slow_change(means, times, seed))
 
 
 def _spread(ordered: list[int], most: int, start: float) -> list[int]:
@@ -109,11 +108,7 @@ def _halves(
 def _is_changed(
     halves: Pixels,  # [2, n, B, 3], of mean zero over the n images
 ) -> Mask:  # [B]
-    """Return which blocks of pixels change over the images by more than 1/255 and by far more than their noise.
-
-    Args:
-        halves: the means of the two halves of each block, from `_halves`.
-    """
+    """Return which blocks of pixels change over the images by more than 1/255 and by far more than their noise."""
     first, second = halves
     degrees = first.shape[2] * (len(first) - 1)
     energy = (first * second).sum((0, 2)) / degrees
@@ -122,7 +117,7 @@ def _is_changed(
     return np.asarray((energy > LEVEL_8_BIT**2) & (energy > FAR_ABOVE * noise))
 
 
-def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, float]:
+def _test_slow_change(means: list[Array], times: list[Array], seed: int) -> tuple[float, float]:
     """Return the p-value and z-score of the test whether block means follow slow cosines of time, cos(pi k t).
 
     Args:
@@ -144,8 +139,8 @@ def _slow(means: list[Array], times: list[Array], seed: int) -> tuple[float, flo
     return compare(float(total[0]), total[1:])
 
 
-def changes(
-    images: Pixels,  # [n, H, W, 3] of one camera place, in [0, 1]
+def changes_of(
+    images: Pixels,  # [n, H, W, 3] of one camera position, in [0, 1]
 ) -> Pixels:  # [n, H, W, 3]
     """Return the difference of each image from the mean image, after gain and offset of the exposure were removed.
 

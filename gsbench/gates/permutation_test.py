@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,38 +14,37 @@ TIE = 1e-9  # relative tolerance: a permutation that happens to be the actual or
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """Hold the p-value and z-score of the test whether residuals follow slow cosines of time."""
+class ResidualsTest(NamedTuple):
+    """The result of the test whether residuals follow slow cosines of time."""
 
     p: float
     z: float
     free: float  # share of the variance of the cosines that the camera does not explain
 
 
-def evidence(
-    residual_products: Array,  # [V, V] Gram matrix of the views' gradients
+def follow_time(
+    products: Array,  # [V, V] scalar products of the views' gradients
     times: Array,  # [V] in [0, 1]
-    camera: Array,  # [V, B] what the camera explains, with a constant
+    camera: Array,  # [V, B] functions of the camera, with a constant
     seed: int,
-    places: Sequence[Sequence[int]] | None = None,
-) -> Evidence:
+    groups: Sequence[Sequence[int]] | None = None,
+) -> ResidualsTest:
     """Test whether the gradients of V views follow slow cosines of time (Freedman and Lane 1983).
 
     Args:
-        residual_products: the scalar products of the gradients of all pairs of views.
+        products: the scalar products of the gradients of all pairs of views.
         times: the times of the views.
-        camera: functions of the camera; their influence on gradients and cosines is removed by linear regression.
+        camera: their influence on gradients and cosines is removed by linear regression.
         seed: the seed of the random permutations.
-        places: groups of views within which times are permuted; by default all views are one group.
+        groups: views within which times are permuted; by default all views are one group.
     """
     waves = slow_waves(times)
     known = _range(camera)
-    own = waves - known @ (known.T @ waves)
-    free = float(np.square(own).sum() / max(np.square(waves).sum(), 1e-300))
-    slow = _range(own)
+    unexplained = waves - known @ (known.T @ waves)
+    free = float(np.square(unexplained).sum() / max(np.square(waves).sum(), 1e-300))
+    slow = _range(unexplained)
     residual = np.eye(len(times)) - known @ known.T
-    gram = residual @ residual_products @ residual
+    gram = residual @ products @ residual
     total = float(np.trace(gram))
     random = np.random.default_rng(seed)
 
@@ -57,14 +56,14 @@ def evidence(
         return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0
 
     actual = share(np.arange(len(times)))
-    null = np.array([share(_deal(len(times), places, random)) for _ in range(PERMUTATIONS)])
-    return Evidence(*compare(actual, null), free)
+    null = np.array([share(_permutation(len(times), groups, random)) for _ in range(PERMUTATIONS)])
+    return ResidualsTest(*compare(actual, null), free)
 
 
 def slow_waves(
     times: Array,  # [V] in [0, 1]
 ) -> Array:  # [V, WAVES]
-    """Return the cosines cos(pi k t), k = 1 .. WAVES, of times t, less the mean of each, [V, WAVES]."""
+    """Return the cosines cos(pi k t), k = 1 .. WAVES, of times t, less the mean of each."""
     waves = np.cos(math.pi * np.outer(times, np.arange(1, WAVES + 1)))
     return np.asarray(waves - waves.mean(0))
 
@@ -83,14 +82,12 @@ def compare(
     return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0
 
 
-def _deal(views: int, places: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
-    """Draw a random permutation of views; with `places`, views are permuted only within each group."""
-    if places is None:
-        return random.permutation(views)
-    dealt = np.arange(views)
-    for place in places:
-        dealt[list(place)] = random.permutation(list(place))
-    return dealt
+def _permutation(views: int, groups: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
+    """Draw a random permutation of views; with `groups`, views are permuted only within each group."""
+    order = np.arange(views)
+    for group in groups or [range(views)]:
+        order[list(group)] = random.permutation(list(group))
+    return order
 
 
 def _range(columns: Array) -> Array:

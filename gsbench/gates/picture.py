@@ -52,19 +52,19 @@ def draw(
     Raises:
         InputError: the model depends on time and `time` is None.
     """
-    seen = model.slice(CameraTime.of(camera, time))
+    gaussians = model.slice(CameraTime.of(camera, time))
     layers = (
-        (seen.colors, background),
+        (gaussians.colors, background),
         (effect_set_colors(model), torch.ones_like(background)),
         (cost_colors(model, most_cost(model)), torch.zeros_like(background)),
     )
     images = [
-        rasterize_slice(seen._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
+        rasterize_slice(gaussians._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
         for colors, behind in layers
     ]
     panels = [to_bytes(image.cpu().numpy()) for image in images]
     panels[2] = inferno(panels[2][..., 0] / 255)
-    return _arranged(panels, model.count_by_effects(), most_cost(model))
+    return _arrange(panels, model.count_by_effects(), most_cost(model))
 
 
 def effect_set_colors(model: GaussianModel) -> Tensor:
@@ -81,17 +81,13 @@ def kinds_of(model: GaussianModel) -> Tensor:
     """Return what each Gaussian depends on (AGR's network, time, direction, nothing) as an index into NAMES, [N]."""
     effect_sets = effect_sets_of(model)
     assert effect_sets.frozen is not None
-    place = torch.arange(len(model), device=effect_sets.frozen.device)
-    conditioned = (
-        1 + effect_sets.frozen.long()
-    )  # TIME and DIRECTION follow one another as in NAMES, and both are static
-    static = torch.full_like(place, NAMES.index("static"))
-    return torch.where(
-        place < effect_sets.refined, 0, torch.where(place < effect_sets.conditioned, conditioned, static)
-    )
+    kinds = 1 + effect_sets.frozen.long()  # TIME and DIRECTION follow one another as in NAMES, and both are static
+    kinds[: effect_sets.refined] = NAMES.index("refined")
+    kinds[effect_sets.conditioned :] = NAMES.index("static")
+    return kinds
 
 
-def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
+def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
     """Put the three panels side by side, with titles above and the legend of the Gaussians' colours below."""
     height, width = panels[0].shape[:2]
     factor = max(1, -(-LEAST_WIDTH // width))
@@ -104,16 +100,15 @@ def _arranged(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixe
     row = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
     step = width + GAP
     titles = _paper(1, row.shape[1])
-    names = (
-        "image",
+    by_set, cost = (
         f"{sum(counts.values()):,} Gaussians by effect set",
         f"cost of what a pixel shows, 0 to {most:.0f} ns",
     )
-    for i, title in enumerate(names):
+    for i, title in enumerate(("image", by_set, cost)):
         _write(titles, title, i * step + 6, 0)
-    there = {name: number for name, number in counts.items() if number}
-    legend = _paper(-(-len(there) // COLUMNS), row.shape[1])
-    for i, (name, number) in enumerate(there.items()):
+    present = {name: number for name, number in counts.items() if number}
+    legend = _paper(-(-len(present) // COLUMNS), row.shape[1])
+    for i, (name, number) in enumerate(present.items()):
         line, left = i // COLUMNS, i % COLUMNS * step + 6
         legend[line * LINE + 5 : line * LINE + 17, left : left + 12] = COLOURS[name]
         _write(legend, f"{EFFECT_SETS[name]}: {number:,}", left + 18, line)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Hold the views from each camera position, as indices into a list of views."""
+    """The views from each camera position, as indices into a list of views."""
 
     fixed: list[list[int]]  # groups of at least two views from exactly the same position
     held: list[list[int]]  # groups of views from a camera that moves a little; empty if these are a minority
@@ -29,7 +29,7 @@ class Viewpoints:
     @property
     def loose(self) -> list[int]:
         """The views that share their exact camera position with no other view, sorted."""
-        return sorted([v for place in self.held for v in place] + self.other)
+        return sorted([v for group in self.held for v in group] + self.other)
 
 
 def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
@@ -48,8 +48,7 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
     near = [group for group in _groups(loose, poses, NEAR)
             if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span]  # fmt: skip
     held = near if 2 * sum(map(len, near)) > len(loose) else []
-    inside = {v for group in held for v in group}
-    return Viewpoints(fixed, held, [v for v in loose if v not in inside])
+    return Viewpoints(fixed, held, sorted(set(loose).difference(*held)))
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
@@ -57,24 +56,17 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
 
     The unit of the shift is the longer side of the image.
     """
-    center = center_of(views)
-    rows = []
-    for view in views:
-        camera = view.camera
-        viewmat, K = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
-        place = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        rows.append((viewmat[:3, :3].ravel() / math.sqrt(2), place, K[:2].ravel(), camera.width, camera.height))
-    side = np.array([max(width, height) for *_, width, height in rows], dtype=np.float64)[:, None]
-    focal = np.array([K[0] for _, _, K, _, _ in rows])[:, None] / side
-    places = np.stack([place for _, place, *_ in rows])
-    distance = extent if center is None else float(np.linalg.norm(places - center.numpy(), axis=1).mean())
-    sizes = np.array([(width, height) for *_, width, height in rows], dtype=np.float64)
-    return np.concatenate([
-        focal.mean() * np.stack([turned for turned, *_ in rows]),
-        focal.mean() * places / max(distance, 1e-12),
-        np.stack([K for _, _, K, _, _ in rows]) / side,
-        sizes,
-    ], 1)  # fmt: skip
+    cameras = [view.camera for view in views]
+    viewmats = np.stack([camera.viewmat.cpu().double().numpy() for camera in cameras])
+    K = np.stack([camera.K.cpu().double().numpy()[:2].ravel() for camera in cameras])
+    sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    side = sizes.max(1, keepdims=True)
+    focal = (K[:, :1] / side).mean()
+    centers = np.stack([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
+    meeting = center_of(views)
+    distance = extent if meeting is None else float(np.linalg.norm(centers - meeting.numpy(), axis=1).mean())
+    turns = viewmats[:, :3, :3].reshape(-1, 9) / math.sqrt(2)
+    return np.concatenate([focal * turns, focal * centers / max(distance, 1e-12), K / side, sizes], 1)
 
 
 def _groups(numbers: list[int], poses: Array, tolerance: float) -> list[list[int]]:

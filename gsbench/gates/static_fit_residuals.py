@@ -67,10 +67,10 @@ def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tens
     with Tape() as tape:
         gaussians = model.slice(CameraTime.of(view.camera, None))
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
-    found: dict[int, Tensor] = {}
+    gradients: dict[int, Tensor] = {}
     residual = image.detach() - view.image
-    tape.backward(image, 2 / residual.numel() * residual, by, found)
-    return [found.get(id(parameter), torch.zeros_like(parameter)) for parameter in by]
+    tape.backward(image, 2 / residual.numel() * residual, by, gradients)
+    return [gradients.get(id(parameter), torch.zeros_like(parameter)) for parameter in by]
 
 
 def smaller(view: View) -> View:

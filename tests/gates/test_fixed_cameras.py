@@ -103,7 +103,7 @@ def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> N
             own = light if together else random.standard_normal(8)
             images = np.outer(own, pattern) + 0.3 * random.standard_normal((8, 30))
             means.append(images - images.mean(0))
-        low += fixed_camera_test._slow(means, times, k)[0] <= 0.05
+        low += fixed_camera_test._test_slow_change(means, times, k)[0] <= 0.05
     assert low / 300 == pytest.approx(0.05, abs=0.035)
 
 

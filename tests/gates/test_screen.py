@@ -14,7 +14,7 @@ from worlds import World, brightening, filmed, moving, small_mover, still
 from gsbench.errors import InputError
 from gsbench.gates import __main__ as command
 from gsbench.gates import permutation_test, screen, static_fit_residuals
-from gsbench.gates.permutation_test import evidence
+from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import screen_time
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Scene
@@ -97,7 +97,7 @@ def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     camera = random.standard_normal((40, 9))
     gradients = camera @ random.standard_normal((9, 50)) * 3 + random.standard_normal((40, 50))
-    deals = [evidence(gradients @ gradients.T, random.permutation(40) / 39, camera, k).p for k in range(300)]
+    deals = [follow_time(gradients @ gradients.T, random.permutation(40) / 39, camera, k).p for k in range(300)]
     assert np.mean(np.array(deals) <= 0.05) == pytest.approx(0.05, abs=0.035)
     assert np.mean(np.array(deals) <= 0.01) <= 0.027
 
@@ -107,7 +107,7 @@ def test_the_waves_that_are_looked_for(wave: int, found: bool) -> None:
     """Catches a constant among the slow waves in place of the fastest, and faster ones: cos(pi k t), k = 1 to 4."""
     times = (np.arange(40) + 0.5) / 40
     gradients = np.cos(np.pi * wave * times)[:, None] + 0.1 * np.random.default_rng(0).standard_normal((40, 20))
-    p = evidence(gradients @ gradients.T, times, np.ones((40, 1)), 0).p
+    p = follow_time(gradients @ gradients.T, times, np.ones((40, 1)), 0).p
     assert p == 0.001 if found else p > 0.05
 
 

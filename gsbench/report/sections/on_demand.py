@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsbench.gates.messages import EFFECT_SETS, of_comparison, reason
+from gsbench.gates.messages import EFFECT_SETS, of_comparison
 from gsbench.measure.record import Gate, Record
 from gsbench.report import stats
 from gsbench.report.frame import Results
@@ -77,7 +77,7 @@ def _mean(runs: pd.DataFrame) -> dict[str, Any]:
     texts = {
         "seeds": len(runs),
         "screen": ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())),
-        "why": reason(screens[0]) if screens else "",
+        "why": screens[0].reason if screens else "",
         "compared": of_comparison(comparison) if comparison else "",
         "gated": int(of.before.notna().sum()),
         "measured on": next(
