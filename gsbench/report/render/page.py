@@ -131,6 +131,10 @@ def table(of: Section) -> dict[str, Any]:
         for name, title, kind in zip(names, shown, kinds, strict=True)
     ]
     turned = len(names) > TURNED > len(shown)
+    if columns and not turned:  # a group is named in its first row
+        texts = [text for text, _ in columns[0]]
+        columns[0] = [(text, "repeated" if text == above else kind)
+                      for (text, kind), above in zip(columns[0], [None, *texts], strict=False)]  # fmt: skip
     rows = columns if turned else list(zip(*columns, strict=True))
     return {"rows": rows, "turned": turned, "count": len(of.table), "more": len(of.table) - len(shown)}
 
