@@ -53,22 +53,21 @@ def save(path: Path, content: Checkpoint) -> None:
     write_atomically(path, write)
 
 
+@dataclass
 class _WithFirstError:
-    """A file that keeps the first error of its disk: torch would hide it behind an error of its own."""
+    """A file that keeps the first error of its disk, which torch would hide, and writes nothing after it."""
 
-    def __init__(self, file: io.BufferedRandom) -> None:
-        """Write to an open file."""
-        self._file = file
-        self.error: OSError | None = None
+    file: io.BufferedRandom
+    error: OSError | None = None
 
     def write(self, data: bytes) -> int:
-        """Write bytes, or nothing after the first error, and return their number."""
-        self._attempt(lambda: self._file.write(data))
+        """Write bytes and return their number."""
+        self._attempt(lambda: self.file.write(data))
         return len(data)
 
     def flush(self) -> None:
-        """Flush the file, unless there was an error."""
-        self._attempt(self._file.flush)
+        """Flush the file."""
+        self._attempt(self.file.flush)
 
     def _attempt(self, action: Callable[[], object]) -> None:
         try:

@@ -7,7 +7,7 @@ Gaussians, or the schedule changes what is trained. `gsbench.kernels.recording` 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -103,10 +103,8 @@ class StepReplay(Generic[Result]):
         if is_new:
             self._signature, self._recorded, self._is_repeatable = signature, [], True
         if recorded := self._recorded:
-            try:
+            with suppress(OutdatedError):  # then the work is recorded anew
                 return of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
-            except OutdatedError:
-                self._recorded = []
         if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: work(index, observed[index], stages))
         recorded = of_all(lambda index, stages: _RecordedView(partial(work, index), observed[index], stages))

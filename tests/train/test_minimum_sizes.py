@@ -18,10 +18,10 @@ from gsbench.train.hooks.minimum_sizes import LEAST_PIXELS, MinimumLifetime, Min
 OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
 
 
-def camera(distance: float, focal: float = 50.0) -> Camera:
+def camera(distance: float, focal: tuple[float, float] = (50.0, 50.0)) -> Camera:
     viewmat = torch.eye(4)
     viewmat[2, 3] = distance
-    return Camera(viewmat, torch.tensor([[focal, 0, 24], [0, focal, 24], [0, 0, 1]]), 48, 48)
+    return Camera(viewmat, torch.tensor([[focal[0], 0, 24], [0, focal[1], 24], [0, 0, 1]]), 48, 48)
 
 
 def training_of(model: GaussianModel, views: list[Any]) -> Any:
@@ -42,23 +42,19 @@ def flat(name: str) -> GaussianModel:
     return model
 
 
-def test_the_floor_is_a_part_of_a_pixel_at_the_nearest_camera() -> None:
-    """Catches the farthest camera, a mean over cameras, or a focal length that is left out."""
+@pytest.mark.parametrize(
+    ("cameras", "pixel"),
+    [
+        ([camera(4.0), camera(2.0), camera(2.5, focal=(100.0, 100.0))], 2.5 / 100),
+        ([camera(2.0, focal=(80.0, 50.0))], 2.0 / 80),
+        ([camera(2.0, focal=(50.0, 80.0))], 2.0 / 80),
+    ],
+)
+def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras: list[Camera], pixel: float) -> None:
+    """Catches the farthest camera, a mean over cameras, and a focal length that is left out, or the smaller of two."""
     model = flat("3dgs")
     model.splats["means"].data.zero_()
-    minimum_scale = scale_of(model, [camera(4.0), camera(2.0), camera(2.5, focal=100.0)])
-    torch.testing.assert_close(minimum_scale.least, torch.full((200,), LEAST_PIXELS * 2.5 / 100))
-
-
-def test_the_floor_is_of_the_finer_axis_of_the_pixels() -> None:
-    """Catches the smaller focal length of a camera whose pixels are not square: it resolves what the other does not."""
-    model, wide = flat("3dgs"), camera(2.0)
-    model.splats["means"].data.zero_()
-    for axis in (0, 1):
-        K = wide.K.clone()
-        K[axis, axis] = 80.0
-        least = scale_of(model, [Camera(wide.viewmat, K, 48, 48)]).least
-        torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * 2.0 / 80))
+    torch.testing.assert_close(scale_of(model, cameras).least, torch.full((200,), LEAST_PIXELS * pixel))
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -68,7 +64,6 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     background = torch.zeros(3)
     before = render(model, eye, 0.5, background)
     others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
-    durations = model.splats["scales"].detach()[:, 3:].clone() if name == "4dgs" else None
     minimum_scale = scale_of(model, [eye])
     with torch.no_grad():
         minimum_scale.after_update(0)
@@ -77,7 +72,6 @@ def test_no_camera_sees_the_floor(name: str) -> None:
     factors = model.slice(CameraTime.at(eye.center, 0.5)).factors
     assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * minimum_scale.least).all()
     assert all(torch.equal(model.splats[n], p) for n, p in others.items())
-    assert durations is None or torch.equal(model.splats["scales"][:, 3:], durations)
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -76,9 +76,3 @@ def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points:
     steps = [step for step in range(iterations) if s.measures(step)]
     assert steps[-1] == iterations - 1
     assert len(steps) == min(points, iterations)
-
-
-def test_densify_config_is_the_published_one() -> None:
-    """Catches a silent change of the published thresholds."""
-    d = DensifyConfig()
-    assert (d.grad_threshold, d.clone_below, d.prune_above) == (2e-4, 0.01, 0.1)

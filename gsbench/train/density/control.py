@@ -29,8 +29,10 @@ LEAST_GROWTH = 4
 # moments, 2 million Gaussians of 7DGS need 2.7 GB.
 MOST_GAUSSIANS = 2_000_000
 
-RULES: dict[str, type[DensificationRule]] = {
-    rule.kind: rule for rule in (GradientDensification, MCMCDensification, MultiviewDensification)
+RULES: dict[str, type[DensificationRule]] = {  # by train.densify.kind
+    "gradient": GradientDensification,
+    "mcmc": MCMCDensification,
+    "multiview": MultiviewDensification,
 }
 
 

@@ -24,8 +24,6 @@ class GradientDensification(DensificationRule):
     - Every 3,000 iterations all opacities are lowered to at most twice the pruning threshold.
     """
 
-    kind = "gradient"
-
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
     ) -> None:

@@ -28,8 +28,6 @@ class MCMCDensification(DensificationRule):
       Gaussians move.
     """
 
-    kind = "mcmc"
-
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Relocate dead Gaussians, then add Gaussians up to `most`; return 0, because none is refused."""

@@ -38,8 +38,6 @@ class MultiviewDensification(GradientDensification):
     - After each round, opacities above MOST_OPACITY are lowered to it.
     """
 
-    kind = "multiview"
-
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Clone and split Gaussians of large gradient and importance, then prune and lower opacities."""

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +25,6 @@ Score = Callable[[torch.Generator], Scores]
 class DensificationRule(ABC):
     """The base class of rules; a rule works with all models, since a model itself splits Gaussians."""
 
-    kind: ClassVar[str]  # its name in train.densify.kind
     adds_noise = False  # whether the training calls `add_noise` after every step
 
     def __init__(
