@@ -15,13 +15,15 @@ from gsbench.gates.screen import screen_time
 from gsbench.gates.shared_viewpoints import group_by_viewpoint
 from gsbench.scenes.scene import Scene
 
-Seen = Callable[[Tensor, float], Tensor]
+Exposure = Callable[[Tensor, float], Tensor]
 
 
-def noisy(seen: Seen | None = None, size: float = 0.02) -> Seen:
-    """Sensor noise, of what `seen` makes of an image."""
+def noisy(exposure: Exposure | None = None, size: float = 0.02) -> Exposure:
+    """Sensor noise, of what `exposure` makes of an image."""
     random = torch.Generator().manual_seed(3)
-    return lambda image, t: (seen(image, t) if seen else image) + size * torch.randn(image.shape, generator=random)
+    return lambda image, t: (
+        (exposure(image, t) if exposure else image) + size * torch.randn(image.shape, generator=random)
+    )
 
 
 def drifting(image: Tensor, moment: float) -> Tensor:
@@ -35,19 +37,23 @@ def flickering(image: Tensor, moment: float) -> Tensor:
 
 
 def darkening(image: Tensor, moment: float) -> Tensor:
-    """A patch of 1 % of the frame that is seen to move in front of the still world."""
+    """A patch of 1 % of the frame that moves in front of the still world."""
     image = image.clone()
     column = int(36 * moment)
     image[18:22, column : column + 4] *= 0.5
     return image
 
 
-@pytest.mark.parametrize("seen", [None, noisy(), drifting, flickering, noisy(drifting), noisy(flickering)])
-def test_a_still_rig_is_off(seen: Seen | None) -> None:
-    """Catches noise, rounding to 8 bits, an exposure that drifts (and saturates) or flickers, taken for a change."""
-    found = screen_time(rigged(still, seen=seen))
-    assert found.decision == "off", found
-    assert "exposure and noise only" in found.reason
+@pytest.mark.parametrize("exposure", [None, noisy(), drifting, flickering, noisy(drifting), noisy(flickering)])
+def test_exposure_is_no_change(exposure: Exposure | None) -> None:
+    """Catches noise, rounding to 8 bits, an exposure that drifts (and saturates) or flickers, taken for a change; and
+    a gain and an offset that take a mover out with the exposure."""
+    still_rig = screen_time(rigged(still, exposure=exposure))
+    assert still_rig.decision == "off", still_rig
+    assert "exposure and noise only" in still_rig.reason
+    if exposure not in (None, drifting, flickering):
+        assert screen_time(rigged(moving, exposure=exposure)).decision == "on"
+        assert screen_time(rigged(small_mover, exposure=exposure)).decision == "on"
 
 
 @pytest.mark.parametrize("world", [moving, small_mover, brightening])
@@ -57,35 +63,48 @@ def test_a_still_rig_is_off(seen: Seen | None) -> None:
 def test_a_rig_sees_motion(world: World, places: int, views: int, together: bool) -> None:
     """Catches "off" or "undecided" on a rig, one of four cameras, one whose cameras fire together, or one with so many
     views that only some of them are compared: their times must be those of these views."""
-    found = screen_time(rigged(world, places, views, together=together))
-    assert found.decision == "on", found
-    assert found.p is not None
-    assert found.free is None
+    screen = screen_time(rigged(world, places, views, together=together))
+    assert screen.decision == "on", screen
+    assert screen.p is not None
+    assert screen.free is None
 
 
-@pytest.mark.parametrize("seen", [noisy(), noisy(drifting), noisy(flickering)])
-def test_exposure_hides_no_motion(seen: Seen) -> None:
-    """Catches a gain and an offset that take the mover out with the exposure."""
-    assert screen_time(rigged(moving, seen=seen)).decision == "on"
-    assert screen_time(rigged(small_mover, seen=seen)).decision == "on"
+def _mixed(fixed: Scene, loose: Scene) -> Scene:
+    return replace(loose, train=fixed.train + loose.train)
 
 
-def test_what_is_rare_or_small_is_never_off() -> None:
-    """Catches events of a moment (no slow wave is left) and movers of 1 % of the frame that are called static."""
-    for scene in (rigged(appearing), rigged(appearing, seen=noisy()), rigged(still, seen=noisy(darkening)),
-                  rigged(appearing, views=3), rigged(moving, views=2), rigged(moving, 4, 4),
-                  rigged(small_mover, 8, 3)):  # fmt: skip
-        assert screen_time(scene).decision != "off"
-
-
-def test_shuffled_times_are_undecided() -> None:
-    """Catches "off" where images of one place differ, though by no slow wave."""
-    scene = rigged(moving)
+def _shuffled(scene: Scene) -> Scene:
     order = torch.randperm(len(scene.train), generator=torch.Generator().manual_seed(5)).tolist()
-    train = [replace(view, time=scene.train[i].time) for view, i in zip(scene.train, order, strict=True)]
-    found = screen_time(replace(scene, train=train))
-    assert found.decision == "undecided"
-    assert "differ" in found.reason
+    return replace(scene, train=[replace(v, time=scene.train[i].time) for v, i in zip(scene.train, order, strict=True)])
+
+
+@pytest.mark.parametrize(
+    ("scene", "decisions", "reason"),
+    [
+        # What is rare (no slow wave is left) or moves in 1 % of the frame is never called static.
+        (lambda: rigged(appearing), ("on", "undecided"), ""),
+        (lambda: rigged(appearing, exposure=noisy()), ("on", "undecided"), ""),
+        (lambda: rigged(still, exposure=noisy(darkening)), ("on", "undecided"), ""),
+        (lambda: rigged(appearing, views=3), ("on", "undecided"), ""),
+        (lambda: rigged(moving, views=2), ("on", "undecided"), ""),
+        (lambda: rigged(moving, 4, 4), ("on", "undecided"), ""),
+        (lambda: rigged(small_mover, 8, 3), ("on", "undecided"), ""),
+        (lambda: _shuffled(rigged(moving)), ("undecided",), "differ"),  # images of one place differ, by no slow wave
+        # Captures of standing and of wandering cameras are judged by both kinds.
+        (lambda: _mixed(rigged(moving, 4, 12), filmed(moving, 36)), ("on",), "together p"),
+        (lambda: _mixed(rigged(still, 3, 6, exposure=noisy()), filmed(still, 48)), ("off",), ""),
+        (lambda: _mixed(rigged(still, 3, 6), filmed(moving, 36)), ("on",), ""),
+        (lambda: _mixed(rigged(moving, 3, 6), filmed(still, 24, orbit=True)), ("on", "undecided"), ""),
+        # Cameras held in the hand: each place has a misfit of its own, which nine harmonics of the camera do not fit.
+        (lambda: rigged(moving, 6, 10, shake=0.005), ("on", "undecided"), ""),
+        (lambda: rigged(still, 6, 10, shake=0.005), ("undecided",), ""),
+    ],
+)
+def test_hard_cases(scene: Callable[[], Scene], decisions: tuple[str, ...], reason: str) -> None:
+    """Catches a scene that is called static though it may change, and a test that ignores a part of the views."""
+    screen = screen_time(scene())
+    assert screen.decision in decisions, screen
+    assert reason in screen.reason
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -100,33 +119,11 @@ def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> N
         light = random.standard_normal(8)
         means = []
         for pattern in patterns:
-            own = light if together else random.standard_normal(8)
-            images = np.outer(own, pattern) + 0.3 * random.standard_normal((8, 30))
+            brightness = light if together else random.standard_normal(8)
+            images = np.outer(brightness, pattern) + 0.3 * random.standard_normal((8, 30))
             means.append(images - images.mean(0))
         low += fixed_camera_test._test_slow_change(means, times, k)[0] <= 0.05
     assert low / 300 == pytest.approx(0.05, abs=0.035)
-
-
-def _both(fixed: Scene, loose: Scene) -> Scene:
-    return replace(loose, train=fixed.train + loose.train)
-
-
-def test_mixed_captures_are_asked_both_ways() -> None:
-    """Catches a capture of standing and of wandering cameras that is judged by one kind alone."""
-    found = screen_time(_both(rigged(moving, 4, 12), filmed(moving, 36)))
-    assert found.decision == "on"
-    assert "together p" in found.reason
-    assert screen_time(_both(rigged(still, 3, 6, seen=noisy()), filmed(still, 48))).decision == "off"
-    assert screen_time(_both(rigged(still, 3, 6), filmed(moving, 36))).decision == "on"
-    assert screen_time(_both(rigged(moving, 3, 6), filmed(still, 24, orbit=True))).decision != "off"
-
-
-def test_cameras_that_are_held_are_never_off() -> None:
-    """Catches nine harmonics for places that move a little: each has a misfit of its own, which drowned time."""
-    scene = rigged(moving, 6, 10, shake=0.005)
-    assert len(group_by_viewpoint(scene.train, scene.extent).held) == 6
-    assert screen_time(scene).decision != "off"
-    assert screen_time(rigged(still, 6, 10, shake=0.005)).decision == "undecided"
 
 
 @pytest.mark.parametrize(("width", "height"), [(24, 48), (48, 24)])
@@ -145,8 +142,10 @@ def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
     assert [len(place) for place in group_by_viewpoint(turned, scene.extent).held] == [3] * 4
 
 
-def test_places_are_told_by_their_cameras() -> None:
-    """Catches places that are split by rounding, or joined though the lens differs; a film has none."""
+def test_viewpoints_are_those_of_the_cameras() -> None:
+    """Catches viewpoints that are split by rounding, or joined though the lens differs; a film has none."""
+    shaken = rigged(still, 6, 10, shake=0.005)
+    assert len(group_by_viewpoint(shaken.train, shaken.extent).held) == 6
     scene = rigged(still, 4, 4)
     random = torch.Generator().manual_seed(0)
     train = [replace(v, camera=replace(v.camera, viewmat=v.camera.viewmat + 1e-6 * torch.randn(4, 4, generator=random)))

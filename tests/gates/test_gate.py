@@ -2,6 +2,7 @@
 
 import copy
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -133,7 +134,7 @@ def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
     for simplification in simplifications_of(after, queries, live):
         for query, before in zip(queries, live, strict=True):
             changed = slice_of(after, simplification, before, query)
-            for a, b in zip(*(tensors_of(_up_to_turns(one)) for one in (before, changed)), strict=True):
+            for a, b in zip(*(tensors_of(_up_to_turns(batch)) for batch in (before, changed)), strict=True):
                 torch.testing.assert_close(a[simplification.rows :], b[simplification.rows :], atol=1e-5, rtol=1e-5)
         assert (errors[simplification.name][simplification.rows :] == 0).all()
         assert simplification.rows == 0 or (errors[simplification.name][: simplification.rows] > 0).any()
@@ -157,29 +158,23 @@ def test_only_what_matters_is_stored(name: str) -> None:
     assert other.effect_sets[:2] == after.effect_sets[:2]
 
 
-@pytest.mark.parametrize(
-    "fault", ["counts", "orders", "frozen", "intervals", "short", "extra", "no_opacities", "missing"]
-)
+FAULTS: dict[str, Callable[[dict[str, Tensor]], object]] = {
+    "counts": lambda state: state["effect_sets.counts"][1:].add_(10_000),
+    "orders": lambda state: state["effect_sets.orders"].fill_(77),
+    "frozen": lambda state: state.update({"effect_sets.frozen": state["effect_sets.frozen"][1:]}),
+    "intervals": lambda state: state.update({"effect_sets.intervals": torch.zeros(10_000, 2)}),
+    "short": lambda state: state.update({"splats.motion": state["splats.motion"][:-1]}),
+    "extra": lambda state: state.update({"effect_sets.more": torch.zeros(1)}),
+    "no_opacities": lambda state: state.pop("splats.opacities"),
+    "missing": lambda state: state.pop("effect_sets.orders"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
 def test_effect_sets_of_a_checkpoint_are_checked(fault: str) -> None:
     """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
-    _, after = gated("7dgs", 3.0)
-    state = after.pack()
-    if fault == "counts":
-        state["effect_sets.counts"] = torch.tensor([5, len(after) + 1])
-    elif fault == "orders":
-        state["effect_sets.orders"] = torch.full_like(state["effect_sets.orders"], 77)
-    elif fault == "frozen":
-        state["effect_sets.frozen"] = state["effect_sets.frozen"][1:]
-    elif fault == "intervals":
-        state["effect_sets.intervals"] = torch.zeros(int(state["effect_sets.counts"][0]) + 1, 2)
-    elif fault == "short":
-        state["splats.motion"] = state["splats.motion"][:-1]
-    elif fault == "extra":
-        state["effect_sets.more"] = torch.zeros(1)
-    elif fault == "no_opacities":
-        del state["splats.opacities"]
-    else:
-        del state["effect_sets.orders"]
+    state = {name: tensor.clone() for name, tensor in gated("7dgs", 3.0)[1].pack().items()}
+    FAULTS[fault](state)
     with pytest.raises(InputError, match="checkpoint: "):
         trained_a_little("7dgs", 1).load_state(state)
 
@@ -200,15 +195,15 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     views = views_of(model, 1)
     sensitivity = probe(model, views[5:], BLACK)
 
-    def measure(one: GaussianModel) -> float:
-        return sum(psnr(render(one, view.camera, view.time, BLACK), view.image) for view in views[:5]) / 5
+    def measure(shown: GaussianModel) -> float:
+        return sum(psnr(render(shown, view.camera, view.time, BLACK), view.image) for view in views[:5]) / 5
 
-    found = gate_within(model, sensitivity, 0.3, measure)
-    assert found is not None
-    assert found.gate.measured_db <= 0.3
-    assert found.gate.measured_db == pytest.approx(measure(model) - measure(found.model), abs=1e-9)
-    assert sum(found.gate.rows.values()) == N
-    assert found.gate.bytes < found.gate.bytes_before == model.stored_bytes()
+    copied = gate_within(model, sensitivity, 0.3, measure)
+    assert copied is not None
+    assert copied.gate.measured_db <= 0.3
+    assert copied.gate.measured_db == pytest.approx(measure(model) - measure(copied.model), abs=1e-9)
+    assert sum(copied.gate.rows.values()) == N
+    assert copied.gate.bytes < copied.gate.bytes_before == model.stored_bytes()
     assert model.effect_sets is None
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None

@@ -45,16 +45,16 @@ def trainer(*words: str, model: str = "7dgs", scene: Scene | None = None) -> Tra
     if scene is None:
         square = moving_square()
         scene = replace(square, val=square.train[:3], test=square.train[3:5])
-    made = build(config)
+    untrained = build(config)
     assert scene.points is not None
-    made.initialise(scene.points, scene.extent, generator(config.seed))
-    return Trainer(made, scene, scene.test, config)
+    untrained.initialise(scene.points, scene.extent, generator(config.seed))
+    return Trainer(untrained, scene, scene.test, config)
 
 
-def end(one: Trainer) -> dict[str, object]:
+def end(training: Trainer) -> dict[str, object]:
     """Train to the end; return the last state, without the seconds that no two runs share."""
     states: list[dict[str, object]] = []
-    one.run(lambda state: states.append(copy.deepcopy(state)), "test")
+    training.run(lambda state: states.append(copy.deepcopy(state)), "test")
     last = states[-1]
     return {key: last[key] for key in ("model", "optimizer", "density")}
 
@@ -93,26 +93,26 @@ def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a gate in training of a model that needs all of its Gaussians, and one that is left out in silence."""
-    one = trainer("effects.gate=both")
-    monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", len(one.model) * 100)
-    end(one)
-    assert [gate.step for gate in one.hook(Gating).gates if gate.step is not None] == []
-    assert "at step 60 the model has" in one.hook(Gating).notes[0]
+    training = trainer("effects.gate=both")
+    monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", len(training.model) * 100)
+    end(training)
+    assert [gate.step for gate in training.hook(Gating).gates if gate.step is not None] == []
+    assert "at step 60 the model has" in training.hook(Gating).notes[0]
 
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
     monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 20.0)
     monkeypatch.setattr("gsbench.gates.gate.SHARES", (0.2,))
-    one = trainer("effects.gate=both")
-    one.run(lambda _: None, "test", lambda: one.step < 61)
-    effect_sets = one.model.effect_sets
+    training = trainer("effects.gate=both")
+    training.run(lambda _: None, "test", lambda: training.step < 61)
+    effect_sets = training.model.effect_sets
     assert effect_sets is not None
-    assert effect_sets.conditioned < len(one.model)
-    before = {name: value.detach().clone() for name, value in one.model.splats.items()}
-    one.run(lambda _: None, "test", lambda: one.step < 70)
-    masks = one.model.kept(effect_sets)
-    for name, value in one.model.splats.items():
+    assert effect_sets.conditioned < len(training.model)
+    before = {name: value.detach().clone() for name, value in training.model.splats.items()}
+    training.run(lambda _: None, "test", lambda: training.step < 70)
+    masks = training.model.kept(effect_sets)
+    for name, value in training.model.splats.items():
         mask = masks[name].expand_as(value) if name in masks else torch.ones_like(value, dtype=torch.bool)
         assert torch.equal(value[~mask], before[name][~mask]), name
         assert not mask.any() or not torch.equal(value[mask], before[name][mask]), name
@@ -142,19 +142,19 @@ def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: 
 
 @pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
 def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
-    """Catches a gated training whose AGR swings to the end, an ungated one that is slowed, and rates of others."""
-    one, rates = trainer(*words), []
+    """Catches a gated training whose AGR swings to the end, an ungated training that is slowed, and rates of others."""
+    training, rates = trainer(*words), []
 
     def note(step: int, factors: Mapping[str, float] = NO_FACTORS) -> dict[str, float]:
         rates.append(original(step, factors))
         return rates[-1]
 
-    original, one.optimizer.rates_at = one.optimizer.rates_at, note
-    end(one)
+    original, training.optimizer.rates_at = training.optimizer.rates_at, note
+    end(training)
     agr, others = [rate["refinement"] for rate in rates], [rate["opacities"] for rate in rates]
     assert agr[0] == agr[59] == pytest.approx(2e-4)
     assert others[0] == others[-1]
-    gated = bool(words) and one.hook(Gating).gates[0].step == 60
+    gated = bool(words) and training.hook(Gating).gates[0].step == 60
     assert gated == bool(words)
     assert agr[60] == pytest.approx(2e-4)
     assert agr[-1] == pytest.approx(2e-4 * LAST_RATE ** (39 / 40) if gated else 2e-4)
@@ -167,7 +167,7 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
     monkeypatch.setattr(hook, "probe", lambda _, views, *__, **___: probed.append(views))
     monkeypatch.setattr(Renderer, "psnr", lambda _, __, views: 30.0 + len(checked.append(views) or views))
     monkeypatch.setattr(hook, "gate_within", lambda model, _, __, measure, ___: measure(model) and None)
-    one, square = trainer("effects.gate=end"), moving_square(views=17)
+    training, square = trainer("effects.gate=end"), moving_square(views=17)
     views, every_eighth = square.train, square.train[::8]
     others = [view for i, view in enumerate(views) if i % 8]
     for val, train, split, expected, notes in (
@@ -176,8 +176,8 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
         ([], views, "test", (others, every_eighth), 1),
         ([], views[:8], "test", (views[:8], views[:8]), 2),  # too few to hold any out, which is said
     ):
-        one.config.scene.eval_split = split
-        of = Trainer(one.model, replace(square, val=val, train=train), [], one.config)
+        training.config.scene.eval_split = split
+        of = Trainer(training.model, replace(square, val=val, train=train), [], training.config)
         of.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
         names = [[view.name for view in asked] for asked in (probed.pop(), checked.pop())]
         assert names == [[view.name for view in asked] for asked in expected]
@@ -193,12 +193,12 @@ def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
     scores: list[float], line: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches effects that are removed because all views are exact before and after, and a loss of inf - inf."""
-    one = trainer("effects.gate=end")
+    training = trainer("effects.gate=end")
     shown = iter([*scores, *[scores[-1]] * 20, scores[0]])
     monkeypatch.setattr(Renderer, "psnr", lambda *_: scores[0] if len(scores) < 2 else next(shown))
-    one.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
-    assert not one.hook(Gating).gates
-    assert line in one.hook(Gating).notes[-1]
+    training.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
+    assert not training.hook(Gating).gates
+    assert line in training.hook(Gating).notes[-1]
 
 
 def fit(x: float) -> Gate:
@@ -208,20 +208,20 @@ def fit(x: float) -> Gate:
 
 def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     """Catches a loss with the wrong sign, or of the wrong model: of the gate at the end, and of freezing direction."""
-    one = trainer()
-    ungated, one.hook(Gating).gates = gaussians_of(one.model), [fit(0.1)]
-    before = one.psnr(one.views)
+    training = trainer()
+    ungated, training.hook(Gating).gates = gaussians_of(training.model), [fit(0.1)]
+    before = training.psnr(training.views)
     faint = {name: x.clone() for name, x in ungated[0].items()} | {"opacities": ungated[0]["opacities"] - 1}
-    become(one.model, (faint, None))
-    after = one.psnr(one.views)
+    become(training.model, (faint, None))
+    after = training.psnr(training.views)
     assert abs(after - before) > 0.1
-    one.hook(Gating).compare(ungated, one.views)
-    assert one.hook(Gating).gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
-    frozen = without_direction(one.model, one.scene.train)
+    training.hook(Gating).compare(ungated, training.views)
+    assert training.hook(Gating).gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
+    frozen = without_direction(training.model, training.scene.train)
     assert frozen is not None
-    direction = one.hook(Gating).direction
+    direction = training.hook(Gating).direction
     assert direction is not None
-    assert direction.loss_db == pytest.approx(after - one.renderer.psnr(frozen, one.views), abs=1e-9)
+    assert direction.loss_db == pytest.approx(after - training.renderer.psnr(frozen, training.views), abs=1e-9)
     assert direction.loss_db != 0
 
 
@@ -241,17 +241,17 @@ def test_auto_and_a_gate_after_the_fact(
     assert done.returncode == 0, done.stderr
     assert "too few; 12 are needed" in done.stderr + done.stdout
     (folder,) = tmp_path.glob("dnerf/square/auto,*/seed0")
-    found = record.read(folder / record.FILE_NAME)
-    assert found.model == "auto"
-    assert found.effects.time
-    assert found.on_demand is not None
-    assert found.on_demand.screen is not None
-    assert found.on_demand.screen.decision == "undecided"
-    assert found.cost is not None
-    assert found.cost.stage_s["screen"] > 0
+    auto = record.read(folder / record.FILE_NAME)
+    assert auto.model == "auto"
+    assert auto.effects.time
+    assert auto.on_demand is not None
+    assert auto.on_demand.screen is not None
+    assert auto.on_demand.screen.decision == "undecided"
+    assert auto.cost is not None
+    assert auto.cost.stage_s["screen"] > 0
     loaded = load_run(folder)
     assert loaded.config.model.name == "7dgs"
-    assert len(loaded.model) == found.cost.num_gaussians
+    assert len(loaded.model) == auto.cost.num_gaussians
 
     plain = gsbench(*overrides(square, tmp_path, "model=7dgs", "train.iterations=60"))
     assert plain.returncode == 0, plain.stderr

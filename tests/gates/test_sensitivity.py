@@ -46,9 +46,9 @@ def views_of(model: GaussianModel, seed: int) -> list[View]:
     film = []
     for i in range(VIEWS):
         draws = torch.rand(3, generator=random).tolist()
-        seen, time = camera(6.28 * draws[0], 1.6 * draws[1] - 0.8, SIZE), draws[2]
-        image = rasterize_slice(model.slice(CameraTime.of(seen, time)), seen, BLACK, model.backend).image[0]
-        film.append(View(str(i), seen, time, image + 0.02 * torch.randn(image.shape, generator=random)))
+        at, time = camera(6.28 * draws[0], 1.6 * draws[1] - 0.8, SIZE), draws[2]
+        image = rasterize_slice(model.slice(CameraTime.of(at, time)), at, BLACK, model.backend).image[0]
+        film.append(View(str(i), at, time, image + 0.02 * torch.randn(image.shape, generator=random)))
     return film
 
 
@@ -72,10 +72,10 @@ def brute_force(model: GaussianModel, views: list[View], simplification: Simplif
         changed = slice_of(model, simplification, live, query)
         before = rasterize_slice(live, view.camera, BLACK, model.backend).image[0]
         for i in range(len(model)):
-            one = Gaussians3D(*(x.clone() for x in tensors_of(live)))
-            for x, y in zip(tensors_of(one), tensors_of(changed), strict=True):
+            simplified = Gaussians3D(*(x.clone() for x in tensors_of(live)))
+            for x, y in zip(tensors_of(simplified), tensors_of(changed), strict=True):
                 x[i] = y[i]
-            x = rasterize_slice(one, view.camera, BLACK, model.backend).image[0] - before
+            x = rasterize_slice(simplified, view.camera, BLACK, model.backend).image[0] - before
             errors[i] += (2 * ((before - view.image) * x).sum()).clamp(min=0) + x.square().sum()
     return errors
 
@@ -93,8 +93,7 @@ def test_prediction_against_brute_force(name: str) -> None:
     views = views_of(model, 1)
     predicted = probe(model, views, BLACK, draws=64)
     queries = [CameraTime.of(view.camera, view.time) for view in views]
-    seen = [model.slice(query) for query in queries]
-    for simplification in simplifications_of(model, queries, seen):
+    for simplification in simplifications_of(model, queries, [model.slice(query) for query in queries]):
         true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
         # The image is linear in opacities and colours, and not in what moves (gsbench/gates/sensitivity.py).
         linear = simplification.raw is None or simplification.order is not None
@@ -135,19 +134,18 @@ def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
     with r = -x / 2, where it would be an improvement, nothing.
     """
     model, N = trained_a_little("3dgs", 0), 4
-    query = CameraTime.at(camera(0.3, 0.2, SIZE).center, None)
-    seen = camera(0.3, 0.2, SIZE)
-    live = model.slice(query)
-    image = rasterize_slice(live, seen, BLACK, model.backend).image[0]
+    at = camera(0.3, 0.2, SIZE)
+    live = model.slice(CameraTime.of(at, None))
+    image = rasterize_slice(live, at, BLACK, model.backend).image[0]
 
     def removed(truth: Tensor) -> Tensor:
-        return probe(model, [View("0", seen, None, truth)], BLACK).errors["removed"]
+        return probe(model, [View("0", at, None, truth)], BLACK).errors["removed"]
 
     plain = removed(image)
     for i in live.opacities.argsort(descending=True)[:N].tolist():
         without = live.opacities.clone()
         without[i] = 0
-        x = rasterize_slice(live._replace(opacities=without), seen, BLACK, model.backend).image[0] - image
+        x = rasterize_slice(live._replace(opacities=without), at, BLACK, model.backend).image[0] - image
         assert x.square().sum() > 1e-3
         assert float(removed(image - x / 2)[i] - plain[i]) == pytest.approx(float(x.square().sum()), rel=1e-3)
         assert float(removed(image + x / 2)[i]) == pytest.approx(float(plain[i]), rel=1e-3)
@@ -170,10 +168,10 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     """Catches a draw that is not the seed's, and an order of views that depends on the threads."""
     model = trained_a_little("7dgs", 0)
     views = views_of(model, 1)[:6]
-    found = []
+    errors = []
     for seed, count in ((1, 1), (1, 3), (2, 1)):
         torch.set_num_threads(count)
-        found.append(probe(model, views, BLACK, seed=seed).errors)
-    first, second, other = found
+        errors.append(probe(model, views, BLACK, seed=seed).errors)
+    first, second, other = errors
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["removed"], other["removed"])

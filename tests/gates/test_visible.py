@@ -39,11 +39,11 @@ def test_when_a_gaussian_is_seen() -> None:
             shown[:, i] |= model.slice_geometry(raw, query)[2] >= ALPHA_MIN
     at = torch.tensor([view.time for view in views])
     for row in range(N):
-        seen = at[shown[row]]
-        if not len(seen):
+        times_shown = at[shown[row]]
+        if not len(times_shown):
             assert intervals[row].tolist() == [math.inf, -math.inf]
             continue
-        torch.testing.assert_close(intervals[row], torch.stack([seen.min() - gap, seen.max() + gap]))
+        torch.testing.assert_close(intervals[row], torch.stack([times_shown.min() - gap, times_shown.max() + gap]))
     assert intervals[:5, 0].isinf().all()
     assert not intervals[5:, 0].isinf().all()
     assert (intervals[:, 1] - intervals[:, 0]).max() < 1 or shown.float().mean() < 0.9, (
@@ -76,7 +76,7 @@ def test_agr_rests_unseen() -> None:
     assert torch.equal(resting.effect_sets.intervals, intervals[again[: resting.effect_sets.refined]])
     assert not (again < 5).any(), "Gaussians that are never seen cost nothing to remove"
     for view in views:
-        a, b = (render(one, view.camera, view.time, BLACK) for one in (gated, resting))
+        a, b = (render(shown, view.camera, view.time, BLACK) for shown in (gated, resting))
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
     asleep = share_asleep(resting, views)
     assert asleep is not None

@@ -38,22 +38,25 @@ def blobs(count: int = 60, seed: int = 0) -> Gaussians3D:
     return Gaussians3D(means, factors, torch.full((count,), 0.95), torch.rand(count, 3, generator=random))
 
 
-def shuffled(views: list[View]) -> list[View]:
-    """The views in another order, always the same one."""
+def scene_of(name: str, views: list[View]) -> Scene:
+    """A scene of views on black, in no order of time, as in the files of many data sets."""
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(7)).tolist()
-    return [views[i] for i in order]
+    extent = scene_extent(torch.stack([view.camera.viewmat for view in views]))
+    return Scene(name, [views[i] for i in order], [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+
+
+def draw(world: World, at: Camera, moment: float) -> Tensor:
+    return rasterize_slice(world(moment), at, torch.zeros(3), AUTO).image[0]
 
 
 def filmed(world: World, views: int = 48, seed: int = 1, *, orbit: bool = False, times: Tensor | None = None) -> Scene:
-    """Film a world, one view a moment: from random places, or on one slow turn around it (`orbit`).
-
-    The views are in no order of time, as in the files of many data sets.
+    """Film a world, one view a moment, from random positions.
 
     Args:
         world: its Gaussians at a time.
         views: of the training.
-        seed: of the places.
-        orbit: the camera moves along with time.
+        seed: of the positions.
+        orbit: the camera makes one slow turn around the world instead.
         times: [views] that the views say they are of; those at which they were filmed by default.
     """
     random = torch.Generator().manual_seed(seed)
@@ -61,36 +64,32 @@ def filmed(world: World, views: int = 48, seed: int = 1, *, orbit: bool = False,
     for i in range(views):
         moment = i / (views - 1)
         draws = torch.rand(2, generator=random)
-        place = (2 * math.pi * moment, 0.3) if orbit else (2 * math.pi * float(draws[0]), 1.6 * float(draws[1]) - 0.8)
-        seen = camera(*place)
-        image = rasterize_slice(world(moment), seen, torch.zeros(3), AUTO).image[0]
-        film.append(View(f"train/{i}", seen, moment if times is None else float(times[i]), image))
-    extent = scene_extent(torch.stack([view.camera.viewmat for view in film]))
-    return Scene("world", shuffled(film), [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+        turn = (2 * math.pi * moment, 0.3) if orbit else (2 * math.pi * float(draws[0]), 1.6 * float(draws[1]) - 0.8)
+        image = draw(world, camera(*turn), moment)
+        film.append(View(f"train/{i}", camera(*turn), moment if times is None else float(times[i]), image))
+    return scene_of("world", film)
 
 
 def rigged(
     world: World,
     places: int = 6,
     views: int = 8,
-    seed: int = 1,
     *,
-    seen: Callable[[Tensor, float], Tensor] | None = None,
+    exposure: Callable[[Tensor, float], Tensor] | None = None,
     shake: float = 0.0,
     together: bool = False,
 ) -> Scene:
-    """Film a world from places that do not change, each seen several times; the views are in no order of time.
+    """Film a world from positions that do not change, several times from each.
 
     Args:
         world: its Gaussians at a time.
-        places: of cameras.
-        views: of each place.
-        seed: of the places.
-        seen: what becomes of an image at a time, before it is stored in 8 bits: noise, exposure.
+        places: number of positions.
+        views: of each position.
+        exposure: what becomes of an image at a time, before it is stored in 8 bits.
         shake: radians by which the cameras turn around the scene between views.
         together: all cameras fire at the same moments, and not one after the other.
     """
-    random = torch.Generator().manual_seed(seed)
+    random = torch.Generator().manual_seed(1)
     film = []
     stands = [(2 * math.pi * k / places, 1.2 * float(torch.rand(1, generator=random)) - 0.6) for k in range(places)]
     for i in range(places * views):
@@ -98,11 +97,10 @@ def rigged(
         turned = shake * (2 * torch.rand(2, generator=random) - 1)
         azimuth, height = stands[i % places]
         at = camera(azimuth + float(turned[0]), height + float(turned[1]))
-        image = rasterize_slice(world(moment), at, torch.zeros(3), AUTO).image[0]
-        image = image if seen is None else seen(image, moment)
+        image = draw(world, at, moment)
+        image = image if exposure is None else exposure(image, moment)
         film.append(View(f"train/{i}", at, moment, (image.clamp(0, 1) * 255).round().to(torch.uint8)))
-    extent = scene_extent(torch.stack([view.camera.viewmat for view in film]))
-    return Scene("rig", shuffled(film), [], [], (0.0, 0.0, 0.0), extent, None, "made in memory")
+    return scene_of("rig", film)
 
 
 def still(_: float) -> Gaussians3D:
