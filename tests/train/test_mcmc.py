@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from small import CAMERA, moved, started
+from models.small import CAMERA, moved, started
 
 from gsbench.config import DensifyConfig
 from gsbench.models import CameraTime, GaussianModel, build
@@ -39,9 +39,9 @@ def rule(model: GaussianModel, noise: float = 0.0) -> tuple[MCMCDensification, M
 )
 def test_the_sums_of_relocation(o: float, n: int, new: float, c: float) -> None:
     """Catches a binomial of the wrong row, a lost sign and sums in float32, with numbers computed elsewhere."""
-    found = relocated(torch.tensor([o, 0.3]), torch.tensor([n, 1]))
-    assert [float(x[0]) for x in found] == pytest.approx([new, c], abs=6e-5)
-    assert [float(x[1]) for x in found] == pytest.approx([0.3, 1.0])
+    results = relocated(torch.tensor([o, 0.3]), torch.tensor([n, 1]))
+    assert [float(x[0]) for x in results] == pytest.approx([new, c], abs=6e-5)
+    assert [float(x[1]) for x in results] == pytest.approx([0.3, 1.0])
 
 
 @pytest.mark.parametrize("o", [0.01, 0.9, 1 - 1e-6])
@@ -57,9 +57,9 @@ def test_many_copies_do_not_cancel(o: float) -> None:
 def test_rows_are_drawn_in_proportion() -> None:
     """Catches rows of weight zero that are drawn, and weights that are not proportions."""
     weights = torch.tensor([0.0, 1.0, 0.0, 3.0, 0.0])
-    found = drawn(weights, 4000, generator(0)).bincount(minlength=5)
-    assert found[[0, 2, 4]].sum() == 0
-    assert 0.72 < found[3] / 4000 < 0.78
+    counts = drawn(weights, 4000, generator(0)).bincount(minlength=5)
+    assert counts[[0, 2, 4]].sum() == 0
+    assert 0.72 < counts[3] / 4000 < 0.78
 
 
 @pytest.mark.parametrize("name", NAMES)

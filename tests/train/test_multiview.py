@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small import started
+from models.small import started
 from tiny_training import moving_square, train, trainer
 
 from gsbench.config import DensifyConfig
@@ -42,8 +42,8 @@ def four_gaussians() -> GaussianModel:
 
 def weights_of_pixels(model: GaussianModel, view: View) -> torch.Tensor:
     """The blend weight of each Gaussian in each pixel, [H, W, N]: an image whose channels are the Gaussians."""
-    seen = model.slice(CameraTime.of(view.camera, view.time))
-    channels = seen._replace(colors=torch.eye(len(model)))
+    gaussians = model.slice(CameraTime.of(view.camera, view.time))
+    channels = gaussians._replace(colors=torch.eye(len(model)))
     return rasterize_slice(channels, view.camera, torch.zeros(len(model)), REFERENCE).image[0].detach()
 
 
@@ -141,8 +141,8 @@ def of_eight(name: str, opacities: list[float], badness: list[float]) -> tuple[M
 
 def copies(model: GaussianModel, means: torch.Tensor) -> list[int]:
     """How many Gaussians of the model have each of the means."""
-    found: list[int] = (model.splats["means"].detach()[:, None] == means).all(-1).sum(0).tolist()
-    return found
+    counts: list[int] = (model.splats["means"].detach()[:, None] == means).all(-1).sum(0).tolist()
+    return counts
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -152,9 +152,9 @@ def test_only_important_gaussians_of_large_gradient_are_cloned(name: str) -> Non
     density.gradient[:4], density.times_visible[:] = 5.0, 1.0
     assert density.densify(generator(1), has_reset=False, most=100) == 0
     assert len(density.model) == len(density.unseen) == 10
-    found = copies(density.model, means)
-    assert [found[i] for i in (0, 1, 4, 5, 6, 7)] == [1] * 6
-    assert set(found[2:4]) <= {0, 2}  # split or cloned
+    counts = copies(density.model, means)
+    assert [counts[i] for i in (0, 1, 4, 5, 6, 7)] == [1] * 6
+    assert set(counts[2:4]) <= {0, 2}  # split or cloned
     opacities = density.model.splats["opacities"].detach()
     assert opacities[:2].tolist() == pytest.approx([math.log(4), 1.0])
     assert opacities.max().item() == pytest.approx(math.log(4))
@@ -195,13 +195,13 @@ def test_rows_are_drawn_once_in_proportion() -> None:
 def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
     """Catches views whose weights are added in the order that threads come by."""
     model = started(build("7dgs", **OPTIONS["7dgs"]), 300)
-    score, found = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2), []
+    score, scores = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2), []
     for count in (1, 2, 3, 8):
         torch.set_num_threads(count)
-        found.append(score(generator(0)))
-    assert found[0].importance.any()
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+        scores.append(score(generator(0)))
+    assert scores[0].importance.any()
+    for other in scores[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(scores[0], other, strict=True))
 
 
 @pytest.mark.parametrize("name", NAMES)
