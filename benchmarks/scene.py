@@ -69,7 +69,7 @@ def model(
 class NoMoments:
     """Stands for the moments of an optimizer that has not begun."""
 
-    def follow(self, rows: Tensor, fresh: Tensor) -> None:
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
         """Have nothing to move."""
 
     def forget(self, parameter: Tensor) -> None:
