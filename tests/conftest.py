@@ -21,7 +21,7 @@ LONGEST = (
     "test_audit.py",
     "test_adding_a_model.py",
     "test_command_line.py",
-    "test_resume.py",
+    "test_checkpoint.py",
     "test_install.py",
     "test_heap.py",
     "test_end_to_end.py",
