@@ -202,7 +202,7 @@ class Stop:
 class Provenance:
     """The conditions under which a run was measured: commit, versions, machine, settings and date."""
 
-    git_commit: str | None  # with "-dirty" if tracked code was changed; None outside of a git checkout
+    git_commit: str | None  # with "-dirty" if code was changed or added; None outside of a git checkout
     versions: dict[str, str]  # of Python and the packages that results depend on
     device: str  # the name of the processor or GPU
     threads: int  # threads of torch and of the kernels

@@ -46,6 +46,19 @@ class GaussianModel(nn.Module, ABC):
     initial_opacity: ClassVar[float] = 0.1
     warm_up: int = 0  # the step, of 30,000, until which `active.warms_up`; a model with a static first stage sets it
 
+    def __init_subclass__(cls, **more: Any) -> None:
+        """Raise InputError if `cls` overrides `condition`, but inherits a `slice_geometry` that does not call it."""
+        super().__init_subclass__(**more)
+        first: dict[str, Any] = {  # the class whose method is called
+            name: next(base for base in cls.__mro__ if name in vars(base)) for name in ("condition", "slice_geometry")
+        }
+        condition, sliced = first.values()
+        calls_it = getattr(sliced.condition, "__isabstractmethod__", False)  # that of GaussianModel and GatedModel
+        if not calls_it and cls.__mro__.index(condition) < cls.__mro__.index(sliced):
+            raise InputError(f"{cls.__name__}: expected slice_geometry in {condition.__name__}, which overrides "
+                             f"condition, got that of {sliced.__name__}, which does not call it: override it too",
+                             docs="adding_a_model.md")  # fmt: skip
+
     def __init__(
         self,
         *,

@@ -63,7 +63,7 @@ RUNS = (
     Column("machine", "", str, "processor, memory and threads; times are comparable only within one"),
     Column("device", "provenance.device", str, "the processor or GPU of the training"),
     Column("threads", "provenance.threads", int, "threads of torch and of the kernels"),
-    Column("git_commit", "provenance.git_commit", object, 'the commit, with "-dirty" if tracked code was changed'),
+    Column("git_commit", "provenance.git_commit", object, 'the commit, with "-dirty" if code was changed or added'),
     Column("config_hash", "provenance.config_hash", str, "SHA-256 of all settings"),
     Column("data_hash", "provenance.data_hash", str, "SHA-256 of the images and cameras"),
     Column("time", "provenance.time", str, "when the run ended, UTC"),

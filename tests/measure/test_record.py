@@ -351,7 +351,7 @@ def test_records_and_tables_do_not_import_torch():
 
 
 def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches records called dirty because another's record was written over, and changed code that is not."""
+    """Catches records called dirty because another's record was written over, and changed or new code that is not."""
     place = tmp_path / "gsbench/measure/provenance.py"
     for path in (place, tmp_path / "results/record.json", tmp_path / "README.md"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -362,7 +362,12 @@ def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.Monkey
     clean = git_commit()
     (tmp_path / "results/record.json").write_text("2")
     (tmp_path / "README.md").write_text("2")
+    (tmp_path / "data.npy").write_text("2")
     assert git_commit() == clean
+    added = tmp_path / "gsbench/balls.py"
+    added.write_text("1")
+    assert git_commit() == f"{clean}-dirty"
+    added.unlink()
     place.write_text("2")
     assert git_commit() == f"{clean}-dirty"
 

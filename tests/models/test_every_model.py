@@ -189,7 +189,7 @@ def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
     """Catches a model that gates take and cannot simplify, and a checkpoint of other rows than were gated."""
     model = made(name, agr).requires_grad_(False)
     if not has_gates(model):
-        with pytest.raises(InputError, match="is no GatedModel"):
+        with pytest.raises(InputError, match=r"is no GatedModel|inherits its methods for gates"):
             as_gated(model)
         return
     queries = [QUERY, CameraTime.at(-CAMERA, 0.7)]
@@ -251,6 +251,8 @@ def test_a_model_holds_it(name: str) -> None:
     """Catches a model that forgets lambda, its unit of time or the exponents, or that lengthens what is long enough."""
     model = started(build(name, **awkward(name)))
     raw = {key: value.data for key, value in model.splats.items()}
+    if "times" not in raw:
+        pytest.skip("its Gaussians have no times")
     bounded = getattr(model, "bounded_times", False) or name == "dgs"
     raw["times"].fill_(0.0 if bounded else 0.5)  # the sigmoid of 0 is 0.5
     parameter, column, tiny = IN_TIME.get(name) or ("log_diagonal", model.rows["t"][0], -20.0)  # type: ignore[index]

@@ -56,6 +56,22 @@ def test_an_installed_package_lists_its_models(folder: Path) -> None:
     assert find("packaged").__module__ == "models_of_a_package"
 
 
+@pytest.mark.parametrize(("base", "more", "is_refused"), [
+    ("gaussians3d.Gaussians3DModel", "", True), ("gated.GatedModel", "", False),
+    ("gaussians3d.Gaussians3DModel", "    slice_geometry = GatedModel.slice_geometry\n", False),
+])  # fmt: skip
+def test_a_condition_that_no_slice_calls(base: str, more: str, is_refused: bool) -> None:
+    """Catches a derived model whose `condition` is ignored, since its base slices by a kernel."""
+    module, name = base.split(".")
+    code = f"from gsbench.models.{module} import {name}\nfrom gsbench.models.gated import GatedModel\n"
+    code += f"class Wide({name}):\n    def condition(self, raw, query):\n        return None\n{more}"
+    if is_refused:
+        with pytest.raises(InputError, match="Wide: expected slice_geometry in Wide"):
+            exec(code, {"__name__": "models_of_mine"})
+    else:
+        exec(code, {"__name__": "models_of_mine"})
+
+
 def test_a_name_that_is_taken(folder: Path) -> None:
     """Catches a stranger's model that stands in the place of 7DGS in silence; the same class twice is no clash."""
     (folder / "models_of_a_thief.py").write_text(MODEL.replace("NAME", "7dgs"))

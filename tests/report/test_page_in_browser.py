@@ -82,6 +82,17 @@ def test_nothing_is_wider_than_the_screen(visit, name, width):
     assert page.evaluate(loose) == 0
 
 
+def test_a_number_stands_under_its_header(visit):
+    """Catches numbers at the left of a column whose header is at the right."""
+    page = visit(width=1440)
+    apart = """() => [...document.querySelectorAll('td.number')].filter((cell) => {
+        const text = cell.firstChild.getBoundingClientRect(), box = cell.getBoundingClientRect();
+        return box.right - text.right > 13;
+    }).length"""
+    assert page.locator("td.number").count() > 0
+    assert page.evaluate(apart) == 0
+
+
 def test_the_slider_by_mouse_and_keyboard(visit):
     """Catches a slider that does not move the edge between the images, and choices that do not change them."""
     page = visit()

@@ -14,7 +14,7 @@ from gsbench.kernels.adam import adam_all
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.run.checks import check_values
-from gsbench.train.hooks import hook_types
+from gsbench.train.hooks import Hook, hook_types
 from gsbench.train.hooks.best import Best
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
@@ -148,6 +148,12 @@ def test_every_hook_is_in_the_table_of_the_docs() -> None:
     """Catches a hook that no page names."""
     page = (ROOT / "docs/adding_a_training_option.md").read_text()
     assert [hook.name for hook in hook_types() if f"`{hook.name}`" not in page] == []
+
+
+def test_a_hook_has_a_name() -> None:
+    """Catches a hook whose training fails at its end, when a checkpoint asks for the name."""
+    with pytest.raises(InputError, match="Nameless: expected the hook's `name`"):
+        type("Nameless", (Hook,), {})
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,11 @@ class Hook:
     name: ClassVar[str]  # its key in a checkpoint
     measures: ClassVar[bool] = False  # whether its state stays when Gaussians of an earlier iteration are restored
 
+    def __init_subclass__(cls) -> None:
+        """Raise InputError if a hook has no name of its own."""
+        if "name" not in vars(cls):
+            raise InputError(f"{cls.__module__}.{cls.__qualname__}: expected the hook's `name`, got none")
+
     def __init__(self, training: Training) -> None:
         """Start at step 0 of a training, whose model has its initial Gaussians."""
         self.training = training
