@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -205,6 +206,11 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     assert sum(copied.gate.rows.values()) == N
     assert copied.gate.bytes < copied.gate.bytes_before == model.stored_bytes()
     assert model.effect_sets is None
+    predicted = choose(sensitivity, model, copied.gate.share).predicted
+    assert copied.gate.predicted_db == pytest.approx(10 * math.log10(1 + predicted))
+    harmless = gate_within(model, sensitivity, 0.3, lambda _: 30.0)
+    assert harmless is not None
+    assert harmless.gate.share == 0.1, "a share of 0.2 is predicted to cost more than twice the allowed 0.3 dB"
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None
     exact = [psnr(view.image, view.image) for view in views[:5]]
