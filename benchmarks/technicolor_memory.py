@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gsbench.config import CONF, register_schema
 from gsbench.measure.machine import processor_name
 from gsbench.measure.quality import evaluate
-from gsbench.run.attempt import Attempt
+from gsbench.run.execution import Execution
 from gsbench.run.identity import identify
 from gsbench.scenes.technicolor import CAMERAS, COLUMNS, TEST_CAMERA
 
@@ -89,12 +89,12 @@ def measure(folder: Path, steps: int, gaussians: int) -> None:
             "+exp=technicolor", "scene=Birthday", "model=4dgs", f"data.root={folder / 'data'}", "resume=false",
             f"results={folder / 'results'}", f"train.iterations={steps}", f"data.initial_points={gaussians}",
         ])  # fmt: skip
-    attempt = Attempt(identify(composed))
+    execution = Execution(identify(composed))
     began = time.perf_counter()
-    model, scene = attempt.prepare()
+    model, scene = execution.prepare()
     told(f"loaded {len(scene.train)} training and {len(scene.test)} test views of camera {TEST_CAMERA}", began)
     began = time.perf_counter()
-    trainer = attempt.fit(model, scene)  # it starts a new peak
+    trainer = execution.fit(model, scene)  # it starts a new peak
     told(f"{steps} steps of batch {trainer.config.train.batch_size} with {len(model)} Gaussians", began)
     view = scene.test[0]
     began = time.perf_counter()

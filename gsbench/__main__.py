@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from gsbench import usage
 from gsbench.config import CONF, HERE, register_schema
 from gsbench.errors import InputError, one_line
-from gsbench.launch import command, sweep, task
+from gsbench.launch import command, processes, sweep
 from gsbench.process.ending import end_with
 from gsbench.run.stop import Stopped, listen
 from gsbench.version import __version__
@@ -68,7 +68,7 @@ def _run(parsed: command.Command) -> int:
         runs, is_sweep = command.runs_of(parsed)
         configs = [command.compose_run(overrides) for overrides in runs]
         if not is_sweep:
-            ended = task.do(configs[0])
+            ended = processes.do(configs[0])
             return 0 if ended.reason is None else BAD_INPUT if ended.is_refused else FAILED
         outcome = sweep.launch(configs, parsed.config_dir)
     if outcome.broken:

@@ -52,3 +52,11 @@ def shared_data() -> Path:
     if not data.is_dir():
         pytest.skip(f"needs the shared data sets, not found at {data} (set GSBENCH_SHARED)")
     return data
+
+
+@pytest.fixture(scope="session")
+def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set with one scene, a moving square, which tests only read."""
+    from tiny_run import write_moving_square
+
+    return write_moving_square(tmp_path_factory.mktemp("data"))

@@ -26,7 +26,7 @@ IMPORTED = (
     "cv2",
     "gsbench.measure.perceptual",
     "gsbench.models.registry",
-    "gsbench.run.run",
+    "gsbench.run.execution",
     "gsbench.launch.sweep",
 )
 _servers: list[subprocess.Popen[str]] = []  # one, from the first command on; its input ends with this process

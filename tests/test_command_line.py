@@ -148,11 +148,6 @@ def test_a_data_root_too_high_or_too_low_names_the_right_one(
     assert f'type "data.root={(tmp_path / place).parent}"' in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
-
-
 def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, tmp_path: Path) -> None:
     """Catches runs that overwrite each other, AGR that cannot be switched, and finished runs that are done again."""
     sweep = ["-m", *overrides(square, tmp_path), "model=4dgs,3dgs", "agr=true,false"]

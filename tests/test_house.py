@@ -34,16 +34,12 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench": 6,
     "gsbench/fetch": 5,
     "gsbench/kernels": 40,
-    "gsbench/measure": 14,
     "gsbench/models": 10,
     "gsbench/raster": 1,
     "gsbench/report": 13,
-    "gsbench/run": 6,
     "tests": 5,
     "tests/models": 46,
     "tests/report": 30,
-    "tests/run": 36,
-    "tests/slurm": 13,
 }
 
 

@@ -9,12 +9,6 @@ from tiny_run import main_here, overrides, write_moving_square
 
 from gsbench.measure import record
 
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
-
-
 NAMES = ("my data (1)", "Küche", "100%%#x", "a=1,b=2", '$HOME `x` "it\'s"', "日本 [3]", "a,b", "x!\\y", "~&;<|>")
 
 

@@ -92,8 +92,8 @@ def run_here(*words: str) -> tuple["Record", Path]:
     from omegaconf import OmegaConf
 
     from gsbench.config import CONF, register_schema
+    from gsbench.run.execution import execute
     from gsbench.run.identity import identify
-    from gsbench.run.run import run
 
     register_schema()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
@@ -101,6 +101,7 @@ def run_here(*words: str) -> tuple["Record", Path]:
         choices = OmegaConf.to_container(composed.hydra.runtime.choices)
         OmegaConf.set_struct(composed, False)
         del composed.hydra
-        record, folder = run(composed, choices, words), identify(composed, choices).folder
+        spec = identify(composed, choices, words)
+        record = execute(spec)
     assert record is not None
-    return record, folder
+    return record, spec.folder

@@ -13,11 +13,10 @@ from gsbench.gates.picture import draw
 from gsbench.measure import record as records
 from gsbench.measure.images import write_png
 from gsbench.measure.record import Record
-from gsbench.run.attempt import Attempt
 from gsbench.run.checks import check_folder, evaluated_views
-from gsbench.run.identity import Run
-from gsbench.run.load import load_run, own_root, scene_of, typed_config
-from gsbench.run.run import write
+from gsbench.run.execution import Execution, write
+from gsbench.run.identity import RunSpec
+from gsbench.run.load import load_run, scene_of, trusted_root, typed_config
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 
@@ -26,12 +25,8 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     """Remove time, direction or AGR from a finished run's Gaussians that do not need them.
 
     The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and
-    direction from a Gaussian. This function may do that. Return the record and the folder of the new run.
-
-    Args:
-        folder: the folder of the finished run, which is not changed.
-        budget_db: how many dB of PSNR on the validation split may be lost.
-        data_root: the folder of the data set; None for the folder in the run's settings.
+    direction from a Gaussian. This function may do that. Return the record and the folder of the new run; `folder` is
+    not changed. At most `budget_db` dB of PSNR on val are lost.
 
     Raises:
         InputError: the run is not finished, effects were already removed at its end, or its data do not exist or have
@@ -47,21 +42,21 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
         raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate={gate}")
     plain["effects"] = {"gate": "end", "budget_db": budget_db}
     config = typed_config(plain, path)
-    config.data.root = plain["data"]["root"] = data_root or own_root(config.data.root, folder)
+    config.data.root = plain["data"]["root"] = data_root or trusted_root(config.data.root, folder)
     old = records.read(folder / records.FILE_NAME)
     words = ["gate=end"] + ([] if budget_db == EffectsConfig().budget_db else [f"budget_db={budget_db}"])
     variant = ",".join(([old.variant] if old.variant else []) + words)
     new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
     check_folder(new)
-    attempt = Attempt(Run(config, plain, new, old.model, variant, overrides))
+    execution = Execution(RunSpec(config, plain, new, old.model, variant, overrides))
     try:
-        model, scene = attempt.prepare()
+        model, scene = execution.prepare()
     except InputError as error:
         raise InputError(f"{error}; if the data set is elsewhere now, name its folder by --data-root") from None
     if scene.fingerprint != former.data:
         raise InputError(f"{folder}: expected the data that it was trained on, {scene.name} has changed since")
-    trainer = attempt.trainer(model, scene)
+    trainer = execution.trainer(model, scene)
     trainer.load_state_dict(former.state)
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
@@ -69,9 +64,9 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     trainer.hook(Gating).finish(by_halves=True)
     content = Checkpoint(training_hash(plain), former.data, trainer.state_dict(), plain, former.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)
-    record = attempt.measure(trainer)
+    record = execution.measure(trainer)
     write(record, new)
-    attempt.draw()
+    execution.draw()
     return record, new
 
 

@@ -166,7 +166,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
 def _job(folder: Path, number: int) -> int:
     """Do run `number` of the plan in `folder`, in a job of Slurm."""
     from gsbench.launch.command import compose_run, hydra_with
-    from gsbench.launch.task import do_planned
+    from gsbench.launch.processes import do_planned
 
     stop.listen()
     sys.path.append(os.getcwd())  # `python -P` leaves it out, but a model of the user's may be there

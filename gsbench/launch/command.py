@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, register_schema
-from gsbench.config_roles import facts
+from gsbench.config_roles import facts, flat
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 
@@ -143,7 +143,12 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
     with read_write(config), open_dict(config):
         del config["hydra"]
     check_complete(config)
-    facts("launch.by").check("launch.by", config.launch.by)
+    try:
+        launch: Any = OmegaConf.to_container(config.launch, resolve=True)
+    except OmegaConfBaseException as error:
+        raise InputError(explain(error)) from None
+    for name, value in flat(launch, "launch."):  # before a job is submitted; the run itself checks all other keys
+        facts(name).check(name, value)
     return RunConfig(list(overrides), config, choices)
 
 

@@ -45,9 +45,7 @@ class Estimate:
     def hours(self, at_once: int = 1, quantity: str = "seconds") -> float:
         """Return the hours until all runs with an estimate are done, if `at_once` train at a time, the longest first.
 
-        Args:
-            at_once: the number of runs at a time, each as fast as the finished ones.
-            quantity: `seconds`, `least` or `most`.
+        `quantity` is `seconds`, `least` or `most`.
         """
         known = [value for run in self.runs if (value := getattr(run, quantity)) is not None]
         return span(known, at_once) / 3600

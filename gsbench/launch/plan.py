@@ -69,11 +69,7 @@ def write(plan: Plan, folder: Path) -> None:
 
 
 def read(path: Path) -> Plan:
-    """Read the plan of a sweep from its file.
-
-    Raises:
-        InputError: the file is not valid; the message names the file and the field.
-    """
+    """Read the plan of a sweep; an InputError names the file and the field that are not valid."""
     return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path), MOST_RUNS)
 
 
@@ -115,10 +111,6 @@ def time_left(folder: Path, at_once: int) -> str:
 
     The other runs are expected to take as long as the mean of those that this sweep has trained. The line is empty
     before the first of these, and after the last run.
-
-    Args:
-        folder: the folder of the sweep's plan.
-        at_once: the number of runs at a time.
     """
     total, outcomes = len(read(folder / FILE_NAME).runs), read_ended(folder)
     durations = [outcome.seconds for outcome in outcomes.values() if outcome.seconds is not None]

@@ -1,28 +1,32 @@
-"""Submit the runs of a sweep to Slurm as a job array (`+launch=slurm`), and wait for its end.
+"""Submit the runs of a sweep to Slurm as a job array (`+launch=slurm`), wait for its end, and ask for states of jobs.
 
 The script of the array does its run by `python -m gsbench.launch job`, in a container image if `launch.container` names
 one. Slurm signals a run before its time limit (USR2): the run saves a checkpoint and ends with the exit status STOPPED,
 and the script, which is outside of the image, puts its job back into the queue.
+
+A status asks Slurm too, so that this module imports neither Hydra nor torch.
 """
 
 import os
 import shlex
 import shutil
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from gsbench.errors import InputError, printable
+from gsbench.errors import InputError, one_line, printable
 from gsbench.launch import plan
-from gsbench.launch.command import RunConfig
 from gsbench.launch.plan import Plan
-from gsbench.launch.queue import ask, queue
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from gsbench.launch.command import RunConfig
 
 SUBMITTING = 300  # time limit of sbatch, seconds; after it, jobs may run that no plan knows
 POLL = 10.0  # seconds between two looks at Slurm's queue
@@ -47,7 +51,7 @@ exit $status
 """
 
 
-def launch(configs: Sequence[RunConfig], planned: Plan, folder: Path) -> None:
+def launch(configs: Sequence["RunConfig"], planned: Plan, folder: Path) -> None:
     """Submit the runs of the plan in `folder` as a job array, and wait until its last job has left the queue.
 
     Raises:
@@ -86,7 +90,7 @@ def launch(configs: Sequence[RunConfig], planned: Plan, folder: Path) -> None:
         time.sleep(POLL)
 
 
-def in_container(configs: Sequence[RunConfig], folder: Path) -> str:
+def in_container(configs: Sequence["RunConfig"], folder: Path) -> str:
     """Return the words of a shell that start Python in the container image, with the folders of the runs bound.
 
     The modules of the image come first (`python -P`): a checkout in the current folder has no kernels for the image.
@@ -112,8 +116,11 @@ def in_container(configs: Sequence[RunConfig], folder: Path) -> str:
     return f"{settings.container_command}{gpu} {bound}"
 
 
-def _paths(config: DictConfig) -> Iterator[str]:
+def _paths(config: "DictConfig") -> Iterator[str]:
     """Yield the files and folders that a config names."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
     for key in PATHS:
         try:
             value = OmegaConf.select(config, key)
@@ -121,3 +128,65 @@ def _paths(config: DictConfig) -> Iterator[str]:
             continue
         if value is not None and not value.startswith("pkg://"):
             yield value
+
+
+ANSWERING = 30  # time limit of every other answer of Slurm, seconds
+
+
+@dataclass(frozen=True)
+class Queue:
+    """The states of the jobs in Slurm's queue, with the job's name `<array>_<task>` as key.
+
+    `silent` is the reason why Slurm did not answer, or None.
+    """
+
+    states: dict[str, str]  # the state and, for a pending job, the reason
+    silent: str | None = None
+
+
+def queue(jobs: Iterable[str]) -> Queue:
+    """Return the states of `jobs` from one call of Slurm's squeue; without jobs, squeue is not called."""
+    arrays = sorted({job.partition("_")[0] for job in jobs})
+    if not arrays:
+        return Queue({})
+    answer = ask("squeue", "--noheader", "--array", "--jobs", ",".join(arrays), "--format=%F %K %T %r")
+    if isinstance(answer, str):
+        return Queue({}, answer)
+    if answer.returncode and "Invalid job id" not in answer.stderr:  # none of the jobs is known any more
+        return Queue({}, (answer.stderr.splitlines() or ["squeue failed without a message"])[-1])
+    states = {}
+    for line in answer.stdout.splitlines():
+        job, task, state, reason = line.split(maxsplit=3)
+        states[job if task == "N/A" else f"{job}_{task}"] = f"{state} {reason}" if state == "PENDING" else state
+    return Queue(states)
+
+
+def endings(jobs: Iterable[str]) -> dict[str, str]:
+    """Return how jobs ended, such as `OUT_OF_MEMORY` or `FAILED, exit 9:0`, from one call of Slurm's sacct.
+
+    The result is empty if Slurm keeps no accounts of jobs or does not answer.
+    """
+    wanted = set(jobs)
+    arrays = ",".join(sorted({job.partition("_")[0] for job in wanted}))
+    if not arrays:
+        return {}
+    answer = ask("sacct", "--noheader", "--parsable2", "--jobs", arrays, "--format=JobID,State,ExitCode")
+    if isinstance(answer, str) or answer.returncode:
+        return {}
+    ends: dict[str, str] = {}
+    for line in answer.stdout.splitlines():
+        name, state, code = line.split("|")
+        job, _, step = name.partition(".")
+        if job in wanted and (not step or state == "OUT_OF_MEMORY"):  # only a job's step reports lack of memory
+            ends[job] = state if state == "OUT_OF_MEMORY" or code == "0:0" else f"{state}, exit {code}"
+    return ends
+
+
+def ask(*command: str, seconds: float = ANSWERING) -> subprocess.CompletedProcess[str] | str:
+    """Run a Slurm command, and return its result or a text that says why there is none."""
+    if shutil.which(command[0]) is None:
+        return f"{command[0]} is not on this machine"
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return one_line(error)

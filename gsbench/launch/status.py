@@ -13,7 +13,7 @@ from typing import Any
 from gsbench.errors import InputError, one_line
 from gsbench.launch import plan
 from gsbench.launch.plan import Ended, Identity, Plan, identity
-from gsbench.launch.queue import Queue, endings, queue
+from gsbench.launch.slurm import Queue, endings, queue
 from gsbench.measure.record import CHECKPOINT, MAX_FILE, PUBLISHED
 from gsbench.measure.record import FILE_NAME as RECORD
 from gsbench.reading import read_file
@@ -207,10 +207,7 @@ def _can_start(run: PlannedRun, queue: Queue) -> bool:
 
 
 def _explained(experiment: Experiment, run: Identity, state: RunStatus, ends: dict[str, str]) -> RunStatus:
-    """Add the outcome of its Slurm job, and the log line that names the cause, to a failed or lost run.
-
-    Other runs, and runs with a record, are returned unchanged.
-    """
+    """Add to a broken run without a record how its Slurm job ended, and the line of its log that says why."""
     if state.state not in BROKEN or state.job is None or state.record is not None:
         return state
     parts = [state.reason or ""]
@@ -224,11 +221,10 @@ def _explained(experiment: Experiment, run: Identity, state: RunStatus, ends: di
 
 
 def cause_in(log: Path) -> str:
-    """Return the line of a log that best explains a failure.
+    """Return the line of a log that best explains a failure: the last that names a cause, such as lack of memory.
 
-    This is the last line that names a cause, such as lack of memory. If there is none, it is the last line that reports
-    an error, or else the last line. If the log reports only an exit code, it is the first other line, which the shell
-    wrote.
+    Else it is the last line that reports an error, or the last line. If the log reports only an exit code, it is the
+    first other line, which the shell wrote.
     """
     if not log.is_file():  # reading a pipe would block
         return "(no log)"
@@ -277,10 +273,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def record_status(path: Path) -> tuple[list[str], RecordStatus]:
-    """Read the overrides and the outcome of a run from its record.
-
-    This is much faster than reading and validating the whole record.
-    """
+    """Read the overrides and the outcome of a run from its record, much faster than by validating it all."""
     written = path.stat().st_mtime
     try:
         plain: Any = json.loads(read_file(path, str(path), MAX_FILE))

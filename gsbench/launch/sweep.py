@@ -12,11 +12,11 @@ from omegaconf import DictConfig
 
 from gsbench.config_roles import launches
 from gsbench.errors import InputError, printable
-from gsbench.launch import parallel, plan, slurm
+from gsbench.launch import plan, slurm
 from gsbench.launch.command import RunConfig, compose_run, hydra_with
 from gsbench.launch.plan import Plan, identity
+from gsbench.launch.processes import do_planned, launch_parallel
 from gsbench.launch.status import BROKEN, Experiment, PlannedRun, RunStatus, read, status
-from gsbench.launch.task import do_planned
 from gsbench.run.grammar import quoted_value
 
 
@@ -52,7 +52,7 @@ def launch(configs: Sequence[RunConfig], config_dir: Path | None) -> Outcome:
         if planned.launcher == "slurm":
             slurm.launch(configs, planned, folder)
         elif planned.launcher == "parallel":
-            parallel.launch(configs, folder)
+            launch_parallel(configs, folder)
         else:
             for number, config in enumerate(configs):
                 do_planned(config, folder, number)
@@ -75,12 +75,9 @@ def _short(path: Path) -> str:
 def retry(experiment: Experiment, more: Sequence[str]) -> int:
     """Launch those runs of sweeps again that were stopped, failed, are lost or not started; return their number.
 
-    Runs that were launched alike are launched together. If they cannot be launched, for example because the folder in
-    which their command was typed is gone, the reason is printed on stderr, and the others are still launched.
-
-    Args:
-        experiment: the state of the experiment, read just before.
-        more: overrides of the launch settings, such as more memory.
+    Runs that were launched alike are launched together, with the launch settings `more`. If they cannot be launched,
+    for example because the folder in which their command was typed is gone, the reason is printed on stderr, and the
+    others are still launched.
 
     Raises:
         InputError: `more` has an override that is not known or does not belong to the launch settings.

@@ -107,6 +107,6 @@ def _beside(path: Path) -> Path:
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files that killed processes on this host left in `folder`."""
     for path in folder.glob(".*.tmp"):
-        found = re.fullmatch(rf"\..+\.{HOST}\.(\d+)\.[0-9a-f]{{8}}\.tmp", path.name)
-        if found and not Path(f"/proc/{found[1]}").exists():
+        match = re.fullmatch(rf"\..+\.{HOST}\.(\d+)\.[0-9a-f]{{8}}\.tmp", path.name)
+        if match and not Path(f"/proc/{match[1]}").exists():
             path.unlink(missing_ok=True)

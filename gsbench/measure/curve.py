@@ -20,10 +20,7 @@ class Point(NamedTuple):
 
 @dataclass
 class Curve:
-    """The training curve of a run: its evaluations in order.
-
-    The checkpoint stores the curve, so that a resumed run continues it.
-    """
+    """The training curve of a run: its evaluations in order, which the checkpoint stores."""
 
     points: list[Point] = field(default_factory=list)
 
@@ -31,8 +28,7 @@ class Curve:
         """Append an evaluation to the curve.
 
         Raises:
-            InputError: iteration or seconds are smaller than those of the last evaluation, which happens after a faulty
-                resume.
+            InputError: iteration or seconds are smaller than those of the last evaluation, as after a faulty resume.
         """
         if self.points and (iteration <= self.points[-1].iteration or seconds < self.points[-1].seconds):
             raise InputError(
@@ -74,11 +70,11 @@ class Curve:
         if not self.points:
             return "val not measured yet"
         before, now = (self.points[-2] if len(self.points) > 1 else None), self.points[-1]
-        told = f"{now.seconds:.0f} s of training, val "
+        text = f"{now.seconds:.0f} s of training, val "
         if now.psnr_val is None:
-            return f"{told}-"
+            return f"{text}-"
         change = "" if before is None or before.psnr_val is None else f" ({now.psnr_val - before.psnr_val:+.2f})"
-        return f"{told}{now.psnr_val:.2f} dB{change}"
+        return f"{text}{now.psnr_val:.2f} dB{change}"
 
     def seconds_to(self, psnr: float) -> float | None:
         """Return the training seconds at the first evaluation with at least `psnr` dB, or None if there is none."""

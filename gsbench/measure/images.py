@@ -83,20 +83,12 @@ def rounding_image(values: npt.NDArray[np.float64]) -> Pixels:  # [H, W]
 
 
 def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
-    """Write `image` to `path` as PNG, atomically.
-
-    Raises:
-        InputError: OpenCV cannot encode the image.
-    """
+    """Write `image` to `path` as PNG, atomically."""
     write_atomically(path, png(image))
 
 
 def png(image: Pixels) -> bytes:  # [H, W, 3] RGB
-    """Return an image as the bytes of a PNG file.
-
-    Raises:
-        InputError: OpenCV cannot encode the image.
-    """
+    """Return an image as the bytes of a PNG file."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
         raise InputError(f"expected an image that PNG can hold, got {image.shape} of {image.dtype}")

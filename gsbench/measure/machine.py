@@ -42,23 +42,13 @@ class Hardware:
 
 
 def named(device: str, threads: int, hardware: Hardware | None) -> str:
-    """Return a description of a machine; times of two runs are comparable only if their descriptions are equal.
-
-    Args:
-        device: the name of the processor or GPU.
-        threads: the number of threads of torch and of the kernels.
-        hardware: the processor and memory; None if the record was written before gsbench recorded them.
-    """
+    """Return a description of a machine; times of two runs are comparable only if their descriptions are equal."""
     where = "" if hardware is None or device == hardware.processor else f"{device} in "
     return f"{where}{hardware or device}, {threads} thread{'' if threads == 1 else 's'}"
 
 
 def hardware(instruction_set: str | None = None) -> Hardware:
-    """Return the processor and memory of this machine.
-
-    Args:
-        instruction_set: the instruction set that the CPU kernels use (`gsbench.kernels.instruction_set`).
-    """
+    """Return the processor and memory of this machine; `instruction_set` is that of the CPU kernels."""
     facts = _facts(CPUINFO)
     kind = {name: next((facts[key] for key in keys if key in facts), None) for name, keys in _KEYS.items()}
     kilobytes = _facts(MEMINFO).get("MemTotal", "").partition(" ")[0]
@@ -72,10 +62,7 @@ def processor_name() -> str:
 
 
 def _facts(path: Path) -> dict[str, str]:
-    """Read a file with lines `key : value`, such as /proc/cpuinfo, and return the first value of each key.
-
-    Return an empty dict if the file cannot be read.
-    """
+    """Return the first value of each key in a file of lines `key : value`, such as /proc/cpuinfo; {} without it."""
     try:
         lines = path.read_text().splitlines()
     except OSError:

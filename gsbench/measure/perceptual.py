@@ -88,13 +88,7 @@ BACKBONES = {
 
 
 class Perceptual(nn.Module):
-    """LPIPS with one backbone, as a torch module.
-
-    Args:
-        backbone: the layers of AlexNet or VGG16.
-        trunk: the weights of these layers, with names such as `0.weight`.
-        linear: the weights of LPIPS' five linear layers, [1, C, 1, 1].
-    """
+    """LPIPS with one backbone, whose weights are named as `0.weight`, and five linear layers of [1, C, 1, 1]."""
 
     shift: Tensor
     scale: Tensor

@@ -32,9 +32,9 @@ def provenance(
         config: all settings of the run with references resolved, as plain JSON.
         data_hash: the fingerprint of the scene.
         data_notes: what was decided where the scene's files leave a choice.
-        threads: the number of threads of torch and of the kernels.
+        threads: of torch and of the kernels.
         device: the name of the GPU; None if the run used the CPU.
-        instruction_set: the instruction set that the CPU kernels use; None if they are not built.
+        instruction_set: that of the CPU kernels; None if they are not built.
     """
     here = hardware(instruction_set)
     return Provenance(
@@ -53,13 +53,13 @@ def provenance(
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, gsbench and the installed packages that results depend on."""
-    found = {"python": platform.python_version(), "gsbench": __version__}
+    installed = {"python": platform.python_version(), "gsbench": __version__}
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            installed[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 NO_CODE = ("results", "docs", "*.md")

@@ -255,11 +255,7 @@ class Record:
 
     @property
     def path(self) -> Path:
-        """Return the folder of the run relative to the folder of all results.
-
-        Raises:
-            InputError: a name is not a valid folder name, see `run_path`.
-        """
+        """Return the folder of the run relative to the folder of all results; `run_path` names its errors."""
         return run_path(Path(), self.experiment, self.scene, self.model, self.seed, variant=self.variant)
 
 
@@ -280,20 +276,12 @@ def write(record: Record, path: Path) -> None:
 
 
 def read(path: Path) -> Record:
-    """Read and validate the record at `path`.
-
-    Raises:
-        InputError: the record is not valid; the message names the file and the field.
-    """
+    """Read and validate the record at `path`; an InputError names the file and the field that are not valid."""
     return parsed(parse_json(read_file(path, str(path), MAX_FILE), str(path)), path)
 
 
 def parsed(plain: Any, path: Path | str) -> Record:
-    """Convert plain JSON to a record.
-
-    Raises:
-        InputError: the JSON is not a valid record; the message names `path` and the field.
-    """
+    """Convert plain JSON to a record; an InputError names `path` and the field that are not valid."""
     version = plain.get("version") if isinstance(plain, dict) else VERSION
     if type(version) is not int or version != VERSION:  # checked first, because another version has other keys
         raise InputError(f"{path}: version: expected {VERSION}, got {ascii(version)[:80]}; run again with this gsbench")
@@ -304,25 +292,16 @@ def parsed(plain: Any, path: Path | str) -> Record:
 
 def find(root: Path, name: str = FILE_NAME) -> list[Path]:
     """Return the sorted paths of all files of a name under `root`, without subfolders called "published"."""
-    found = []
+    paths = []
     for folder, folders, names in os.walk(root):
         if name in names or name in folders:  # a broken link counts too, so that it is reported
-            found.append(Path(folder, name))
+            paths.append(Path(folder, name))
         folders[:] = [inner for inner in folders if inner != PUBLISHED]
-    return sorted(found)
+    return sorted(paths)
 
 
 def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, variant: str = "") -> Path:
     """Return the folder of a run: `root/<experiment>/<scene>/<model>[,<variant>]/seed<k>`.
-
-    Args:
-        root: the folder of all results.
-        experiment: the name of the experiment.
-        scene: the name of the scene.
-        model: the model's name, with the suffix _agr or _noagr if its use of AGR (a network) differs from the published
-            method.
-        seed: the seed of the run, at least 0 and below 2^63.
-        variant: the settings that differ from the experiment's, such as "iterations=10"; "" for none.
 
     Raises:
         InputError: a name has characters that a folder name may not have, or the seed is out of range.
@@ -353,11 +332,7 @@ def _check_seed(seed: int, where: str) -> None:
 
 
 def check(record: Record, file: str) -> None:
-    """Check the rules for records that types cannot express, such as that a successful run has metrics.
-
-    Raises:
-        InputError: the record breaks a rule; the message names `file` and the field.
-    """
+    """Raise InputError if a record breaks a rule that types cannot express, such as that a good run has metrics."""
     _check_names(record.experiment, record.scene, record.model, record.variant, f"{file}: ")
     ok = record.status == "ok"
     if ok == (record.reason is not None):

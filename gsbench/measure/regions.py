@@ -73,8 +73,8 @@ def moving(views: Sequence[View]) -> Regions:
             strip = np.sort(sums[:, row : row + STRIP], axis=0)
             median[row : row + STRIP] = strip[(len(group) - 1) // 2]
         radius = round(sums.shape[1] / PIXELS_OF_A_RADIUS)
-        for view, own in zip(group, sums, strict=True):
-            moved = (np.abs(own.astype(np.int32) - median) > 9 * THRESHOLD).any(-1).astype(np.uint8)
+        for view, image_sums in zip(group, sums, strict=True):
+            moved = (np.abs(image_sums.astype(np.int32) - median) > 9 * THRESHOLD).any(-1).astype(np.uint8)
             moved = cv2.morphologyEx(moved, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             masks[view.name] = cv2.dilate(moved, np.ones((2 * radius + 1,) * 2, np.uint8)).astype(bool)
     return _large(masks, "images of one camera")
@@ -106,12 +106,7 @@ class RegionScores:
     """Measures PSNR over the moving pixels and over those of objects, while images are rendered one after the other."""
 
     def __init__(self, views: Sequence[View], quantised: bool) -> None:
-        """Find the regions of the evaluated views.
-
-        Args:
-            views: the evaluated views.
-            quantised: whether renders are rounded to 8 bits first.
-        """
+        """Find the regions of the evaluated views; `quantised`: renders are rounded to 8 bits first."""
         self.regions = find_regions(views)
         self.quantised = quantised
         self.scores: dict[str, dict[str, float]] = {name: {} for name in self.regions}  # dB by region, then by view
@@ -128,21 +123,23 @@ class RegionScores:
 
     def metrics(self) -> dict[str, float | None]:
         """Return `psnr_moving` and `psnr_object`, means over the views that have such a region; None without one."""
-        return {f"psnr_{name}": fmean(found.values()) if found else None for name, found in self.scores.items()}
+        return {f"psnr_{name}": fmean(present.values()) if present else None for name, present in self.scores.items()}
 
     def with_scores(self, per_view: Sequence[ViewScore]) -> list[ViewScore]:
         """Return the scores of single views with those over their regions added."""
         moving, objects = self.scores["moving"], self.scores["object"]
-        return [replace(one, psnr_moving=moving.get(one.name), psnr_object=objects.get(one.name)) for one in per_view]
+        return [
+            replace(view, psnr_moving=moving.get(view.name), psnr_object=objects.get(view.name)) for view in per_view
+        ]
 
     def missing(self) -> dict[str, str]:
         """Return the reasons why a metric is None."""
         return {f"psnr_{name}": regions.missing for name, regions in self.regions.items() if regions.missing}
 
-    def found(self) -> dict[str, Region]:
+    def of_record(self) -> dict[str, Region]:
         """Return the regions for the record of the run."""
-        return {name: Region(one.source, len(one.masks), one.share, one.digest)
-                for name, one in self.regions.items() if one.masks}  # fmt: skip
+        return {name: Region(each.source, len(each.masks), each.share, each.digest)
+                for name, each in self.regions.items() if each.masks}  # fmt: skip
 
 
 def _large(masks: dict[str, Mask], source: str) -> Regions:
@@ -155,8 +152,8 @@ def _large(masks: dict[str, Mask], source: str) -> Regions:
 def _by_camera(views: Sequence[View]) -> list[list[View]]:
     """Group the views by equal cameras and image sizes."""
     cameras = [view.camera for view in views]
-    keys = np.array([[one.width, one.height, *one.viewmat.flatten().tolist(), *one.K.flatten().tolist()]
-                     for one in cameras])  # fmt: skip
+    keys = np.array([[each.width, each.height, *each.viewmat.flatten().tolist(), *each.K.flatten().tolist()]
+                     for each in cameras])  # fmt: skip
     groups, left = [], np.arange(len(views))
     while len(left):
         same = (np.abs(keys[left] - keys[left[0]]) <= SAME).all(1)

@@ -65,12 +65,6 @@ def time_renders(
     A call renders an image from the model, including slicing (conditioning on time and direction) and AGR (the neural
     refinement), and caches nothing for the next call. The device is synchronised before and after each call.
 
-    Args:
-        render: renders frame i.
-        count: the number of timed calls.
-        warmup: the number of calls before them.
-        synchronise: waits for the device.
-
     Raises:
         InputError: `count` is below 30, too few for percentiles.
     """
@@ -78,15 +72,7 @@ def time_renders(
         raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
     for i in range(warmup):
         render(i % count)
-    milliseconds = []
-    for i in range(count):
-        synchronise()
-        start = time.perf_counter()
-        render(i)
-        synchronise()
-        milliseconds.append(1000.0 * (time.perf_counter() - start))
-    deciles = statistics.quantiles(milliseconds, n=10, method="inclusive")
-    return RenderTimes(p10=deciles[0], p50=deciles[4], p90=deciles[8])
+    return _percentiles([_milliseconds(render, i, synchronise) for i in range(count)])
 
 
 def time_in_turns(
@@ -94,24 +80,27 @@ def time_in_turns(
     count: int = LEAST_RENDERS,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> list[RenderTimes]:
-    """Time several render functions alternately, frame by frame, so that other load on the machine affects all of them.
-
-    Args:
-        renders: the functions to time; each renders frame i.
-        count: the number of timed calls of each function.
-        synchronise: waits for the device.
-    """
+    """Time several render functions in turns, frame by frame, so that other load on the machine affects all alike."""
     times: list[list[float]] = [[] for _ in renders]
     for i in range(-2, count):
-        for own, render in zip(times, renders, strict=True):
-            synchronise()
-            start = time.perf_counter()
-            render(max(i, 0))
-            synchronise()
+        for milliseconds, render in zip(times, renders, strict=True):
+            taken = _milliseconds(render, max(i, 0), synchronise)
             if i >= 0:
-                own.append(1000.0 * (time.perf_counter() - start))
-    deciles = [statistics.quantiles(own, n=10, method="inclusive") for own in times]
-    return [RenderTimes(p10=own[0], p50=own[4], p90=own[8]) for own in deciles]
+                milliseconds.append(taken)
+    return list(map(_percentiles, times))
+
+
+def _milliseconds(render: Callable[[int], object], i: int, synchronise: Callable[[], None]) -> float:
+    synchronise()
+    start = time.perf_counter()
+    render(i)
+    synchronise()
+    return 1000.0 * (time.perf_counter() - start)
+
+
+def _percentiles(milliseconds: Sequence[float]) -> RenderTimes:
+    deciles = statistics.quantiles(milliseconds, n=10, method="inclusive")
+    return RenderTimes(p10=deciles[0], p50=deciles[4], p90=deciles[8])
 
 
 class StageClock:
@@ -160,12 +149,9 @@ class StageClock:
 
     @contextmanager
     def side_by_side(self, workers: int) -> Iterator[list["StageClock"]]:
-        """Time a block in which several threads of the CPU work at the same time.
+        """Time a block in which several threads of the CPU work at the same time, each with a clock of its own.
 
         The seconds of the block are divided among the stages in proportion to the seconds that the threads took.
-
-        Args:
-            workers: the number of threads, each of which gets a clock of its own.
         """
         clocks = [StageClock() for _ in range(workers)]
         start = self._begin()
@@ -182,8 +168,8 @@ class StageClock:
             self.add(OTHER, wall)
             return
         for seconds in workers:
-            for name, own in seconds.items():
-                self.add(name, wall * own / total)
+            for name, taken in seconds.items():
+                self.add(name, wall * taken / total)
 
     def add(self, name: str, seconds: float) -> None:
         """Add seconds that were measured elsewhere to a stage."""

@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.models import GaussianModel
 from gsbench.run import progress, stop
 from gsbench.run.checks import evaluated_views
-from gsbench.run.identity import Run
+from gsbench.run.identity import RunSpec
 from gsbench.run.load import plain_description
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -43,17 +43,17 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
 
 
-def saved_state(this: Run, scene: Scene) -> dict[str, Any] | None:
+def saved_state(spec: RunSpec, scene: Scene) -> dict[str, Any] | None:
     """Return the state in the checkpoint of the run's folder; None if there is none that the settings allow to use.
 
     Raises:
         InputError: the checkpoint is damaged.
     """
-    path, hashes = _checkpoint_of(this, scene)
-    return checkpoint.load(path, *hashes, this.config.device) if this.config.resume else None
+    path, hashes = _checkpoint_of(spec, scene)
+    return checkpoint.load(path, *hashes, spec.config.device) if spec.config.resume else None
 
 
-def resume(trainer: Trainer, this: Run, state: dict[str, Any] | None) -> bool:
+def resume(trainer: Trainer, spec: RunSpec, state: dict[str, Any] | None) -> bool:
     """Continue from the `saved_state` of a run, and return whether there is one.
 
     Raises:
@@ -62,46 +62,40 @@ def resume(trainer: Trainer, this: Run, state: dict[str, Any] | None) -> bool:
     if state is None:
         return False
     trainer.load_state_dict(state)
-    path = this.folder / checkpoint.FILE_NAME
-    print(f"{this.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
+    path = spec.folder / checkpoint.FILE_NAME
+    print(f"{spec.name}: continues from step {trainer.step} of {path}", file=sys.stderr)
     return True
 
 
-def save(state: dict[str, Any], this: Run, scene: Scene, plain: dict[str, Any]) -> None:
+def save(state: dict[str, Any], spec: RunSpec, scene: Scene, plain: dict[str, Any]) -> None:
     """Write the checkpoint of a run: a trainer's state, with the settings as plain values."""
-    path, hashes = _checkpoint_of(this, scene)
+    path, hashes = _checkpoint_of(spec, scene)
     checkpoint.save(path, Checkpoint(*hashes, state, plain, plain_description(scene)))
 
 
-def _checkpoint_of(this: Run, scene: Scene) -> tuple[Path, tuple[str, str]]:
+def _checkpoint_of(spec: RunSpec, scene: Scene) -> tuple[Path, tuple[str, str]]:
     """Return the path of a run's checkpoint, and the hashes of the settings and of the data that it must have."""
-    return this.folder / checkpoint.FILE_NAME, (training_hash(this.plain), scene.fingerprint)
+    return spec.folder / checkpoint.FILE_NAME, (training_hash(spec.plain), scene.fingerprint)
 
 
 def fit(
     trainer: Trainer,
-    this: Run,
+    spec: RunSpec,
     plain: dict[str, Any],
     reporter: Callable[[], progress.Reporter],
     follow: Callable[[], None] = lambda: None,
     until: int | None = None,
 ) -> None:
-    """Train to the last step, or until so many steps are finished; `follow` is called after every step.
+    """Train to the last step, or until `until` steps are finished; `follow` is called after every step.
 
-    Args:
-        trainer: the trainer at its first step.
-        this: the run to train, with the folder of its checkpoint.
-        plain: the settings as plain values, for the checkpoint.
-        reporter: starts to report the progress to other processes, once signals are handled.
-        follow: a function that is called after every step.
-        until: the number of finished steps; None for all.
+    `plain` holds the settings for the checkpoint. `reporter` starts to report the progress, once signals are handled.
 
     Raises:
         NoGaussianError: no Gaussian is left.
         DivergedError: a loss or gradient was not finite.
         Stopped: a signal asked the process to end; the checkpoint is saved.
     """
-    path = this.folder / checkpoint.FILE_NAME
+    path = spec.folder / checkpoint.FILE_NAME
     with stop.requested() as request:
         report = reporter()
         if trainer.step:
@@ -114,10 +108,10 @@ def fit(
             return request.signal is None and trainer.step != until
 
         if trainer.step != until:
-            trainer.run(lambda state: save(state, this, trainer.scene, plain), this.name, goes_on)
+            trainer.run(lambda state: save(state, spec, trainer.scene, plain), spec.name, goes_on)
             report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
     if request.signal is not None:  # asked here, so that a signal after the last step is not lost
-        raise stop.Stopped(request.signal, f"{this.name}: stopped at step {trainer.step}, saved in {path}: "
+        raise stop.Stopped(request.signal, f"{spec.name}: stopped at step {trainer.step}, saved in {path}: "
                                            f"the same command continues from there")  # fmt: skip
     _check_fitted(trainer)
 

@@ -26,7 +26,7 @@ LONGEST_VARIANT = 80  # characters; longer names could exceed the limits of a pa
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSpec:
     """The training and measurement of one model on one scene with one seed: settings, names and folder."""
 
     config: Config
@@ -43,17 +43,16 @@ class Run:
         return f"{self.config.scene.name} {self.label}{variant} seed{self.config.seed}"
 
 
-def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> Run:
+def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, overrides: Sequence[str] = ()) -> RunSpec:
     """Resolve the settings of one run, and give the run its label, variant and folder.
 
     Args:
         composed: the config of one scene, as Hydra composed it.
         choices: the choice of each config group (HydraConfig.runtime.choices); None for a run without variant.
-        overrides: the overrides of the command line (HydraConfig.overrides.task).
+        overrides: the overrides of the command line.
 
     Raises:
-        InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist. Hydra has
-            already refused unknown keys and wrong types.
+        InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist.
     """
     for key in fields(Config):
         if key.name not in composed:
@@ -73,7 +72,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
         Path(config.results), config.experiment, config.scene.name, label, config.seed, variant=variant
     )
     plain = _storable(recorded(plain))
-    return Run(config, plain, folder, label, variant, repeating(overrides))
+    return RunSpec(config, plain, folder, label, variant, repeating(overrides))
 
 
 def _deleted(key: str) -> InputError:
@@ -131,10 +130,7 @@ def _standard_choices() -> dict[str, str]:
 
 
 def _storable(value: Any) -> Any:
-    """Convert values that a record cannot hold, such as NaN, to text.
-
-    A run with such values is refused, and its record shows the text.
-    """
+    """Convert values that a record cannot hold, such as NaN, to text; a run with such values is refused."""
     if isinstance(value, dict):
         return {key: _storable(member) for key, member in value.items()}
     if isinstance(value, float):
@@ -143,10 +139,7 @@ def _storable(value: Any) -> Any:
 
 
 def _printed(value: Any) -> str:
-    """Format a value for a folder name; a value with unsafe characters becomes a hash.
-
-    A SHA-256 is cut to its first eight digits.
-    """
+    """Format a value for a folder name: a SHA-256 as its first digits, unsafe characters as a hash."""
     text = value if isinstance(value, str) else json.dumps(value)
     if re.fullmatch("[0-9a-f]{64}", text):
         return text[:8]

@@ -96,15 +96,15 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
                          f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK",
                          docs="runs.md#the-folder-of-a-run")  # fmt: skip
-    found = checkpoint.read(path, device)
-    config = typed_config(found.config, path)
+    saved = checkpoint.read(path, device)
+    config = typed_config(saved.config, path)
     config.device, config.raster.backend = device, backend
-    scene = parse(SceneDescription, found.scene, str(path))
+    scene = parse(SceneDescription, saved.scene, str(path))
     _check_scene(scene, path)
     model = build_with_placeholders(config, scene.extent).to(device)  # `load_state` replaces the placeholders
     try:
-        model.load_state(found.state["model"])
-        step = checkpoint.whole_number("step", found.state["step"], config.train.iterations)
+        model.load_state(saved.state["model"])
+        step = checkpoint.whole_number("step", saved.state["step"], config.train.iterations)
     except (InputError, MemoryError):
         raise
     except Exception as error:  # parts of an untrusted file may have any type
@@ -115,16 +115,12 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
 
 
 def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
-    """Load the scene on which a run was trained.
-
-    Args:
-        run: the run, whose settings name the scene.
-        data_root: the folder of the data set, if it is not the one in the settings.
+    """Load the scene on which a run was trained, from `data_root` or from the folder in its settings.
 
     Raises:
         InputError: the data do not exist, are invalid, or differ from the data of the training.
     """
-    root = data_root or own_root(run.config.data.root, run.folder)
+    root = data_root or trusted_root(run.config.data.root, run.folder)
     config = replace(run.config, data=replace(run.config.data, root=root))
     try:
         scene = load_scene(config)
@@ -139,7 +135,7 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     return scene
 
 
-def own_root(root: str, where: Path) -> str:
+def trusted_root(root: str, where: Path) -> str:
     """Return `root`, the data folder in a checkpoint, if it is safe to use.
 
     Raises:
@@ -202,13 +198,12 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
 
 
 def _without_interpolations(value: Any) -> Any:
-    """Return plain values unchanged; raise ValueError if a text contains `${`, which OmegaConf would interpolate.
-
-    For instance, `${oc.env:NAME}` would read an environment variable.
-    """
+    """Return plain values; raise ValueError if a text has `${`, as in ${oc.env:NAME}, which would be resolved."""
     if isinstance(value, str) and "${" in value:
         raise ValueError(f"expected resolved values, got {value!r:.80}")
-    for key, one in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+    for key, member in (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    ):
         _without_interpolations(key)
-        _without_interpolations(one)
+        _without_interpolations(member)
     return value

@@ -49,7 +49,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
         quantised=config.protocol.quantise,
         weights=lpips_weights(config),
     )
-    frame, made = frames(trainer, views[0])
+    frame, note = frames(trainer, views[0])
     times = time_renders(
         lambda i: frame(views[i % len(views)]),
         count=max(config.protocol.renders, len(views)),
@@ -80,7 +80,7 @@ def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measure
         images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )
-    return Measured(metrics, missing, regions.with_scores(quality.per_view), regions.found(), cost, made, images)
+    return Measured(metrics, missing, regions.with_scores(quality.per_view), regions.of_record(), cost, note, images)
 
 
 def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
@@ -112,10 +112,9 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
 
 
 def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Return the metrics of the last iteration, with the PSNR at the best iteration added.
+    """Return the metrics of the last iteration, with the PSNR at the iteration that was best on val added.
 
-    The best iteration is the one with the highest PSNR on the validation split. If the settings ask for `best_on_test`,
-    the highest PSNR on the evaluated split during training is added too.
+    With `protocol.best_on_test`, the highest PSNR on the evaluated split during training is added too.
     """
     metrics, missing = dict(quality.metrics), dict(quality.missing)
     best = trainer.hook(Best).scores

@@ -1,17 +1,28 @@
-"""Report the progress of a run to other processes in a file progress.json, and in stopped.json where it was stopped.
+"""Report the progress of a run in progress.json, by which its process also claims the run, and in stopped.json.
 
-The module does not import torch.
+Only one of several identical commands trains. progress.json is created by a hard link, which succeeds in only one of
+several processes, on one or more hosts. If the process of a claim has ended, another process may take the claim: the
+one that has created a file with a name of that claim, by a hard link too. So no file lock is needed, and clients of NFS
+that see another's files late, or by a stale handle, do not take one run. Where the file system has file locks but no
+hard links, such as FAT, a lock protects these steps. The module does not import torch.
 """
 
 import dataclasses
+import errno
+import fcntl
+import hashlib
 import json
 import os
 import socket
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
-from gsbench.measure.atomic import write_atomically
+from gsbench.errors import InputError
+from gsbench.measure.atomic import create_atomically, write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.schema import parse
 from gsbench.reading import parse_json, read_file
@@ -21,6 +32,10 @@ STOPPED = "stopped.json"  # the progress of a run that a signal stopped; its pro
 EVERY = 5.0  # seconds between two writes
 LARGEST = 1 << 20  # bytes
 SILENT = 600.0  # seconds without a report after which a run on an unreachable host counts as lost
+CLAIM_LOCK = ".claim"
+PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, so go on without
+ATTEMPTS, PAUSE = 100, 0.02  # attempts to claim, and seconds between two
+READS = 3  # attempts to read a claim; without hard links it may be half written, on NFS its handle may be stale
 
 
 @dataclass(frozen=True)
@@ -57,7 +72,6 @@ class Reporter:
         """Report that the run in `folder` has started.
 
         Args:
-            folder: the folder of the run.
             overrides: the run's overrides, as in its record.
             steps: the number of steps of the run; model=auto may train several candidates.
             done: the steps of candidates that were trained before.
@@ -70,10 +84,7 @@ class Reporter:
         self._written = time.monotonic()
 
     def is_due(self) -> bool:
-        """Return whether the interval since the last report (`EVERY` seconds) is over.
-
-        The caller asks first, because computing a report may wait for the GPU.
-        """
+        """Return whether the last report is EVERY seconds old; to compute one without need may wait for the GPU."""
         return time.monotonic() - self._written >= EVERY
 
     def __call__(self, step: int, seconds: float, last: Point | None) -> None:
@@ -96,20 +107,12 @@ def write_stopped(folder: Path, progress: Progress) -> None:
 
 
 def read(path: Path) -> Progress:
-    """Read a progress.json or stopped.json.
-
-    Raises:
-        InputError: the file is invalid.
-    """
+    """Read a progress.json or stopped.json; an InputError says why it is invalid."""
     return decode(read_file(path, str(path), LARGEST), str(path))
 
 
 def decode(content: bytes, where: str) -> Progress:
-    """Return the progress in the content of a progress.json; `where` is its path, for the message.
-
-    Raises:
-        InputError: the content is invalid.
-    """
+    """Return the progress in the content of the file `where`; an InputError says why it is invalid."""
     return parse(Progress, parse_json(content, where), where)
 
 
@@ -136,3 +139,147 @@ def slurm_job() -> str | None:
     """Return the id of this process's Slurm job as squeue prints it (`12` or `12_3`), or None outside of Slurm."""
     array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
+
+
+def take_claim(folder: Path, claim: Progress) -> Progress | None:
+    """Claim the run in the existing `folder`; return the progress of the live process that has claimed it, or None.
+
+    Raises:
+        InputError: other processes claim and release the run repeatedly.
+        OSError: the claim cannot be read or written.
+    """
+    path = folder / FILE_NAME
+    with _alone(folder):
+        for _ in range(ATTEMPTS):
+            content, other = _read(path)
+            if other is not None and not _may_be_taken(other, claim):
+                return other
+            if content is not None:
+                _remove(path, content, claim)  # its process has ended, or the file is damaged
+            if create_atomically(path, encode(claim)):
+                return None
+            time.sleep(PAUSE)
+    raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
+
+
+def _remove(path: Path, content: bytes, claim: Progress) -> None:
+    """Remove the claim with this content, unless another process does so or has done so.
+
+    Only the process whose progress is in the file `heir` removes the claim, and only if the claim is still the one that
+    was read. An heir that was killed leaves this file. It is a claim too, and is removed in the same way.
+    """
+    heir = path.with_name(f"{CLAIM_LOCK}.{hashlib.sha256(content).hexdigest()[:16]}")
+    if not create_atomically(heir, encode(claim)):
+        left, other = _read(heir)
+        if left is not None and (other is None or _may_be_taken(other, claim)):
+            _remove(heir, left, claim)
+        return
+    try:
+        if _content(path) == content:
+            path.unlink(missing_ok=True)
+    finally:
+        heir.unlink(missing_ok=True)
+
+
+def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) -> None:
+    """Remove this process's claim on the run in `folder`; the claim of another process is kept.
+
+    If a signal has stopped the run, its progress becomes stopped.json.
+    """
+    path = folder / FILE_NAME
+    try:
+        with _alone(folder):
+            _, other = _read(path)
+            if other is not None and _is_same_process(other, claim):
+                if is_stopped:
+                    write_stopped(folder, other)
+                path.unlink(missing_ok=True)
+    except OSError:  # the folder cannot be written any more; the claim expires with this process
+        return
+
+
+def _read(path: Path) -> tuple[bytes | None, Progress | None]:
+    """Read a claim: its content, None if there is none, and its progress, None if the claim is damaged or missing."""
+    for _ in range(READS):
+        content = _content(path)
+        if content is None:
+            break
+        try:
+            return content, decode(content, str(path))
+        except InputError:
+            time.sleep(PAUSE)
+    return content, None
+
+
+def _content(path: Path) -> bytes | None:
+    """Return the bytes of a claim, or None if there is none.
+
+    Raises:
+        OSError: it cannot be read, which does not make it a damaged one.
+    """
+    for last in (*[False] * (READS - 1), True):
+        try:
+            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would be waited for
+                return file.read(LARGEST)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            if error.errno != errno.ESTALE or last:
+                raise
+            time.sleep(PAUSE)
+    raise AssertionError("the last attempt returns or raises")
+
+
+def _is_same_process(other: Progress, claim: Progress) -> bool:
+    return (other.host, other.pid, other.born) == (claim.host, claim.pid, claim.born)
+
+
+def _may_be_taken(other: Progress, claim: Progress) -> bool:
+    """Return whether this process may take an existing claim.
+
+    The process may take the claim if the claim is its own, if the process of the claim has ended, or if Slurm has
+    requeued the job after a node failed. Two live processes of one Slurm job on one node respect each other's claims.
+    """
+    requeued = other.job is not None and other.job == claim.job and other.host != claim.host
+    return _is_same_process(other, claim) or requeued or not is_alive(other)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a file lock while the block reads and replaces a claim; skip the lock if the file system has none."""
+    path = folder / CLAIM_LOCK
+    until = time.monotonic() + PATIENCE
+    file: IO[bytes] | None = None
+    try:
+        while file is None and time.monotonic() < until:
+            try:
+                file = _locked(path)
+            except BlockingIOError:
+                time.sleep(0.01)
+            except OSError:  # a file system without locks
+                break
+        yield
+    finally:
+        if file is not None:
+            path.unlink(missing_ok=True)
+            file.close()
+
+
+def _locked(path: Path) -> IO[bytes] | None:
+    """Open and lock `path`; return None if the file was removed in the meantime, so that the caller must try again.
+
+    Raises:
+        BlockingIOError: another process holds the lock.
+    """
+    file = path.open("ab")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+            return file
+    except FileNotFoundError:
+        pass
+    except OSError:
+        file.close()
+        raise
+    file.close()
+    return None

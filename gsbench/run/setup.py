@@ -53,11 +53,7 @@ def build(config: Config) -> GaussianModel:
 def build_with_placeholders(config: Config, extent: float) -> GaussianModel:
     """Build the model with four placeholder Gaussians, so that it has its parameters before the true ones are known.
 
-    It raises the same errors as `build`.
-
-    Args:
-        config: the settings.
-        extent: the radius of the scene, world units.
+    `extent` is the radius of the scene, world units. It raises the same errors as `build`.
     """
     model, points = build(config), torch.eye(4, 3)
     model.initialise(Points(points, points), extent, generator(config.seed))

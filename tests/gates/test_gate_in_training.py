@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from interrupted import assert_same_bits
-from tiny_run import gsbench, overrides, write_moving_square
+from tiny_run import gsbench, overrides
 from tiny_training import compose, moving_square
 
 from gsbench.gates import __main__ as command
@@ -223,11 +223,6 @@ def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     assert direction is not None
     assert direction.loss_db == pytest.approx(after - training.renderer.psnr(frozen, training.views), abs=1e-9)
     assert direction.loss_db != 0
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 def test_auto_and_a_gate_after_the_fact(

@@ -3,15 +3,10 @@
 from pathlib import Path
 
 import pytest
-from tiny_run import main_here, overrides, write_moving_square
+from tiny_run import main_here, overrides
 
 import gsbench
 from gsbench.measure import record
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 @pytest.mark.parametrize(
@@ -119,7 +114,7 @@ def test_an_error_that_nobody_foresaw_is_a_record(
     def fault(*_: object) -> None:
         raise ZeroDivisionError("here")
 
-    monkeypatch.setattr("gsbench.run.attempt.Attempt.measure", fault)
+    monkeypatch.setattr("gsbench.run.execution.Execution.measure", fault)
     words = [*overrides(square, tmp_path, "model=3dgs"), "-m", "seed=0,1"]
     assert main_here(*words) == 1
     written = [record.read(path) for path in record.find(tmp_path)]

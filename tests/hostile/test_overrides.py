@@ -25,8 +25,9 @@ from gsbench.config_roles import flat
 from gsbench.errors import InputError
 from gsbench.launch.command import compose_run, parse, runs_of
 from gsbench.measure import record
-from gsbench.run import claim
-from gsbench.run.run import run
+from gsbench.run import progress
+from gsbench.run.execution import execute
+from gsbench.run.identity import identify
 from gsbench.train import checkpoint
 
 SAMPLE, ALL = 30, 700
@@ -82,7 +83,7 @@ def end(words: list[str], square: Path, results: Path) -> str:
     try:
         (run_words, *_), _ = runs_of(parse([*base, *words]))
         composed = compose_run([*run_words, f"results={results}"]).config
-        done = run(composed)
+        done = execute(identify(composed))
     except (InputError, HydraException, OmegaConfBaseException):
         return "refused"
     assert done is not None
@@ -143,9 +144,9 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as patched:
         patched.setattr(record, "write", full)
         with pytest.raises(InputError, match="its record cannot be written: No space left on device"):
-            run(composed)
+            execute(identify(composed))
         assert len(list(tmp_path.rglob("checkpoint.pt"))) == 1
-    done = run(composed)
+    done = execute(identify(composed))
     assert done is not None
     assert done.status == "ok"
     fsync = os.fsync
@@ -158,17 +159,17 @@ def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: 
     with monkeypatch.context() as patched:
         patched.setattr("gsbench.measure.atomic.os.fsync", full_for_checkpoints)
         composed.seed = 1
-        done = run(composed)
+        done = execute(identify(composed))
     assert done is not None
     (path,) = (written.with_name(checkpoint.FILE_NAME) for written in tmp_path.rglob("seed1/record.json"))
     assert (done.status, done.reason) == ("failed", f"{path}: No space left on device")
     with monkeypatch.context() as patched:
         patched.setattr(checkpoint, "save", full)
         composed.seed = 2
-        done = run(composed)
+        done = execute(identify(composed))
     assert done is not None
     assert done.reason == f"{path.parents[1] / 'seed2'}: No space left on device"
     with monkeypatch.context() as patched:
-        patched.setattr(claim, "create_atomically", full)
+        patched.setattr(progress, "create_atomically", full)
         with pytest.raises(InputError, match=r"seed2: the run cannot be claimed: .*No space left on device"):
-            run(composed)
+            execute(identify(composed))

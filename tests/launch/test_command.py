@@ -77,6 +77,14 @@ def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
         runs_of(parse(words.split()))
 
 
+@pytest.mark.parametrize("setting", ["at_once=-2", "minutes=0", "cpus=0", "gpus=-1", "requeues=-1", "signal_seconds=0",
+                                     "signal_seconds=65536"])  # fmt: skip
+def test_a_launch_that_slurm_would_refuse_is_refused_before_it(setting: str) -> None:
+    """Catches a job that is submitted and fails, or is never requeued, for a number out of its range."""
+    with pytest.raises(InputError, match=rf"launch\.{setting.partition('=')[0]}: expected .*\d"):
+        compose_run(["+exp=mini", "scene=suzanne", "+launch=slurm", f"launch.{setting}"])
+
+
 def test_scenes_of_the_user_are_choices_and_typos_are_not() -> None:
     """Catches a retry or a job that cannot compose a scene without a file, and a scene that is no scene."""
     assert compose_run(["+exp=mini", "data.scenes=[new]", "scene=new"]).config.scene.name == "new"

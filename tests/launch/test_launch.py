@@ -25,11 +25,6 @@ from gsbench.train import checkpoint
 SCENE = ("scene=", "scene.name=")
 
 
-@pytest.fixture
-def square(tmp_path: Path) -> Path:
-    return write_moving_square(tmp_path / "data")
-
-
 def sweep(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run `python -m gsbench.launch`."""
     return python_m("gsbench.launch", *arguments)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from forked import Forked
 from interrupted import assert_same_bits, bits
-from tiny_run import gsbench, main_here, overrides, write_moving_square
+from tiny_run import gsbench, main_here, overrides
 
 from gsbench.launch import plan, status
 from gsbench.run import progress
@@ -19,11 +19,6 @@ from gsbench.train import checkpoint
 RUNS = 3
 LONG, SHORT = "train.iterations=100000", "train.iterations=1500"
 ENDED = {"stopped", "not started", "done"}
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 def words(data: Path, results: Path, iterations: str) -> list[str]:

@@ -16,7 +16,7 @@ from tiny_run import ROOT
 from gsbench.launch import plan, status
 from gsbench.launch.__main__ import lines, main
 from gsbench.launch.plan import Ended, Plan
-from gsbench.launch.queue import Queue
+from gsbench.launch.slurm import Queue
 from gsbench.launch.status import RunStatus
 from gsbench.run import progress
 from gsbench.run.progress import Progress, born

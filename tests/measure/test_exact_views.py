@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_run import SIZE, overrides, run_here, write_moving_square
+from tiny_run import SIZE, overrides, run_here
 from tiny_training import compose, moving_square
 
 from gsbench.errors import InputError
@@ -23,7 +23,7 @@ from gsbench.measure.exact_views import MOST_PSNR, capped, decides, rank, senten
 from gsbench.measure.quality import evaluate, psnr
 from gsbench.measure.record import Record, ViewScore
 from gsbench.measure.speed import Effort
-from gsbench.run.candidates import Candidate, Result, best, highest
+from gsbench.run.selection import Candidate, Result, best, highest
 from gsbench.run.setup import build
 from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
@@ -119,11 +119,6 @@ def test_the_last_of_equal_candidates_is_taken(scores: list[float | None], chose
     assert highest([*results, failed]) is results[chosen]
     with pytest.raises(DivergedError, match="all 2 candidates failed; failed: step 5"):
         best([failed, replace(failed, candidate=replace(failed.candidate, name="other"))])
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 def with_away(square: Path, root: Path, split: str, whole: bool = False) -> Path:

@@ -116,7 +116,7 @@ def test_scores_are_means_over_the_views_that_have_a_region() -> None:
     assert metrics["psnr_object"] == pytest.approx(20.0, abs=1e-3)
     assert metrics["psnr_moving"] is None
     assert set(scores.missing()) == {"psnr_moving"}
-    measured = scores.found()
+    measured = scores.of_record()
     assert set(measured) == {"object"}
     assert (measured["object"].views, measured["object"].source) == (1, "alpha")
     assert math.isclose(measured["object"].share, 144 / (HEIGHT * WIDTH))

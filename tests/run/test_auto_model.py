@@ -13,10 +13,9 @@ from tiny_training import compose, moving_square
 from gsbench.config import TrainConfig
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, ModelComparison, Record, TimeScreen
-from gsbench.run import auto_model, trackers
-from gsbench.run.auto_model import candidates, check_candidates, check_compare, resolve
-from gsbench.run.candidates import FOLDER
-from gsbench.run.identity import Run
+from gsbench.run import log, selection
+from gsbench.run.identity import RunSpec
+from gsbench.run.selection import FOLDER, candidates, check_candidates, check_compare, resolve
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 from gsbench.train.divergence import DivergedError
@@ -27,11 +26,6 @@ RUN = (f"train.iterations={STEPS}", "train.curve_points=10", "train.checkpoint_m
 SLOW = "model.candidates.moving.lr.opacities.start=1e-4"  # so that another candidate than the first wins
 COMPARED = ("model=auto", "effects.compare=true", SLOW, *RUN)
 NAMES = ["7dgs", "4dgs", "7dgs_noagr", "6dgs"]
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +49,14 @@ def test_a_scene_that_may_move_has_a_model_with_time(
     decision: str, model: str, agr: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches an undecided scene that loses its motion, AGR in a static model, and a screen for a model with a name."""
-    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen(decision, "said", None, None, None, 0.0))
+    monkeypatch.setattr(selection, "screen_time", lambda *_: TimeScreen(decision, "said", None, None, None, 0.0))
     for words, chosen in (
         (("auto", 10), (model, agr, decision)),
         (("auto", 10, "agr=false"), (model, False, decision)),
         (("4dgs", 10), ("4dgs", False, None)),
     ):
         config = compose(*words)
-        resolved = resolve(Run(config, {}, Path("nowhere"), config.model.name), moving_square())
+        resolved = resolve(RunSpec(config, {}, Path("nowhere"), config.model.name), moving_square())
         screened = resolved.screen.decision if resolved.screen else None
         assert (resolved.config.model.name, resolved.config.agr, screened) == chosen
 
@@ -146,7 +140,7 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_comparison(
 
         def end(self, _: str) -> None: ...
 
-    monkeypatch.setitem(trackers.TRACKERS, "json", Tracked)
+    monkeypatch.setitem(log.TRACKERS, "json", Tracked)
     record, folder = run_here(*words)
     assert sent == [*(point.iteration for point in record.curve), STEPS], "a tracker lacks the steps of the comparison"
     monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained again"))
@@ -199,7 +193,7 @@ def test_a_candidate_that_fails_loses(square: Path, tmp_path: Path, monkeypatch:
 
 def test_a_static_scene_is_not_compared(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches models with time that are trained on a scene which the screen calls static."""
-    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen("off", "static", None, None, None, 0.0))
+    monkeypatch.setattr(selection, "screen_time", lambda *_: TimeScreen("off", "static", None, None, None, 0.0))
     record, folder = run_here(*overrides(square, tmp_path, *COMPARED))
     assert record.on_demand is not None
     assert record.on_demand.comparison is None

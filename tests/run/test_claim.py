@@ -19,7 +19,7 @@ from tiny_run import ROOT, command, environment, overrides, write_moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure import atomic
-from gsbench.run import claim, progress
+from gsbench.run import progress
 from gsbench.run.progress import Progress
 
 CROWD, ROUNDS = 6, 15
@@ -29,9 +29,9 @@ HERE = socket.gethostname()
 def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
     """Claim a run in many rounds at the same moment as others do, and note who had it."""
     for number in range(ROUNDS):
-        at, mine = folder / str(number), Progress(["seed=0"])
+        at, claim = folder / str(number), Progress(["seed=0"])
         start.wait(60)
-        if claim.take(at, mine) is None:
+        if progress.take_claim(at, claim) is None:
             (at / f"won.{os.getpid()}").touch()
         ended.wait(60)  # the winner lives until all have asked
 
@@ -43,7 +43,7 @@ def test_of_many_processes_one_has_the_run(
 ) -> None:
     """Catches a claim that is looked for and then made, so that several make it, and one that nobody takes over."""
     if not locks:
-        monkeypatch.setattr(claim, "_locked", without_locks)
+        monkeypatch.setattr(progress, "_locked", without_locks)
     one_of_many_has_each_run(tmp_path, [tmp_path], left)
 
 
@@ -85,11 +85,11 @@ def one_of_many_has_each_run(disk: Path, mounts: list[Path], left: str) -> None:
     fork = multiprocessing.get_context("fork")
     start, ended = fork.Barrier(CROWD), fork.Barrier(CROWD)
     crowd = [fork.Process(target=compete, args=(mounts[i % len(mounts)], start, ended)) for i in range(CROWD)]
-    for one in crowd:
-        one.start()
-    for one in crowd:
-        one.join(60)
-        assert one.exitcode == 0
+    for process in crowd:
+        process.start()
+    for process in crowd:
+        process.join(60)
+        assert process.exitcode == 0
     for number in range(ROUNDS):
         names = sorted(path.name for path in (disk / str(number)).iterdir())
         assert [name.partition(".")[0] for name in names] == ["progress", "won"], names
@@ -102,25 +102,25 @@ def without_locks(_: Path) -> None:
 
 def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -> None:
     """Catches a run that two commands of one job do, one that a requeued job waits for, and a later claim removed."""
-    mine = Progress([], job="7")
-    elsewhere = replace(mine, host="elsewhere", job=None)
+    claim = Progress([], job="7")
+    elsewhere = replace(claim, host="elsewhere", job=None)
     sleeper = subprocess.Popen(["sleep", "60"])
-    beside = replace(mine, pid=sleeper.pid, born=progress.born(sleeper.pid))
+    beside = replace(claim, pid=sleeper.pid, born=progress.born(sleeper.pid))
     requeued = replace(elsewhere, job="7")
-    silent = replace(elsewhere, updated=mine.updated - 2 * progress.SILENT)
+    silent = replace(elsewhere, updated=claim.updated - 2 * progress.SILENT)
     try:
-        for other, living in ((elsewhere, True), (beside, True), (requeued, False), (silent, False), (mine, False)):
+        for other, living in ((elsewhere, True), (beside, True), (requeued, False), (silent, False), (claim, False)):
             progress.write(tmp_path, other)
-            assert claim.take(tmp_path, mine) == (other if living else None)
-            claim.release(tmp_path, mine)
+            assert progress.take_claim(tmp_path, claim) == (other if living else None)
+            progress.release_claim(tmp_path, claim)
             assert (tmp_path / progress.FILE_NAME).exists() == living  # what is another's stays
     finally:
         sleeper.kill()
         sleeper.wait()
     progress.write(tmp_path, beside)
-    assert claim.take(tmp_path, mine) is None
+    assert progress.take_claim(tmp_path, claim) is None
     assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
-    claim.release(tmp_path / "gone", mine)
+    progress.release_claim(tmp_path / "gone", claim)
 
 
 @pytest.mark.parametrize("times", [2, 1000])
@@ -137,49 +137,51 @@ def test_a_stale_handle_makes_no_claim_a_dead_one(times: int, tmp_path: Path, mo
         return opened(path, *flags)
 
     with monkeypatch.context() as patched:
-        patched.setattr(claim.os, "open", open_stale)
+        patched.setattr(progress.os, "open", open_stale)
         if times == 2:
-            assert claim.take(tmp_path, Progress([])) == elsewhere
+            assert progress.take_claim(tmp_path, Progress([])) == elsewhere
         else:
             with pytest.raises(OSError, match="Stale file handle"):
-                claim.take(tmp_path, Progress([]))
-            claim.release(tmp_path, elsewhere)
+                progress.take_claim(tmp_path, Progress([]))
+            progress.release_claim(tmp_path, elsewhere)
     assert progress.read(tmp_path / progress.FILE_NAME) == elsewhere
 
 
 def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path: Path) -> None:
     """Catches a claim that is removed by a process which read the one before it."""
-    dead, mine = progress.encode(Progress([], born=1)), Progress([])
-    progress.write(tmp_path, mine)
-    claim._remove(tmp_path / progress.FILE_NAME, dead, Progress([], host="elsewhere"))
-    assert progress.read(tmp_path / progress.FILE_NAME) == mine
+    dead, claim = progress.encode(Progress([], born=1)), Progress([])
+    progress.write(tmp_path, claim)
+    progress._remove(tmp_path / progress.FILE_NAME, dead, Progress([], host="elsewhere"))
+    assert progress.read(tmp_path / progress.FILE_NAME) == claim
     assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
 
 
 @pytest.mark.parametrize("alive", [True, False])
 def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches two processes that remove a claim in turn, and a run that none can do as one was killed at that."""
-    monkeypatch.setattr(claim, "PAUSE", 0)
+    monkeypatch.setattr(progress, "PAUSE", 0)
     progress.write(tmp_path, Progress([], born=1))
     with monkeypatch.context() as patched:  # a process that is killed at this moment
         patched.setattr(Path, "unlink", lambda *_, **__: None)
         content = (tmp_path / progress.FILE_NAME).read_bytes()
-        claim._remove(tmp_path / progress.FILE_NAME, content, Progress([], host="elsewhere" if alive else HERE, born=1))
+        progress._remove(
+            tmp_path / progress.FILE_NAME, content, Progress([], host="elsewhere" if alive else HERE, born=1)
+        )
     if alive:
         with pytest.raises(InputError, match="claim it again and again"):
-            claim.take(tmp_path, Progress([]))
+            progress.take_claim(tmp_path, Progress([]))
         assert (tmp_path / progress.FILE_NAME).read_bytes() == content
     else:
-        assert claim.take(tmp_path, Progress([])) is None
+        assert progress.take_claim(tmp_path, Progress([])) is None
         assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".tmp")] == [progress.FILE_NAME]
 
 
 def test_a_lock_that_is_held_for_ever_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a command that hangs beside a process that was suspended while it claimed."""
-    monkeypatch.setattr(claim, "PATIENCE", 0.1)
-    held = claim._locked(tmp_path / claim.LOCK)
+    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    held = progress._locked(tmp_path / progress.CLAIM_LOCK)
     assert held is not None
-    assert claim.take(tmp_path, Progress([])) is None
+    assert progress.take_claim(tmp_path, Progress([])) is None
     held.close()
 
 
@@ -191,11 +193,11 @@ def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, mon
         raise OSError(number, "no links here")
 
     monkeypatch.setattr(atomic.os, "link", link)
-    assert claim.take(tmp_path, Progress(["a=1"])) is None
+    assert progress.take_claim(tmp_path, Progress(["a=1"])) is None
     other = Progress(["a=1"], host=socket.gethostname() + "2")
-    found = claim.take(tmp_path, other)
-    assert found is not None
-    assert found.pid == os.getpid()
+    holder = progress.take_claim(tmp_path, other)
+    assert holder is not None
+    assert holder.pid == os.getpid()
     assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
 
 
@@ -214,10 +216,10 @@ def test_of_three_commands_at_once_one_trains(tmp_path: Path) -> None:
             others = [run for run in runs if run.poll() is not None]
         (winner,) = (run for run in runs if run.poll() is None)
         for run in others:
-            said = run.communicate()[1]
-            assert run.returncode == 0, said
-            lines = [line for line in said.splitlines() if re.search(rf"left to process {winner.pid} on ", line)]
-            assert len(lines) == 1, said
+            errors = run.communicate()[1]
+            assert run.returncode == 0, errors
+            lines = [line for line in errors.splitlines() if re.search(rf"left to process {winner.pid} on ", line)]
+            assert len(lines) == 1, errors
         winner.send_signal(signal.SIGTERM)
         assert "stopped " in winner.communicate(timeout=60)[1]
         assert not list((tmp_path / "r").rglob(progress.FILE_NAME))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_run import overrides, run_here, write_moving_square
+from tiny_run import overrides, run_here
 
 from gsbench.errors import InputError
 from gsbench.measure import perceptual, provenance
@@ -19,15 +19,10 @@ WORDS = ("model=3dgs", "train.iterations=4")
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
-
-
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, data: Path) -> tuple[Record, Path, Path]:
+def done(tmp_path_factory: pytest.TempPathFactory, square: Path) -> tuple[Record, Path, Path]:
     """A finished run of 4 steps, its results and its folder."""
     results = tmp_path_factory.mktemp("results")
-    record, folder = run_here(*overrides(data, results, *WORDS))
+    record, folder = run_here(*overrides(square, results, *WORDS))
     assert record.status == "ok"
     return record, results, folder
 
@@ -37,7 +32,7 @@ class Trained(Exception):  # noqa: N818
 
 
 @pytest.fixture
-def again(tmp_path: Path, data: Path, done, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+def again(tmp_path: Path, square: Path, done, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
     """Do the finished run again with other words, and return the new record and what was said."""
     first, before, folder = done
     results = tmp_path / "results"
@@ -52,7 +47,7 @@ def again(tmp_path: Path, data: Path, done, monkeypatch: pytest.MonkeyPatch, cap
         if callable(change):
             change(repeat.folder)
         capfd.readouterr()
-        record, _ = run_here(*overrides(data, results, *WORDS, *more))
+        record, _ = run_here(*overrides(square, results, *WORDS, *more))
         return record, "".join(capfd.readouterr())
 
     repeat.first, repeat.folder = first, results / folder.relative_to(before)
@@ -90,68 +85,68 @@ def test_what_is_kept_says_where_it_was_measured(again) -> None:
     assert f"measured 2026-01-02 on another CPU, {threads}; " in again(change=elsewhere)[1]
 
 
-def test_a_place_is_no_setting(again, data: Path, tmp_path: Path) -> None:
+def test_a_place_is_no_setting(again, square: Path, tmp_path: Path) -> None:
     """Catches a training repeated, for want of its checkpoint, because the data were moved or are saved less often."""
-    (tmp_path / "moved").symlink_to(data)
-    record, said = again(f"data.root={tmp_path / 'moved'}", "train.checkpoint_minutes=9", change=no_checkpoint)
+    (tmp_path / "moved").symlink_to(square)
+    record, output = again(f"data.root={tmp_path / 'moved'}", "train.checkpoint_minutes=9", change=no_checkpoint)
     assert record == again.first
-    assert "finished before, kept" in said
+    assert "finished before, kept" in output
 
 
 def test_a_release_trains_nothing_again(again, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a version in the name of a run, in its hash or in its checkpoint, which would cost every training."""
     monkeypatch.setattr(provenance, "__version__", "9.9.9")
-    record, said = again()
+    record, output = again()
     assert record == again.first
-    assert "finished before, kept" in said
+    assert "finished before, kept" in output
     record, _ = again("protocol.quantise=true")  # measured from the checkpoint: `again` refuses a step
     assert record.status == "ok"
     assert record.provenance.versions["gsbench"] == "9.9.9"
 
 
-def test_what_is_measured_otherwise_is_named(again) -> None:
-    """Catches a user who is told that something differs and not what."""
-    record, said = again("protocol.quantise=true")
-    assert "what is measured is another (protocol.quantise True instead of False): measured again" in said
-    assert record.protocol["quantise"] is True
-
-
-def test_a_checkpoint_that_is_gone_is_said(again) -> None:
-    """Catches a training of hours that is announced as a measurement."""
-    said = again("protocol.quantise=true", change=no_checkpoint, trains=True)[1]
-    assert "(protocol.quantise True instead of False): its checkpoint is gone: running again" in said
-
-
-def test_another_training_is_named(again) -> None:
-    """Catches a run of an older config in the same folder that is trained again for no reason that is said."""
-
-    def older(folder: Path) -> None:
-        config = dict(again.first.provenance.config)
-        config["train"] = config["train"] | {"iterations": 1000}
-        provenance = dataclasses.replace(again.first.provenance, config=config)
-        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
+def changed(record: Record, folder: Path, *, with_checkpoint: bool = False, **provenance: object) -> None:
+    """Let the record of a finished run have another provenance, as one that was made before has."""
+    other = dataclasses.replace(record.provenance, **provenance)
+    files.write(dataclasses.replace(record, provenance=other), folder / files.FILE_NAME)
+    if not with_checkpoint:
         no_checkpoint(folder)
 
-    said = again(change=older, trains=True)[1]
-    assert "the training is another (train.iterations 4 instead of 1000): running again" in said
+
+def of_older_config(record: Record, folder: Path) -> None:
+    config = record.provenance.config
+    changed(record, folder, config={**config, "train": config["train"] | {"iterations": 1000}})
 
 
-def test_changed_data_are_named(again) -> None:
-    """Catches data that have changed and are called another config."""
+QUANTISED = "protocol.quantise True instead of False"
 
-    def other(folder: Path) -> None:
-        provenance = dataclasses.replace(again.first.provenance, data_hash="0" * 64)
-        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
 
-    assert "the scene's data has changed: running again" in again(change=other)[1]
+@pytest.mark.parametrize(
+    ("words", "change", "reason", "trains"),
+    [
+        (["protocol.quantise=true"], lambda *_: None, f"what is measured is another ({QUANTISED}): measured again",
+         False),
+        (["protocol.quantise=true"], lambda _, folder: no_checkpoint(folder),
+         f"({QUANTISED}): its checkpoint is gone: running again", True),
+        ([], of_older_config, "the training is another (train.iterations 4 instead of 1000): running again", True),
+        ([], lambda record, folder: changed(record, folder, with_checkpoint=True, data_hash="0" * 64),
+         "the scene's data has changed: running again", False),
+    ],
+    ids=["measured", "no checkpoint", "training", "data"],
+)  # fmt: skip
+def test_what_differs_is_named(again, words: list[str], change, reason: str, trains: bool) -> None:
+    """Catches a run that is done again for no reason that is said, and a training of hours announced as a measurement;
+    `again` refuses a step of training unless the run trains."""
+    record, output = again(*words, change=lambda folder: change(again.first, folder), trains=trains)
+    assert reason in output
+    assert record.protocol["quantise"] is bool(words)
 
 
 def test_weights_that_come_are_measured_from_the_checkpoint(again, monkeypatch) -> None:
     """Catches a training that LPIPS weights cost, and a column that stays empty although they are there."""
     assert again.first.metrics["lpips_vgg"] is None
     weights(monkeypatch, here=True)
-    record, said = again()
-    assert "it has no LPIPS (vgg), whose weights are here now: measured again" in said
+    record, output = again()
+    assert "it has no LPIPS (vgg), whose weights are here now: measured again" in output
     assert record.metrics["lpips_vgg"] == 0.25
     assert record.metrics["psnr"] == again.first.metrics["psnr"]
 
@@ -159,8 +154,8 @@ def test_weights_that_come_are_measured_from_the_checkpoint(again, monkeypatch) 
 def test_weights_that_come_after_the_checkpoint_went_cost_nothing(again, monkeypatch) -> None:
     """Catches a training repeated for an LPIPS column: a record without its checkpoint is kept as it is."""
     weights(monkeypatch, here=True)
-    record, said = again("protocol.lpips_vgg=weights.pth", change=no_checkpoint)
-    assert "whose weights are here now, but its checkpoint is gone: kept without" in said
+    record, output = again("protocol.lpips_vgg=weights.pth", change=no_checkpoint)
+    assert "whose weights are here now, but its checkpoint is gone: kept without" in output
     assert record == again.first
 
 
@@ -169,10 +164,10 @@ def test_weights_that_go_take_nothing_with_them(again, monkeypatch) -> None:
     weights(monkeypatch, here=True)
     measured, _ = again("protocol.lpips_vgg=weights.pth")
     weights(monkeypatch, here=False)
-    record, said = again(change=no_checkpoint)
+    record, output = again(change=no_checkpoint)
     assert record == measured
     assert record.metrics["lpips_vgg"] == 0.25
-    assert "finished before, kept" in said
+    assert "finished before, kept" in output
 
 
 def test_weights_that_are_named_and_missing_lose_no_record(again, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from gsbench.config import CONF, register_schema
 from gsbench.config_roles import training_hash
 from gsbench.errors import InputError
-from gsbench.run.identity import LONGEST_VARIANT, Run, identify
+from gsbench.run.identity import LONGEST_VARIANT, RunSpec, identify
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +24,7 @@ def composer() -> Iterator[None]:
 
 
 @functools.cache  # a composition takes long, and most tests compare with the plain run
-def named(*words: str) -> Run:
+def named(*words: str) -> RunSpec:
     """The run of `python -m gsbench +exp=mini scene=suzanne` and these words."""
     composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", *words], return_hydra_config=True)
     choices = OmegaConf.to_container(composed.hydra.runtime.choices)
@@ -140,12 +140,12 @@ def test_long_names_are_cut_at_a_word_and_stay_different() -> None:
     many = [
         f"model.lr.{name}.start={i}e-3" for i, name in enumerate(("means", "times", "directions", "shape", "motion"), 1)
     ]
-    one, other = named(*many), named(*many[:-1], "model.lr.motion.start=9e-3")
-    for run in (one, other):
+    first, other = named(*many), named(*many[:-1], "model.lr.motion.start=9e-3")
+    for run in (first, other):
         assert len(run.variant) <= LONGEST_VARIANT
         assert run.variant.startswith("lr.means.start=0.001,lr.times.start=0.002,")
-    assert one.variant != other.variant
-    assert named(*many[::-1]).variant == one.variant  # whatever the order of the words
+    assert first.variant != other.variant
+    assert named(*many[::-1]).variant == first.variant  # whatever the order of the words
 
 
 def test_the_words_repeat_the_run(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from interrupted import assert_same_bits, bits, counted_steps, run_through_kills
-from tiny_run import overrides, run_here, write_moving_square
+from tiny_run import overrides, run_here
 from tiny_training import compose, moving_square
 
 from gsbench.config import Config
@@ -14,9 +14,8 @@ from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, LengthChoice, Record, TimeScreen
 from gsbench.models import GaussianModel
 from gsbench.report.sections.curves import events
-from gsbench.run import auto_model, checks, load
-from gsbench.run.candidates import FOLDER
-from gsbench.run.lengths import lengths
+from gsbench.run import checks, load, selection
+from gsbench.run.selection import FOLDER, lengths
 from gsbench.run.setup import build
 from gsbench.scenes import View
 from gsbench.train.divergence import DivergedError
@@ -25,11 +24,6 @@ from gsbench.train.loop import Trainer
 OTHERS = ("model=7dgs", "train.curve_points=2", "train.checkpoint_minutes=0", "protocol.pictures=0")
 RUN = (*OTHERS, "train.iterations=80", "train.lengths=4")  # 10, 20, 40 and 80 steps
 LOSS = {40: 30.0}  # dB that val loses at a length, so that 20 is the best that is tried
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(autouse=True)
@@ -60,19 +54,19 @@ def test_the_best_length_on_val_is_kept_with_its_own_bits(
 ) -> None:
     """Catches the longest that is kept although it is worse, a length that need not be trained, and hidden costs."""
     record, folder = run_here(*overrides(square, tmp_path, *RUN))
-    found = choice_in(record)
-    assert [one.name for one in found.tried] == ["iterations=10", "iterations=20", "iterations=40"]
-    assert found.kept == 20
+    choice = choice_in(record)
+    assert [each.name for each in choice.tried] == ["iterations=10", "iterations=20", "iterations=40"]
+    assert choice.kept == 20
     assert "the training of 20 iterations is kept" in capsys.readouterr().err
-    alone, own = run_here(*overrides(square, tmp_path / "alone", *OTHERS, "train.iterations=20"))
+    alone, folder_alone = run_here(*overrides(square, tmp_path / "alone", *OTHERS, "train.iterations=20"))
     assert record.metrics == alone.metrics
-    assert_same_bits(bits(folder), bits(own))
+    assert_same_bits(bits(folder), bits(folder_alone))
     assert [point.psnr_val for point in record.curve] == [point.psnr_val for point in alone.curve]
-    assert found.tried[1].psnr_val == alone.curve[-1].psnr_val
-    others = found.tried[0].seconds + found.tried[2].seconds
+    assert choice.tried[1].psnr_val == alone.curve[-1].psnr_val
+    others = choice.tried[0].seconds + choice.tried[2].seconds
     assert record.cost is not None
     assert record.cost.stage_s["compare"] == pytest.approx(others)
-    assert record.cost.train_s == pytest.approx(sum(one.seconds for one in found.tried))
+    assert record.cost.train_s == pytest.approx(sum(each.seconds for each in choice.tried))
     assert record.curve[0].seconds > others, "a PSNR is reached only after the other lengths"
     assert not (folder / FOLDER).exists()
     assert [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()] == [10, 20]
@@ -97,8 +91,8 @@ def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, mon
     monkeypatch.setitem(LOSS, 40, -1.0)
     monkeypatch.setitem(LOSS, 80, -2.0)
     monkeypatch.setitem(LOSS, 10, 1.0)
-    found = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
-    assert (found.kept, len(found.tried)) == (80, 4)
+    choice = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
+    assert (choice.kept, len(choice.tried)) == (80, 4)
 
 
 @pytest.mark.parametrize("saves", [7, 71], ids=["midway", "chosen"])
@@ -109,8 +103,8 @@ def test_a_kill_repeats_no_step(saves: int, square: Path, tmp_path: Path, monkey
     again = overrides(square, tmp_path, *RUN)
     record, folder = run_through_kills(saves, monkeypatch, lambda: run_here(*again))
     assert steps["all"] == 10 + 20 + 40
-    assert [(one.name, one.psnr_val) for one in choice_in(record).tried] == [
-        (one.name, one.psnr_val) for one in choice_in(whole).tried
+    assert [(each.name, each.psnr_val) for each in choice_in(record).tried] == [
+        (each.name, each.psnr_val) for each in choice_in(whole).tried
     ]
     assert record.metrics == whole.metrics
     assert_same_bits(bits(folder), bits(unbroken))
@@ -141,9 +135,9 @@ def test_a_length_that_fails_loses(square: Path, tmp_path: Path, monkeypatch: py
         descend(self)
 
     monkeypatch.setattr(Trainer, "train_step", diverging)
-    found = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
-    assert [one.reason for one in found.tried] == ["step 5: a loss of nan", None, "step 5: a loss of nan"]
-    assert found.kept == 20
+    choice = choice_in(run_here(*overrides(square, tmp_path, *RUN))[0])
+    assert [each.reason for each in choice.tried] == ["step 5: a loss of nan", None, "step 5: a loss of nan"]
+    assert choice.kept == 20
     failing |= {20, 80}
     failed, _ = run_here(*overrides(square, tmp_path / "all", *RUN))
     assert (failed.status, failed.length_choice) == ("diverged", None)
@@ -153,7 +147,7 @@ def test_the_model_that_auto_chose_has_several_lengths(
     square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches lengths of another model than the screen chose, and seconds of the screen that are lost."""
-    monkeypatch.setattr(auto_model, "screen_time", lambda *_: TimeScreen("off", "said", None, None, None, 5.0))
+    monkeypatch.setattr(selection, "screen_time", lambda *_: TimeScreen("off", "said", None, None, None, 5.0))
     record, folder = run_here(*overrides(square, tmp_path, *RUN, "model=auto"))
     assert choice_in(record).kept == 20
     assert not record.effects.time
@@ -164,14 +158,14 @@ def test_the_model_that_auto_chose_has_several_lengths(
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("effects.compare=true",), "train.lengths: expected effects.compare=false"),
         (("train.patience=0.2",), "train.patience: expected train.lengths=null"),
         (("scene.eval_split=val",), "train.lengths: expected results on test"),
     ],
 )
-def test_settings_that_exclude_each_other_are_refused(words: tuple[str, ...], said: str) -> None:
+def test_settings_that_exclude_each_other_are_refused(words: tuple[str, ...], message: str) -> None:
     """Catches a key that does nothing, and results on the views by which the length was chosen."""
     square = moving_square()
     scene, config = replace(square, val=square.train[:1]), compose("3dgs", 10, "train.lengths=2", *words)
@@ -180,7 +174,7 @@ def test_settings_that_exclude_each_other_are_refused(words: tuple[str, ...], sa
         if len(words) and "val" not in words[0]
         else lambda _: checks.check_scene(model(), scene, config)
     )
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         asked(config)
 
 
@@ -198,6 +192,6 @@ def test_a_length_without_a_step_or_a_val_is_refused() -> None:
 def test_each_length_is_twice_the_one_before() -> None:
     """Catches a last length that is not the one which was asked for, and odd numbers that are not halved."""
     config: Config = compose("7dgs", 75, "train.lengths=3")
-    assert [(one.train.iterations, one.train.lengths) for one in lengths(config).values()] == [
+    assert [(each.train.iterations, each.train.lengths) for each in lengths(config).values()] == [
         (18, None), (37, None), (75, None)
     ]  # fmt: skip

@@ -48,9 +48,9 @@ def test_a_folder_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_whose_config_is_of_another_model_is_refused(folder: Path, tmp_path: Path) -> None:
     """Catches parameters of one model that are rendered as another's, and a config that is no config."""
-    found = checkpoint.read(folder / checkpoint.FILE_NAME)
-    other = {**found.config, "agr": False}
-    for config, said in ((other, "not of this model"), ({}, "config"), ({**found.config, "foo": 1}, "foo")):
-        checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("t", "d", found.state, config, found.scene))
-        with pytest.raises(InputError, match=said):
+    saved = checkpoint.read(folder / checkpoint.FILE_NAME)
+    other = {**saved.config, "agr": False}
+    for config, message in ((other, "not of this model"), ({}, "config"), ({**saved.config, "foo": 1}, "foo")):
+        checkpoint.save(tmp_path / checkpoint.FILE_NAME, Checkpoint("t", "d", saved.state, config, saved.scene))
+        with pytest.raises(InputError, match=message):
             load_run(tmp_path)

@@ -1,6 +1,7 @@
 """The log of a run: curve.jsonl in its folder, and the trackers, which are faked here and may fail as they like."""
 
 import importlib.machinery
+import importlib.util
 import json
 import math
 import re
@@ -10,13 +11,11 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from tiny_run import overrides, run_here, write_moving_square
+from tiny_run import overrides, run_here
 
 from gsbench.errors import InputError
 from gsbench.measure.curve import Curve
-from gsbench.run import trackers
-from gsbench.run.log import FILE_NAME, RunLog
-from gsbench.run.trackers import TRACKERS, Guarded, Subject
+from gsbench.run.log import FILE_NAME, ID_FILE, TRACKERS, Guarded, RunLog, Subject
 
 Sent = dict[str, Any]
 
@@ -27,10 +26,10 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 def module(monkeypatch: pytest.MonkeyPatch, name: str, **content: object) -> None:
     """Put a module into sys.modules, as if its package were installed."""
-    made = ModuleType(name)
-    made.__spec__ = importlib.machinery.ModuleSpec(name, None)
-    vars(made).update(content)
-    monkeypatch.setitem(sys.modules, name, made)
+    fake_module = ModuleType(name)
+    fake_module.__spec__ = importlib.machinery.ModuleSpec(name, None)
+    vars(fake_module).update(content)
+    monkeypatch.setitem(sys.modules, name, fake_module)
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, name: str) -> Sent:
@@ -116,11 +115,6 @@ def run_in(folder: Path, log: str | None = None) -> Any:
 # ---- curve.jsonl
 
 
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
-
-
 def test_a_resumed_run_repeats_no_line(tmp_path: Path) -> None:
     """Catches lines after the last checkpoint that come twice, a half-written line, and a loss that a resume loses."""
     killed = trainer((10, 1.0, 20.0))
@@ -191,7 +185,7 @@ def test_a_resumed_run_has_the_same_id(
     sent = fake(monkeypatch, name)
     for step in (0, 10, 0):
         RunLog(run_in(tmp_path, name), trainer(step=step)).end(None)
-    (tmp_path / trackers.ID_FILE).write_text("../../other")
+    (tmp_path / ID_FILE).write_text("../../other")
     RunLog(run_in(tmp_path, name), trainer(step=10)).end(None)
     assert sent["ids"] == ["made0", "made0", "made2", "made3"]
     assert sent["ended"] == [killed] * 4
@@ -234,8 +228,8 @@ def test_a_tracker_that_fails_is_told_once_and_costs_nothing(
     tracker.end("ok")
     assert calls.count(broken) == 1
     assert calls[-1] == broken
-    said = "gsbench: warning: log=wandb: ConnectionError: no route to host: the run goes on without it\n"
-    assert capsys.readouterr().err == said
+    message = "gsbench: warning: log=wandb: ConnectionError: no route to host: the run goes on without it\n"
+    assert capsys.readouterr().err == message
 
 
 def test_a_run_with_a_server_that_is_down_is_ok(
@@ -252,19 +246,19 @@ def test_a_run_with_a_server_that_is_down_is_ok(
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("wandb", "log=wandb: the package wandb is not installed: pip install '.[wandb]'"),
         ("tensorbord", "log 'tensorbord' is not known. Did you mean 'tensorboard'"),
     ],
 )
 def test_what_is_not_installed_or_known_is_refused_at_the_door(
-    name: str, said: str, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, message: str, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a run that trains for hours before it says so, or a finished run whose record becomes a failed one."""
     _, folder = run_here(*overrides(square, tmp_path, "model=3dgs"))
     record = (folder / "record.json").read_bytes()
-    monkeypatch.setattr(trackers.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=re.escape(said)):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=re.escape(message)):
         run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
     assert (folder / "record.json").read_bytes() == record

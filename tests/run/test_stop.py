@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from forked import Forked
-from tiny_run import gsbench, overrides, write_moving_square
+from tiny_run import gsbench, overrides
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import HOST
@@ -18,11 +18,6 @@ from gsbench.run import progress, stop
 from gsbench.train import checkpoint
 
 LONG = ("model=3dgs", "train.iterations=100000", "train.curve_points=1", "train.densify.stop=1")
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 def started(*arguments: str, results: Path, folder: Path) -> Forked:
@@ -50,11 +45,11 @@ def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, 
     process = started(*overrides(square, results, *LONG), results=results, folder=tmp_path)
     process.send_signal(number)
     assert process.wait() == code, process.err
-    said = process.err
-    assert "Traceback" not in said
-    found = re.search(r"stopped at step (\d+), saved in (.*): the same command continues from there", said)
-    assert found, said
-    assert checkpoint.read(Path(found[2])).state["step"] == int(found[1])
+    errors = process.err
+    assert "Traceback" not in errors
+    match = re.search(r"stopped at step (\d+), saved in (.*): the same command continues from there", errors)
+    assert match, errors
+    assert checkpoint.read(Path(match[2])).state["step"] == int(match[1])
     assert not list(results.rglob(progress.FILE_NAME))
     assert not list(results.rglob("*.tmp"))
 
@@ -133,11 +128,11 @@ def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path) -> None:
 
 def test_progress_can_be_read_and_a_later_process_with_its_number_is_not_it(tmp_path: Path) -> None:
     """Catches a lost run that counts as running because its process number was given away again."""
-    mine = progress.Progress(["seed=1"], step=3, steps=9, psnr_val=20.5)
-    progress.write(tmp_path, mine)
-    assert progress.read(tmp_path / progress.FILE_NAME) == mine
-    assert progress.is_alive(mine)
-    assert mine.born is not None
-    assert not progress.is_alive(replace(mine, born=mine.born - 1))
-    assert progress.is_alive(replace(mine, host="elsewhere"))
-    assert not progress.is_alive(replace(mine, host="elsewhere", updated=mine.updated - 2 * progress.SILENT))
+    here = progress.Progress(["seed=1"], step=3, steps=9, psnr_val=20.5)
+    progress.write(tmp_path, here)
+    assert progress.read(tmp_path / progress.FILE_NAME) == here
+    assert progress.is_alive(here)
+    assert here.born is not None
+    assert not progress.is_alive(replace(here, born=here.born - 1))
+    assert progress.is_alive(replace(here, host="elsewhere"))
+    assert not progress.is_alive(replace(here, host="elsewhere", updated=here.updated - 2 * progress.SILENT))

@@ -72,24 +72,24 @@ class Sweep:
 
     def training(self) -> list[Progress]:
         """The runs that train at this moment and have a checkpoint, the newest last."""
-        found = []
+        training = []
         for path in self.results.rglob(PROGRESS):
             with contextlib.suppress(InputError):  # it ended just now
-                if path.with_name("checkpoint.pt").exists() and is_alive(one := read_progress(path)):
-                    found.append(one)
-        return sorted(found, key=lambda one: one.started)
+                if path.with_name("checkpoint.pt").exists() and is_alive(progress := read_progress(path)):
+                    training.append(progress)
+        return sorted(training, key=lambda progress: progress.started)
 
     def one_training(self, node: str = "n1,n2") -> Progress:
         """Wait until a run trains on a node and has a checkpoint; return the newest."""
-        found: list[Progress] = []
+        on_node: list[Progress] = []
 
         def trains() -> bool:
             jobs = self.cluster.run("squeue", "-h", "--array", "--states=RUNNING", "-w", node, "-o", "%F_%K").split()
-            found[:] = [one for one in self.training() if one.job in jobs or f"{one.job}_N/A" in jobs]
-            return bool(found)
+            on_node[:] = [run for run in self.training() if run.job in jobs or f"{run.job}_N/A" in jobs]
+            return bool(on_node)
 
         wait_until(f"a run with a checkpoint on {node}", trains, 240, self._over)
-        return found[-1]
+        return on_node[-1]
 
     def broken(self) -> list[str]:
         """The reasons of the runs that failed or are lost."""
@@ -160,9 +160,9 @@ def killed_jobs_and_nodes(check: Check) -> None:
         lambda: "PENDING" in check.cluster.run("squeue", "-h", "--array", "-o", "%T", "-j", job),
         60,
     )
-    found = [run for run in sweep.status() if run["job"] == job]
-    check.say("requeue of a running job", "queued, not lost", [run["state"] for run in found] == ["queued"],
-              f"{found[0]['state']} at step {found[0]['step']}: {found[0]['reason']}", begin)  # fmt: skip
+    requeued = [run for run in sweep.status() if run["job"] == job]
+    check.say("requeue of a running job", "queued, not lost", [run["state"] for run in requeued] == ["queued"],
+              f"{requeued[0]['state']} at step {requeued[0]['step']}: {requeued[0]['reason']}", begin)  # fmt: skip
 
     begin = time.monotonic()
     sweep.one_training("n2")
@@ -183,19 +183,20 @@ def killed_jobs_and_nodes(check: Check) -> None:
 
 def time_limit(check: Check) -> None:
     """A time limit that comes before the run's end: at 2 minutes less 60 s, Slurm's signal comes after 30 to 60 s."""
-    begin = time.monotonic()
-    (quick,) = check.reference.glob("mini/suzanne/7dgs*/seed0/record.json")
-    seconds = json.loads(quick.read_text())["cost"]["train_s"]
-    # Without growth a step of the long run takes as long as one of the quick run, so that its seconds are known.
-    long = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000",
-            f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")  # fmt: skip
-    do_here(check.reference, long)
     image = check.folder / "gsbench.sif"
     image.touch()
     in_image = (f"launch.container={image}", f"launch.container_command={apptainer(check.folder)} exec")
     for name, launch in ("time limit", ()), ("time limit in a container image", in_image):
         begin = time.monotonic()
+        # Without growth all steps take equally long, so that a short run just before says how many fill the time.
+        fixed = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000")
+        rate = check.folder / f"rate_{name.replace(' ', '_')}"
+        do_here(rate, (*fixed, f"train.iterations={STEPS}"))
+        (quick,) = rate.rglob("record.json")
+        seconds = json.loads(quick.read_text())["cost"]["train_s"]
+        long = (*fixed, f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")
         sweep = check.sweep(name.replace(" ", "_"), *long, "launch.minutes=2", "launch.signal_seconds=60", *launch)
+        do_here(check.reference, long)  # beside the job, which can only become longer by it
         sweep.wait(600)
         log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
         check.say(name, "saved and requeued at Slurm's signal", "continues from step" in log,
@@ -287,37 +288,34 @@ INJECTIONS: tuple[Callable[[Check], None], ...] = (
 
 def differences(reference: Path, results: Path) -> list[str]:
     """What differs between the finished runs of a folder and the same runs of the reference."""
-    found = []
+    differing = []
     for path in sorted(results.rglob("record.json")):
         run = path.parent.relative_to(results)
-        ours, theirs = (json.loads((root / run / "record.json").read_text()) for root in (results, reference))
-        if ours["status"] != "ok":
-            continue
-        if ours["metrics"] != theirs["metrics"]:
-            found.append(f"{run}: metrics")
-        if [(i, psnr) for i, _, psnr in ours["curve"]] != [(i, psnr) for i, _, psnr in theirs["curve"]]:
-            found.append(f"{run}: curve")
-        if not equal(*(checkpoint(root / run / "checkpoint.pt") for root in (results, reference))):
-            found.append(f"{run}: checkpoint")
-    return found
+        here, there = (measured(root / run) for root in (reference, results))
+        if there["status"] == "ok":
+            differing += [f"{run}: {part}" for part, value in there.items() if not equal(value, here[part])]
+    return differing
 
 
-def checkpoint(path: Path) -> Any:
-    """The state in a checkpoint, less its times."""
+def measured(run: Path) -> dict[str, Any]:
+    """The status of a finished run, its metrics, and its curve and the state in its checkpoint less their times."""
     from gsbench.train.checkpoint import read, without_times
 
-    return without_times(read(path).state)
+    record = json.loads((run / "record.json").read_text())
+    state = without_times(read(run / "checkpoint.pt").state) if record["status"] == "ok" else None
+    curve = [[step, psnr] for step, _, psnr in record["curve"] or []]
+    return {"status": record["status"], "metrics": record["metrics"], "curve": curve, "checkpoint": state}
 
 
-def equal(one: Any, other: Any) -> bool:
+def equal(a: Any, b: Any) -> bool:
     """Whether two states are equal to the bit."""
-    if isinstance(one, torch.Tensor):
-        return isinstance(other, torch.Tensor) and one.dtype == other.dtype and torch.equal(one, other)
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-    if isinstance(one, list):
-        return len(one) == len(other) and all(map(equal, one, other))
-    return bool(one == other)
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(equal, a, b))
+    return bool(a == b)
 
 
 def do_here(folder: Path, overrides: tuple[str, ...]) -> None:

@@ -139,15 +139,15 @@ class Cluster:
 
     def _of_node(self, node: str) -> set[int]:
         """The processes of a node's jobs and the slurmstepds above them, which do not have the node in their names."""
-        found = set()
+        processes = set()
         for path in Path("/proc").glob("[0-9]*/environ"):
             with contextlib.suppress(OSError):
                 if f"SLURMD_NODENAME={node}".encode() in path.read_bytes().split(b"\0"):
-                    found.add(int(path.parent.name))
+                    processes.add(int(path.parent.name))
                     parent = path.with_name("stat").read_text().rpartition(")")[2].split()[1]
                     if Path(f"/proc/{parent}/cmdline").read_bytes().startswith(b"slurmstepd"):
-                        found.add(int(parent))
-        return found
+                        processes.add(int(parent))
+        return processes
 
     def stop(self) -> None:
         """Stop every daemon, the ones that were started last first."""
@@ -243,11 +243,11 @@ def wait_until(
 def free_ports(count: int) -> list[int]:
     """Ports on which nobody listens."""
     sockets = [socket.socket() for _ in range(count)]
-    for one in sockets:
-        one.bind(("127.0.0.1", 0))
-    ports = [one.getsockname()[1] for one in sockets]
-    for one in sockets:
-        one.close()
+    for socket_ in sockets:
+        socket_.bind(("127.0.0.1", 0))
+    ports = [socket_.getsockname()[1] for socket_ in sockets]
+    for socket_ in sockets:
+        socket_.close()
     return ports
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from forked import Forked
 from interrupted import assert_resumes, assert_same_bits
-from tiny_run import gsbench, overrides, run_here, write_moving_square
+from tiny_run import gsbench, overrides, run_here
 from tiny_training import trainer
 
 from gsbench.errors import InputError
@@ -29,11 +29,6 @@ RUN = (
     "train.checkpoint_minutes=0",
     "data.initial_points=60",
 )
-
-
-@pytest.fixture(scope="module")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_moving_square(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tiny_run import overrides, run_here, write_moving_square
-
-
-@pytest.fixture(scope="session")
-def square(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set with one moving square."""
-    return write_moving_square(tmp_path_factory.mktemp("data"))
+from tiny_run import overrides, run_here
 
 
 def trained(square: Path, root: Path, *words: str) -> Path:

@@ -25,7 +25,7 @@ class LengthsKey:
 
 @dataclass
 class ChosenOnVal:
-    """The comparisons that led to a training; gsbench.run.lengths and gsbench.run.auto_model make them."""
+    """The comparisons that led to a training; gsbench.run.selection makes them."""
 
     length: LengthChoice | None = None  # by which `train.lengths` chose this training
     comparison: ModelComparison | None = None  # by which model=auto chose the model (`effects.compare`)

@@ -1,8 +1,8 @@
-"""Do the runs of a sweep in parallel processes of this machine, a process for each run (`+launch=parallel`).
+"""Do the runs of a sweep here: each in this process, or in parallel processes (`+launch=parallel`).
 
-A process is a fork of one that has imported torch and computed nothing: a run does not wait for imports, and there are
-no threads that a fork would lose. If one dies, for example because memory ran out, the others go on. A signal to any of
-them stops the sweep: each run saves a checkpoint, and no other begins.
+A parallel process is a fork of one that has imported torch and computed nothing: a run does not wait for imports, and
+there are no threads that a fork would lose. If one dies, for example because memory ran out, the others go on. A signal
+to any of them stops the sweep: each run saves a checkpoint, and no other begins.
 """
 
 import contextlib
@@ -11,14 +11,19 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Sequence
 from multiprocessing import connection, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from gsbench.errors import InputError, printable
-from gsbench.launch.command import RunConfig
-from gsbench.launch.task import do_planned
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.errors import InputError, one_line, printable
+from gsbench.launch import plan
+from gsbench.launch.command import RunConfig, explain
+from gsbench.launch.plan import Ended
+from gsbench.measure.record import FILE_NAME
 from gsbench.process.memory import is_out_of_memory, too_little_address_space
 from gsbench.run import stop
 from gsbench.run.stop import Request, Stopped
@@ -27,7 +32,57 @@ POLL = 0.2  # seconds between two looks for a signal, and of a run's process for
 Running = dict[BaseProcess, str]  # the processes of runs, and the overrides of each
 
 
-def launch(configs: Sequence[RunConfig], folder: Path) -> None:
+def do_planned(config: RunConfig, folder: Path, number: int, at_once: int = 1) -> Ended:
+    """Do run `number` of the sweep whose plan is in `folder`; write its outcome, and print the time left.
+
+    `at_once` is the number of runs at a time, 0 if nobody knows, as on Slurm.
+    """
+    ended = do(config)
+    plan.write_ended(folder, number, ended)
+    if at_once and (line := plan.time_left(folder, at_once)):
+        print(line, file=sys.stderr)
+    return ended
+
+
+def do(config: RunConfig) -> Ended:
+    """Do a run, and return its outcome; a reason why it did not end well is printed too."""
+    began, results = time.time(), Path(config.config.results).absolute()
+    try:
+        ended = _done(config, began, results)
+    except OmegaConfBaseException as error:  # a reference in the config that leads nowhere
+        ended = Ended(reason=explain(error), is_refused=True)
+    except InputError as error:
+        ended = Ended(reason=str(error), is_refused=True)
+    except Exception as error:
+        if not is_out_of_memory(error):
+            traceback.print_exc()
+        kind = "out of memory" if is_out_of_memory(error) else type(error).__name__
+        ended = Ended(reason=f"{kind}: {one_line(error)}")
+    if ended.reason is not None:
+        print(f"gsbench: error: {printable(f'{config.config.scene.name}: {ended.reason}')}", file=sys.stderr)
+    return ended
+
+
+def _done(config: RunConfig, began: float, results: Path) -> Ended:
+    if (limit := too_little_address_space()) is not None:
+        raise MemoryError(limit)
+    from gsbench.run.execution import UnrecordedError, execute  # imports torch
+    from gsbench.run.identity import identify
+
+    spec = identify(config.config, config.choices, config.overrides)
+    path = spec.folder.absolute() / FILE_NAME
+    try:
+        record = execute(spec)
+    except UnrecordedError as error:
+        return Ended(reason=str(error))
+    problem = None if record is None or record.status == "ok" else f"{record.status}: {record.reason}"
+    if not path.exists():  # another process does the run
+        return Ended(reason=problem or "it ended without a record" if record else None)
+    seconds = time.time() - began if path.stat().st_mtime >= began else None  # an older record was kept
+    return Ended(os.path.relpath(path, results), problem, seconds=seconds)
+
+
+def launch_parallel(configs: Sequence[RunConfig], folder: Path) -> None:
     """Do the runs of the plan in `folder`, at most `launch.at_once` at a time.
 
     Raises:
@@ -96,7 +151,7 @@ def _import_torch() -> None:
     if too_little_address_space() is not None:
         return
     try:
-        import gsbench.run.run  # noqa: F401
+        import gsbench.run.execution  # noqa: F401
     except (ImportError, OSError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise

@@ -1,0 +1,389 @@
+"""Choose the training of a run among several by PSNR on val: a model for model=auto, a length for train.lengths.
+
+For model=auto, a test whether the scene changes with time decides between a candidate with time ("moving") and one
+without ("static"). With effects.compare=true, and if the scene may move, all candidates are trained to 70 % of their
+steps, and the best on val is trained to the end.
+
+For train.lengths a run is trained at several lengths, each from the start. Long trainings of small scenes overfit.
+Learning rates fall to the end of a training, so that to stop it early is worth little: a training that was planned to
+be short is better (docs/tuning.md).
+"""
+
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsbench.config import Config, ModelConfig
+from gsbench.errors import InputError, one_line
+from gsbench.gates import messages
+from gsbench.gates.screen import import_compiler, screen_time
+from gsbench.measure.exact_views import rank
+from gsbench.measure.record import Candidate, LengthChoice, ModelComparison, TimeScreen
+from gsbench.measure.speed import Effort
+from gsbench.run import fitting, progress
+from gsbench.run.checks import check_scene, check_values
+from gsbench.run.identity import RunSpec, label_of
+from gsbench.run.setup import build, build_with_placeholders
+from gsbench.scenes import Scene
+from gsbench.scenes.gaussian_ply import TrainedGaussians
+from gsbench.schedule import Schedule
+from gsbench.train.divergence import DivergedError
+from gsbench.train.hooks.choices import Choices, choices_in, lengths_of
+from gsbench.train.loop import Trainer
+from gsbench.train.optim import check_rates
+
+FOLDER = "candidates"  # in the run's folder; each candidate has a folder there for its checkpoint
+AUTO = "auto"
+HOW_TO = "effects.md#comparing-models-on-val"
+
+
+def plain(spec: RunSpec, config: Config) -> dict[str, Any]:
+    """Return the settings of a training of a run as plain values: the run's, with the training's model and length.
+
+    The checkpoint of a run has those of the training that is kept, so that its schedule is that of its length.
+    """
+    length = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
+    model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)
+    return spec.plain | {"train": spec.plain["train"] | length, "model": model, "agr": config.agr}
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The candidates of a run, by name. Each has the data and the seed of the run, and settings of its own."""
+
+    spec: RunSpec
+    scene: Scene
+    start: TrainedGaussians | None  # trained Gaussians to start from; None: start from points
+    settings: dict[str, Config]
+
+    def trainer(self, name: str) -> Trainer:
+        """Return the trainer of a candidate at step 0."""
+        config = self.settings[name]
+        return fitting.trainer_of(build(config), self.scene, config, self.start)
+
+    def chosen(self, known: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
+        """Return the trainer of the candidate that the run's own checkpoint names, or else of the one to `choose` now.
+
+        The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `known`
+        returns the name of the chosen candidate in the state of a checkpoint.
+
+        Raises:
+            InputError: a checkpoint is damaged.
+        """
+        state = fitting.saved_state(self.spec, self.scene)
+        name = known(state) if state else None
+        if name is None:
+            trainer = choose()
+            fitting.save(trainer.state_dict(), self.spec, self.scene, plain(self.spec, trainer.config))
+        elif name in self.settings:
+            trainer = self.trainer(name)
+            fitting.resume(trainer, self.spec, state)
+        else:
+            raise InputError(f"checkpoint: expected one of {', '.join(self.settings)}, got {name!r:.80}: "
+                             f"start over with resume=false")  # fmt: skip
+        shutil.rmtree(self.spec.folder / FOLDER, ignore_errors=True)
+        return trainer
+
+    def trained(
+        self, chosen: "Result", results: Sequence["Result"], screen: TimeScreen | None, effort: Effort
+    ) -> Trainer:
+        """Return the trainer of the chosen candidate at the step of its checkpoint.
+
+        The training of all other candidates counts as training before its own, and so do the time screen of model=auto
+        and its CPU time, `effort`.
+
+        Raises:
+            InputError: the checkpoint is gone or damaged.
+        """
+        run, trainer = self._run(chosen.candidate.name), self.trainer(chosen.candidate.name)
+        state = fitting.saved_state(replace(run, config=replace(run.config, resume=True)), self.scene)
+        if state is None:
+            raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
+        trainer.load_state_dict(state)
+        others = [result for result in results if result is not chosen]
+        seconds = sum(other.candidate.seconds for other in others)
+        trainer.stages.add("compare", seconds)
+        if screen is not None:
+            trainer.stages.add("screen", screen.seconds)
+            seconds += screen.seconds
+        trainer.curve.delay(seconds)
+        for spent in (effort, *(other.effort for other in others)):
+            trainer.effort.add(spent)
+        return trainer
+
+    def train(self, name: str, until: int, before: Sequence["Result"], steps: int) -> "Result":
+        """Train a candidate to `until` steps, from its checkpoint if it has one, and return its PSNR on val.
+
+        The results `before`, and the `steps` of the whole run, are for reports of progress.
+
+        Raises:
+            InputError: the checkpoint is damaged.
+            Stopped: a signal asked the process to end; the checkpoint is saved.
+        """
+        spec, run, trainer = self.spec, self._run(name), self.trainer(name)
+        done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
+        error = None
+        try:
+            fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
+            fitting.fit(trainer, run, run.plain, until=until, reporter=lambda: progress.Reporter(
+                spec.folder, spec.overrides, steps, done, seconds
+            ))  # fmt: skip
+        except (DivergedError, fitting.NoGaussianError) as raised:
+            error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
+            error.__context__ = None
+        psnr = None if error or trainer.curve.last is None else trainer.curve.last.psnr_val
+        spent = sum(trainer.stages.seconds.values())
+        return Result(Candidate(name, psnr, spent, one_line(error) if error else None), until, trainer.effort, error)
+
+    def _run(self, name: str) -> RunSpec:
+        """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
+        spec, config = self.spec, self.settings[name]
+        return replace(spec, config=config, plain=plain(spec, config), folder=spec.folder / FOLDER / name,
+                       label=f"{spec.label} ({name})")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Result:
+    """What the training of a candidate gave, and what it cost."""
+
+    candidate: Candidate
+    steps: int  # after which its PSNR on val is measured
+    effort: Effort
+    error: DivergedError | fitting.NoGaussianError | None = None  # why the training failed
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Return the value by which candidates are compared: none that failed is above one that did not."""
+        return self.error is None, rank(self.candidate.psnr_val)
+
+
+def highest(results: Sequence[Result]) -> Result:
+    """Return the result with the highest PSNR on val, the last of equal ones, which may be one that failed."""
+    return max(reversed(results), key=lambda result: result.rank)
+
+
+def best(results: Sequence[Result]) -> Result:
+    """Return the `highest` result.
+
+    Raises:
+        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
+    """
+    top, first = highest(results), results[0]
+    if top.error is not None and first.error is not None:
+        raise type(first.error)(
+            f"all {len(results)} candidates failed; {first.candidate.name}: {first.candidate.reason}"
+        )
+    return top
+
+
+def is_auto(config: Config) -> bool:
+    """Return whether the settings have model=auto, so that a test of the scene must still choose the model."""
+    return config.model.name == AUTO
+
+
+def with_candidate(config: Config, name: str) -> Config:
+    """Return the settings of model=auto with its candidate "moving" or "static" as the model."""
+    return _with_model(config, config.model.candidates.get(name), f"model.candidates.{name}")
+
+
+def candidates(config: Config) -> dict[str, Config]:
+    """Return the settings of each model to compare, by its label; the first is the one that model=auto trains alone.
+
+    Raises:
+        InputError: a candidate is no model config, or two of them have one label.
+    """
+    more = [_with_model(config, model, f"model.compared.{key}") for key, model in config.model.compared.items()]
+    by_label: dict[str, Config] = {}
+    for each in (with_candidate(config, "moving"), *more, with_candidate(config, "static")):
+        candidate = replace(each, model=replace(each.model, agr=each.agr))  # agr=false: 7dgs is 7dgs_noagr
+        label = label_of(candidate)
+        if by_label.setdefault(label, candidate) != candidate:
+            raise InputError(f"model.compared: expected models of different names, two are {label!r:.80}")
+    return by_label
+
+
+def _with_model(config: Config, model: Any, key: str) -> Config:
+    """Return settings with another model, from the config key `key`, with AGR only if the model's settings have it.
+
+    Raises:
+        InputError: `model` is not a model config.
+    """
+    try:
+        typed = OmegaConf.merge(OmegaConf.structured(ModelConfig), model or {})
+        chosen: ModelConfig = OmegaConf.to_object(typed)  # type: ignore[assignment]
+    except (OmegaConfBaseException, ValueError, TypeError) as error:
+        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
+    return replace(config, model=replace(chosen, gate=config.model.gate), agr=config.agr and chosen.agr)
+
+
+def check_compare(config: Config) -> None:
+    """Raise InputError if the settings ask to compare models on val and cannot have this."""
+    if not config.effects.compare:
+        return
+    if not is_auto(config):
+        raise InputError(f"effects.compare=true: expected model=auto, whose candidates it compares, got "
+                         f"model={config.model.name}: leave effects.compare out, or use model=auto",
+                         docs=HOW_TO)  # fmt: skip
+    if config.scene.eval_split == "val":
+        raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
+                         "views by which the model is chosen would be too high; name a model instead")  # fmt: skip
+
+
+def check_candidates(config: Config, scene: Scene) -> None:
+    """Raise InputError if a scene with times has no val views, or a candidate bad settings or no way to train on it."""
+    if not scene.val:
+        raise InputError(f"effects.compare=true: expected views of val to compare models on, {scene.name} has none: "
+                         f"scene.val_every=8 takes every eighth training view", docs=HOW_TO)  # fmt: skip
+    for name, settings in candidates(config).items():
+        try:
+            check_values(settings)
+            check_scene(build(settings), scene, settings)
+            check_rates(build_with_placeholders(settings, scene.extent).groups(), settings.model)
+        except InputError as error:
+            raise InputError(f"effects.compare=true, candidate {name}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """The settings of a training after model=auto was replaced by a model, and the test that chose it."""
+
+    config: Config
+    screen: TimeScreen | None = None  # the test that chose the model, for model=auto
+    effort: Effort = field(default_factory=Effort)  # CPU time of this test
+
+    @property
+    def compares(self) -> bool:
+        """Return whether a comparison on val must still choose the model: `effects.compare`, if the scene may move."""
+        return self.config.effects.compare and self.screen is not None and self.screen.decision != "off"
+
+
+def before_scene(config: Config) -> Config:
+    """Return settings to check before the scene is loaded: model=auto is replaced by its candidate with time."""
+    return with_candidate(config, "moving") if is_auto(config) else config
+
+
+def resolve(spec: RunSpec, scene: Scene) -> Resolved:
+    """Replace model=auto by a model with or without time, after a test whether the training views change with time.
+
+    The reason is printed. If the test is undecided, the model has time: training 7DGS on a static scene costs a few
+    seconds, but 6DGS on a moving scene loses the motion. Other settings are returned unchanged.
+
+    Raises:
+        InputError: the settings lack a candidate of model=auto.
+    """
+    if not is_auto(spec.config):
+        return Resolved(spec.config)
+    import_compiler()
+    effort = Effort()
+    with effort:
+        screen = screen_time(scene, spec.config.seed, spec.config.raster.backend)
+        config = with_candidate(spec.config, "static" if screen.decision == "off" else "moving")
+    resolved = Resolved(config, screen, effort)
+    model = f"{config.model.name}{' with AGR' if config.agr else ''}"
+    print(f"{spec.name}: time is {screen.decision}: {screen.reason}; "
+          f"{'models are compared on val' if resolved.compares else model}", file=sys.stderr)  # fmt: skip
+    return resolved
+
+
+def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, resolved: Resolved) -> Trainer:
+    """Return the trainer of the candidate with the highest PSNR on val, from which the run continues.
+
+    The candidates are trained one after another, each with the settings and the seed of the run, so that the result is
+    bit-equal to a run of the chosen model alone. A checkpoint of each is kept until the choice is saved in the run's
+    own checkpoint. The seconds of the time screen and of the other candidates count as training.
+
+    Raises:
+        InputError: a checkpoint is damaged.
+        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
+        Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
+    """
+
+    def chosen_in(state: dict[str, Any]) -> str | None:
+        comparison = choices_in(state).comparison
+        return None if comparison is None else comparison.chosen
+
+    parts = Candidates(spec, scene, start, candidates(spec.config))
+    return parts.chosen(chosen_in, lambda: _trained_models(parts, resolved))
+
+
+def _trained_models(parts: Candidates, resolved: Resolved) -> Trainer:
+    """Train all candidates, print which is the best, and return its trainer with the costs of all."""
+    results: list[Result] = []
+    for name, config in parts.settings.items():
+        until = Schedule(config.train, config.model.sh_degree, config.agr).compares_after
+        steps = (len(parts.settings) - 1) * until + config.train.iterations
+        results.append(parts.train(name, until, results, steps))
+    chosen = best(results)
+    comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
+    print(f"{parts.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
+    trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
+    trainer.hook(Choices).chosen.comparison = comparison
+    return trainer
+
+
+def reporter(spec: RunSpec, trainer: Trainer) -> progress.Reporter:
+    """Report the progress of a run's last training; the steps of other candidates count as done."""
+    comparison = trainer.hook(Choices).chosen.comparison
+    others = len(comparison.candidates) - 1 if comparison else 0
+    done = others * trainer.schedule.compares_after
+    return progress.Reporter(spec.folder, spec.overrides, done + trainer.config.train.iterations, done)
+
+
+def lengths(config: Config) -> dict[str, Config]:
+    """Return the settings of each length, by a name such as "iterations=1000", the shortest first.
+
+    Each length is twice the one before, and the last is `train.iterations`.
+    """
+    train, count = config.train, lengths_of(config)
+    assert count is not None
+    alone: dict[str, Any] = {"lengths": None}
+    trains = [replace(train, iterations=train.iterations >> k, **alone) for k in reversed(range(count))]
+    return {length_name(shorter.iterations): replace(config, train=shorter) for shorter in trains}
+
+
+def length_name(iterations: int) -> str:
+    """Return the name of a length among the candidates of a run."""
+    return f"iterations={iterations}"
+
+
+def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, resolved: Resolved) -> Trainer:
+    """Return the trainer of the length with the highest PSNR on val, at its last step.
+
+    The lengths are trained from the shortest on. They end with the first that is not better on val than all before it.
+    The result is bit-equal to a run of the chosen length alone. Each length is gated as such a run is, after its PSNR
+    on val was measured. The seconds of the time screen and of the other lengths count as training.
+
+    Raises:
+        InputError: a checkpoint is damaged.
+        DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.
+        Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
+    """
+    parts = Candidates(spec, scene, start, lengths(resolved.config))
+    return parts.chosen(_kept_length, lambda: _trained_lengths(parts, resolved))
+
+
+def _kept_length(state: dict[str, Any]) -> str | None:
+    length = choices_in(state).length
+    return None if length is None else length_name(length.kept)
+
+
+def _trained_lengths(parts: Candidates, resolved: Resolved) -> Trainer:
+    """Train one length after the other, print which is the best, and return its trainer with the costs of all."""
+    results: list[Result] = []
+    steps = sum(config.train.iterations for config in parts.settings.values())
+    for name, config in parts.settings.items():
+        results.append(parts.train(name, config.train.iterations, results, steps))
+        top = highest(results)
+        if top is not results[-1] and top.error is None:
+            break
+    chosen = best(results)
+    choice = LengthChoice(chosen.steps, [result.candidate for result in results])
+    print(f"{parts.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
+    trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
+    trainer.hook(Choices).chosen.length = choice
+    return trainer
