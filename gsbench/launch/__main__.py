@@ -110,17 +110,12 @@ def _details(run: RunStatus) -> str:
         if run.psnr is not None:
             parts.append(f"val {run.psnr:.2f} dB")
         if run.seconds_left is not None:
-            parts.append(f"{_duration(run.seconds_left)} left")
+            parts.append(f"{plan.duration(run.seconds_left)} left")
         if run.job is not None:
             parts.append(f"job {run.job}")
     if run.reason:
         parts.append(run.reason)
     return ", ".join(parts)
-
-
-def _duration(seconds: float) -> str:
-    minutes = seconds / 60
-    return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
 
 
 def _show(folder: Path, in_json: bool) -> list[RunStatus]:

@@ -118,5 +118,10 @@ def time_left(folder: Path, at_once: int) -> str:
     if not durations or left <= 0:
         return ""
     seconds = fmean(durations) * left / max(1, min(at_once, left))
-    about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-    return f"{len(outcomes)} of {total} runs have ended; about {about} left"
+    return f"{len(outcomes)} of {total} runs have ended; about {duration(seconds)} left"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds as text in whole seconds or minutes, or in hours."""
+    minutes = seconds / 60
+    return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"

@@ -158,7 +158,8 @@ def _judge(experiment: Experiment, run: Identity) -> RunStatus:
         reason = record.reason if record.status == "failed" else f"{record.status}: {record.reason}"
         return replace(state, state="failed", reason=reason, record=str(record.path))
     if at:
-        reason = f"process {at.pid} on {at.host} is gone, last seen {_ago(at.updated)} {_step(at)}"
+        since = plan.duration(time.time() - at.updated)
+        reason = f"process {at.pid} on {at.host} is gone, last seen {since} ago {_step(at)}"
         if path and path.with_name(CHECKPOINT).exists():
             reason += ": the same command continues from its last checkpoint"
         return _with_progress(state, at, "lost", reason)
@@ -174,11 +175,6 @@ def _with_progress(state: RunStatus, at: Progress, name: str, reason: str | None
 
 def _step(at: Progress) -> str:
     return f"at step {at.step} of {at.steps}" if at.steps else "before its first step"
-
-
-def _ago(then: float) -> str:
-    minutes = (time.time() - then) / 60
-    return f"{60 * minutes:.0f} s ago" if minutes < 2 else f"{minutes:.0f} min ago"
 
 
 def _kept(experiment: Experiment, planned: PlannedRun | None) -> RecordStatus | None:

@@ -286,9 +286,8 @@ class Effort:
         """Return the CPU-seconds and the load measured so far, for a checkpoint."""
         return {"seconds": self._seconds, "cpu_s": self._cpu_s, "load_s": self._load_s}
 
-    def load_state_dict(self, state: dict[str, float] | None) -> None:
-        """Replace CPU-seconds and load by those of a checkpoint; both become None if an old checkpoint has none."""
-        state = state or dict.fromkeys(("seconds", "cpu_s", "load_s"), math.nan)
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Replace CPU-seconds and load by those of a checkpoint."""
         self._seconds, self._cpu_s, self._load_s = (float(state[name]) for name in ("seconds", "cpu_s", "load_s"))
 
 

@@ -1,7 +1,7 @@
 """Load the model of a finished or interrupted run from its folder, and the scene on which it was trained."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from gsbench.models.registry import is_registered
 from gsbench.run.checks import check_values
 from gsbench.run.setup import PACKAGE, build_with_placeholders, check_scene_names, load_scene
 from gsbench.scenes import Scene
-from gsbench.scenes.scene import UP, Placement
+from gsbench.scenes.scene import Placement
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 
@@ -35,9 +35,9 @@ class SceneDescription:
     has_time: bool
     width: int  # of the first training view, pixels
     height: int
-    up: list[float] = field(default_factory=lambda: list(UP))  # Scene.up; older checkpoints have none
-    center: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # of Scene.placement; older ones have none
-    unit: float = 1.0  # of Scene.placement
+    up: list[float]  # Scene.up
+    center: list[float]  # of Scene.placement
+    unit: float  # of Scene.placement
 
     @classmethod
     def of(cls, scene: Scene) -> "SceneDescription":

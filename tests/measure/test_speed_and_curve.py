@@ -93,12 +93,10 @@ def test_an_effort_that_is_not_known_is_none(fault, monkeypatch):
         pass
     assert effort.load is None
     assert effort.cpu_s is not None
-    endless = {"seconds": 1.0, "cpu_s": float("inf"), "load_s": float("inf")}
-    for state in (None, endless):  # of an older gsbench; of none, for a record holds no infinity
-        effort.load_state_dict(state)
-        with effort:
-            pass
-        assert (effort.cpu_s, effort.load) == (None, None)
+    effort.load_state_dict({"seconds": 1.0, "cpu_s": float("inf"), "load_s": float("inf")})  # which no record holds
+    with effort:
+        pass
+    assert (effort.cpu_s, effort.load) == (None, None)
 
 
 def test_laps_are_all_of_the_time(monkeypatch):

@@ -24,6 +24,7 @@ from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
+from gsbench.scenes.scene import UP
 from gsbench.schedule import ActiveComponents
 from gsbench.stability.float64_render import check_exactness, float64_model, render_twice
 from gsbench.view import video
@@ -52,7 +53,7 @@ def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> 
     model = lively("7dgs_agr", count=80, backend=backend).float()
     model.set_active(ActiveComponents(3, True, True))
     model.effect_sets = effect_sets
-    scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE)
+    scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE, list(UP), [0.0] * 3, 1.0)
     run = LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0"))
     return FrameRenderer(run, "7dgs", most_cost(model))
 
