@@ -48,6 +48,8 @@ def main(arguments: list[str] | None = None) -> int:
         if len(results.runs) and options.figures:
             paths = page.figures(results, options.figures)
             print(f"Written: {len(paths) // 2} figures in {options.figures}", file=sys.stderr)
+    except BrokenPipeError:  # the program that reads the output has ended, such as `head`: end_with is silent
+        raise
     except (InputError, OSError) as error:
         print(f"gsbench.report: {one_line(error)}", file=sys.stderr)
         return 2
@@ -83,9 +85,9 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 def _report(results: Results, columns: Sequence[str], options: argparse.Namespace) -> None:
     """Print the result tables, and write them with the page unless only a part or another form was asked for."""
-    shown = output.tables(results, columns)
+    shown = output.tables(results, columns, latex=options.latex)
     if options.latex:
-        print(text.latex(shown[::2]))
+        print(text.latex(shown))
     elif not _is_json(options, lambda: _numbers(results)):
         print(text.terminal(shown))
         if not options.select:

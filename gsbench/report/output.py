@@ -1,29 +1,32 @@
 """Write what a report leaves in a folder of results: the result tables, the numbers of all runs, and the page."""
 
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
-
-import pandas as pd
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.report.frame import Results
 from gsbench.report.render import page, text
 from gsbench.report.section import Section
+from gsbench.report.sections import built
 from gsbench.report.sections.experiment import table
-from gsbench.report.sections.protocol import protocol
 
 NOT_IN_FILE = ["config", "missing", "path", "record"]  # columns of `runs` that are no values
 
 
-def tables(results: Results, columns: Sequence[str] = ()) -> list[Section]:
-    """Return the result table and the protocol of each experiment.
+def tables(results: Results, columns: Sequence[str] = (), *, latex: bool = False) -> list[Section]:
+    """Return the sections that the terminal and ``table.md`` show, or those of --latex, for each experiment.
 
     Args:
         results: the tables of the runs.
         columns: the columns of the result table; empty for those that the runs have.
+        latex: whether they are for --latex.
     """
-    chapters = results.chapters()
-    return [of for chapter in chapters for of in (table(chapter, columns), protocol(chapter, pd.DataFrame())) if of]
+    return [
+        table(chapter, columns) if of.key == "experiment" else of
+        for chapter in results.chapters()
+        for of in built(chapter, attrgetter("in_latex" if latex else "in_terminal"))
+    ]
 
 
 def write(

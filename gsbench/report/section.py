@@ -160,22 +160,28 @@ class Registered:
     """A function that makes a section, and one that returns the differences that this section tests."""
 
     build: Build
-    asks: Callable[[Results], Asked]
+    asks: Callable[[Results], Asked] | None
+    in_terminal: bool
+    in_latex: bool
 
 
-SECTIONS: dict[str, Registered] = {}  # in the order of the report
+SECTIONS: dict[str, Registered] = {}  # by the name of their functions
 
 
-def section(asks: Callable[[Results], Asked] = lambda _: []) -> Callable[[Build], Build]:
+def section(
+    asks: Callable[[Results], Asked] | None = None, *, in_terminal: bool = False, in_latex: bool = False
+) -> Callable[[Build], Build]:
     """Register a function that makes a section of one experiment from its tables and the tested differences.
 
     Args:
         asks: returns the differences that the section shows as significant or not. They come back as the rows of
             `tested`, adjusted for all comparisons of the report.
+        in_terminal: whether the terminal and ``table.md`` show the section too; the page and --json show every one.
+        in_latex: whether --latex shows it.
     """
 
     def register(build: Build) -> Build:
-        SECTIONS[build.__name__] = Registered(build, asks)
+        SECTIONS[build.__name__] = Registered(build, asks, in_terminal, in_latex)
         return build
 
     return register

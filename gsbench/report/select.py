@@ -4,8 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from gsbench.errors import InputError, did_you_mean, printable
-from gsbench.report.frame import Results
-from gsbench.report.sections.experiment import WITH_TRAIN
+from gsbench.report.frame import NUMBERS, Results
 
 KEYS = ("model", "scene", "column")
 
@@ -51,7 +50,7 @@ def parse(words: Sequence[str]) -> Selection:
         if key in lists:
             raise InputError(f"--select: expected {key}= once, got it twice: join the values by commas")
         lists[key] = list(dict.fromkeys(values))
-    _check("column", lists.get("column", []), WITH_TRAIN)
+    _check("column", lists.get("column", []), NUMBERS)
     return Selection(*(lists.get(key, []) for key in KEYS))
 
 

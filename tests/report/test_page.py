@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -28,6 +29,7 @@ from gsbench.report import live, output, select
 from gsbench.report.__main__ import main
 from gsbench.report.frame import load
 from gsbench.report.render import charts, page, palette, text
+from gsbench.report.section import SECTIONS, Registered, Section
 from gsbench.report.sections import gallery
 from gsbench.report.sections.stages import REST, STAGES
 
@@ -311,7 +313,7 @@ def test_text_from_a_record_cannot_break_a_form():
 
 def test_latex_is_balanced_and_every_row_has_every_column():
     """Catches a table that LaTeX refuses: an open brace or environment, a row with a cell too many or too few."""
-    written = text.latex(output.tables(results(*records()))[:1])
+    written = text.latex(output.tables(results(*records()), latex=True))
     bare = re.sub(r"\\[{}]", "", "\n".join(line for line in written.splitlines() if not line.startswith("%")))
     assert bare.count("{") == bare.count("}")
     columns = len(re.search(r"tabular}{([lr]+)}", bare)[1])
@@ -330,6 +332,30 @@ def test_the_terminal_form_fits(width):
     lines = text.terminal(output.tables(results(*runs)), width).splitlines()
     assert max(map(len, lines)) <= width
     assert any("for lack of width" in line for line in lines)
+
+
+def test_each_section_stands_where_its_flags_say(monkeypatch):
+    """Catches a flag of a section that acts nowhere, and a form that picks its sections by their places."""
+
+    def memory(chapter, _):
+        return Section("memory", "Memory", "", chapter.runs[["model", "peak_mb"]])
+
+    keys = lambda **form: [of.key for of in output.tables(results(*records()), **form)]  # noqa: E731
+    assert keys() == ["experiment", "protocol"]
+    assert keys(latex=True) == ["experiment"]
+    monkeypatch.setitem(SECTIONS, "memory", Registered(memory, None, in_terminal=True, in_latex=True))
+    assert keys() == ["experiment", "memory", "protocol"]
+    assert keys(latex=True) == ["experiment", "memory"]
+
+
+def test_a_reader_that_ends_is_no_error(folder):
+    """Catches an error and an exit status for `python -m gsbench.report FOLDER | head`."""
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "gsbench.report", str(folder), "--select", "model=7dgs"]
+    done = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_cell_of_csv_is_no_formula_and_no_number_is_rounded(tmp_path):
@@ -389,10 +415,10 @@ def test_other_forms_are_printed_and_nothing_is_written(folder, tmp_path, capsys
 
 def test_a_selection_keeps_its_columns_in_order(folder, capsys):
     """Catches a selection that shows another model or column, or that replaces the folder's own table."""
-    assert main([str(folder), "--select", "model=7dgs,4dgs", "scene=suzanne", "column=fps,psnr_db"]) == 0
+    assert main([str(folder), "--select", "model=7dgs,4dgs", "scene=suzanne", "column=fps,psnr_db,peak_mb"]) == 0
     printed = capsys.readouterr().out
     assert "3dgs" not in printed
-    assert printed.index("FPS") < printed.index("PSNR")
+    assert printed.index("FPS") < printed.index("PSNR") < printed.index("peak_mb")
     assert "LPIPS-Alex" not in printed.partition("Protocol")[0].partition("Mean over")[0]
     assert not (folder / "table.md").exists()
 

@@ -372,6 +372,7 @@ def test_settings_that_differ_within_a_scene_are_a_warning():
     a, b = run("a"), run("b")
     table = sections(a, dataclasses.replace(b, protocol={**b.protocol, "downscale": 2}))["protocol"].table
     assert table.setting[table.note == "WARNING"].tolist() == ["downscale", "downscale"]
+    assert "WARNING" not in sections(a, b)["protocol"].text
     by_scene = [run("a"), run("a", scene="x", protocol={**b.protocol, "downscale": 2})]
     assert not (sections(*by_scene)["protocol"].table.note == "WARNING").any()
     dirty = dataclasses.replace(a.provenance, git_commit="0123-dirty")

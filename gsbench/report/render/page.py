@@ -28,7 +28,7 @@ TURNED = 13  # columns from which a table of few rows is shown with its columns 
 
 
 @dataclass(frozen=True)
-class Chapter:
+class Article:
     """The part of the page about one experiment on one data set."""
 
     key: str
@@ -55,16 +55,16 @@ def write(results: Results, folder: Path, *, reload: int = 0, more: Sequence[Sec
 
 def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Section] = ()) -> str:
     """Return the page as text; no script but its own can run in it, and none may evaluate text."""
-    chapters = [_chapter(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
-    look = styles(name for chapter in chapters for name in chapter.series)
-    keyed = [(f"{chapter.key}-{of.key}", of) for chapter in chapters for of in chapter.sections]
+    articles = [_article(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
+    look = styles(name for article in articles for name in article.series)
+    keyed = [(f"{article.key}-{of.key}", of) for article in articles for of in article.sections]
     keyed += [(f"more-{of.key}", of) for of in more]
     specs = {f"{key}-{i}": charts.spec(figure, look) for key, of in keyed for i, figure in enumerate(of.figures)}
     views = {key: list(map(asdict, of.images)) for key, of in keyed if of.key == "gallery"}
     scripts = [library(), _asset("page.js")]
     return _template().render(
         title=short(title)[:80] or "results",
-        chapters=chapters,
+        articles=articles,
         more=more,
         look=look,
         markers=MARKERS,
@@ -83,18 +83,18 @@ def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Sectio
 
 def figures(results: Results, folder: Path) -> list[Path]:
     """Write all figures of the page as PDF and SVG files to a folder, and return their paths."""
-    chapters = [_chapter("", chapter) for chapter in results.chapters()]
-    look = styles(name for chapter in chapters for name in chapter.series)
+    articles = [_article("", chapter) for chapter in results.chapters()]
+    look = styles(name for article in articles for name in article.series)
     return [
         path
-        for chapter in chapters
-        for of in chapter.sections
+        for article in articles
+        for of in article.sections
         for figure in of.figures
-        for path in charts.write(figure, look, folder / f"{chapter.title} {of.key} {figure.caption}")
+        for path in charts.write(figure, look, folder / f"{article.title} {of.key} {figure.caption}")
     ]
 
 
-def _chapter(key: str, chapter: Results) -> Chapter:
+def _article(key: str, chapter: Results) -> Article:
     runs = chapter.runs
     counts = {
         "run": len(runs),
@@ -105,7 +105,7 @@ def _chapter(key: str, chapter: Results) -> Chapter:
     words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
     title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])[:60]}"
     mean = runs.groupby("model").psnr_db.mean()
-    return Chapter(
+    return Article(
         key, title, " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]]), built(chapter),
         sorted(runs.series.unique()), "" if mean.isna().all() else str(mean.idxmax()),
     )  # fmt: skip

@@ -5,12 +5,13 @@ All differences that sections show as significant or not are tested together, wi
 
 import importlib
 import pkgutil
+from collections.abc import Callable
 
 import pandas as pd
 
 from gsbench.report import stats
 from gsbench.report.frame import Results
-from gsbench.report.section import SECTIONS, Section
+from gsbench.report.section import SECTIONS, Registered, Section
 
 ORDER = ["budgets", "frontier", "experiment", "pairs", "effects", "quality", "curves", "lengths", "on_demand", "stages",
          "gallery", "protocol", "runs"]  # others come before the last two  # fmt: skip
@@ -25,7 +26,7 @@ def tested(chapter: Results) -> pd.DataFrame:
     Returns:
         A row for each difference: its "section", "quantity", "name", "weights", and the columns of stats.differences.
     """
-    rows = [(key, *row) for key, registered in SECTIONS.items() for row in registered.asks(chapter)]
+    rows = [(key, *row) for key, of in SECTIONS.items() if of.asks for row in of.asks(chapter)]
     asked = pd.DataFrame(rows, columns=["section", "quantity", "name", "weights"])
     parts = [asked.iloc[:0].join(stats.differences({}, []))]
     for quantity, of in asked.groupby("quantity", sort=False):
@@ -34,9 +35,10 @@ def tested(chapter: Results) -> pd.DataFrame:
     return pd.concat(parts[1:] or parts, ignore_index=True)
 
 
-def built(chapter: Results) -> list[Section]:
-    """Make all sections of one experiment, in their order."""
-    tests = tested(chapter)
-    ordered = sorted(SECTIONS, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER) - 2.5)
+def built(chapter: Results, chosen: Callable[[Registered], bool] = lambda _: True) -> list[Section]:
+    """Make the chosen sections of one experiment, in their order."""
+    keys = [key for key, of in SECTIONS.items() if chosen(of)]
+    ordered = sorted(keys, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER) - 2.5)
+    tests = tested(chapter) if any(SECTIONS[key].asks for key in keys) else pd.DataFrame(columns=["section"])
     sections = [SECTIONS[key].build(chapter, tests[tests.section == key]) for key in ordered]
     return [section for section in sections if section is not None]

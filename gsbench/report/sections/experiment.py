@@ -7,22 +7,22 @@ import pandas as pd
 from gsbench.errors import printable
 from gsbench.report import paper, stats
 from gsbench.report.frame import Results, covered
-from gsbench.report.section import COLUMNS, Section, number, section, text
+from gsbench.report.section import COLUMNS, Column, Section, number, section, text
 
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_object_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians",
          "lpips_vgg", "psnr_best_on_test_db")  # fmt: skip
 WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
 IF_MEASURED = ("psnr_moving_db", "psnr_object_db", "lpips_vgg", "psnr_best_on_test_db")
 TEXT = (
-    "Mean over seeds ± half the width of the 95 % interval over seeds. Bold: the best mean of a scene and every mean "
-    "that does not differ from it: the interval of their paired difference contains zero, or they look equal. "
-    "“paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a V100, and whose "
-    "LPIPS does not name its network. “paper, other data”: the scene here is a stand-in of the same name, so the two "
-    "rows cannot be compared."
+    "Mean over seeds ± half the width of the 95 % interval over seeds. Bold (in a terminal *): the best mean of a "
+    "scene and every mean that does not differ from it: the interval of their paired difference contains zero, or they "
+    "look equal. “paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a "
+    "V100, and whose LPIPS does not name its network. “paper, other data”: the scene here is a stand-in of the same "
+    "name, so the two rows cannot be compared."
 )
 
 
-@section()
+@section(in_terminal=True, in_latex=True)
 def experiment(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table; averages are over the scenes that every model has finished."""
     return table(chapter, [])
@@ -58,10 +58,10 @@ def _means(runs: pd.DataFrame, names: list[str]) -> pd.DataFrame:
     """Return the means of each row of the table with their ranks."""
     rows = stats.means(runs, ["label"], names)
     for name in names:
-        if better := COLUMNS[name].better:
-            rows[f"{name} rank"] = rows.label.map(
-                stats.ranks(runs, "label", name, better == "higher", COLUMNS[name].show)
-            )
+        column = COLUMNS.get(name) or Column(name)
+        if column.better:
+            ranks = stats.ranks(runs, "label", name, column.better == "higher", column.show)
+            rows[f"{name} rank"] = rows.label.map(ranks)
     return rows
 
 

@@ -23,12 +23,12 @@ TUNED = frozenset((
 TEXT = (
     "PSNR is over all pixels and channels of a view, after the final iteration, averaged over views; SSIM is that of "
     "scikit-image (Gaussian window, data_range 1). FPS is 1000 / the median milliseconds of a frame, with slicing and "
-    "AGR. Minutes of training are without evaluation. WARNING: runs that are compared differ in this. Times of other "
-    "machines than that of most runs are left out."
+    "AGR. Minutes of training are without evaluation. Times of other machines than that of most runs are left out."
 )
+DIFFER = " WARNING: runs that are compared differ in this."
 
 
-@section()
+@section(in_terminal=True)
 def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table of settings; a setting that differs between the runs of a scene, and is no variant, is a warning.
 
@@ -44,7 +44,8 @@ def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
     rows += [["", *fact] for fact in _facts(runs)]
     table = pd.DataFrame(rows, columns=["note", "setting", "value", "scenes", "runs"])
     table = table.sort_values("note", ascending=False, kind="stable").reset_index(drop=True)
-    return Section("protocol", "Protocol, machine, seeds", TEXT, table, notes=tuple(_notes(runs)))
+    words = TEXT + (DIFFER if (table.note == WARNING).any() else "")
+    return Section("protocol", "Protocol, machine, seeds", words, table, notes=tuple(_notes(runs)))
 
 
 def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> Iterator[list[object]]:
