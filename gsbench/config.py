@@ -66,8 +66,8 @@ class LearningRate:
 
     start: float = key(REQUIRED, "at the first step", low=0, high=inf)
     end: float | None = key(None, "at the last step; null: constant", low=0, high=inf)
-    per_extent: bool = key(False, "times the radius of the cameras")
-    per_run: bool = key(False, "times sqrt(recipe_iterations / iterations)")
+    per_extent: bool = key(False, "the rate is multiplied by the scene's extent")
+    per_run: bool = key(False, "the rate is multiplied by sqrt(recipe_iterations / iterations)")
 
 
 @dataclass
@@ -76,13 +76,13 @@ class ModelConfig:
 
     name: str = key(REQUIRED, "the model's class")
     module: str | None = key(None, "Python module of your model")
-    published_with_agr: bool = key(False, "as its authors published it")
+    published_with_agr: bool = key(False, "whether its authors published it with AGR")
     agr: bool = key("${.published_with_agr}", "default of the key agr")
     agr_octaves: int = key(4, "octaves of AGR's times", low=0, high=32)
     sh_degree: int = key(3, "SH degree", low=0, high=3)
     min_opacity: float = key(0.005, "Gaussians of lower opacity are pruned", low=0, high=0.25)  # resets: to twice it
     gate: str = key("off", "default of effects.gate", role="place", choices=("off", "end", "both"))
-    candidates: dict[str, Any] = key({}, "of model=auto")
+    candidates: dict[str, Any] = key({}, "the models among which model=auto chooses")
     compared: dict[str, Any] = key({}, "more of them, with effects.compare=true", needs="effects.compare")
     lr: dict[str, LearningRate] = key({}, "of each parameter group")
     options: dict[str, Any] = key({}, "arguments of the class")

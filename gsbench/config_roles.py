@@ -96,6 +96,7 @@ def _decided(keys: Plain) -> Plain:
 
 
 def _differences(before: Plain, after: Plain) -> list[str]:
+    # Hashes are compared, not values: 1, 1.0 and True are equal to Python, but they are other settings.
     before, after = _decided(before), _decided(after)
     return [f"{key} {_shown(after, key)} instead of {_shown(before, key)}"
             for key in sorted(before.keys() | after.keys())

@@ -137,7 +137,10 @@ class Operation:
         return outputs, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        """Return the kernel arguments of an earlier `run` again, computed from the tensors that autograd saved."""
+        """Return the kernel arguments of an earlier `run` again, for `backward`.
+
+        Autograd saves only the tensors: their addresses, which the kernel needs, are looked up anew.
+        """
         slots = self._slots_of(tensors, numbers)
         slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
         return slots

@@ -114,9 +114,9 @@ def status(experiment: Experiment) -> list[RunStatus]:
     """Return the state of every run of a sweep, and of every other run that left a file."""
     runs = dict.fromkeys((*experiment.planned, *experiment.records, *experiment.progress, *experiment.stopped))
     judged = {run: _judge(experiment, run) for run in runs}
-    kept = {state.record for run, state in judged.items() if run in experiment.planned and state.record is not None}
-    # A planned run may have a record with other overrides; such a record is not counted as a second run.
-    judged = {run: state for run, state in judged.items() if run in experiment.planned or state.record not in kept}
+    # A planned run may have a record with other overrides, under which it was found too: it is counted once.
+    counted = {state.record for run, state in judged.items() if run in experiment.planned and state.record}
+    judged = {run: state for run, state in judged.items() if run in experiment.planned or state.record not in counted}
     ends = endings(state.job for state in judged.values() if state.state == "lost" and state.job)
     return [_explained(experiment, run, state, ends) for run, state in judged.items()]
 

@@ -311,7 +311,10 @@ class CholeskyModel(JointModel):
         return torch.sigmoid(raw["times"]) if self.bounded_times else raw["times"]
 
     def shifted_times(self, raw: Raw, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """Return raw times of means later by `shift` [N, 1], and the shift; bounded times stay in (0, 1)."""
+        """Return the raw times of means that are moved by `shift` [N, 1] in time, and by how much they really moved.
+
+        Bounded times (sigmoids) stay in (0, 1), so they may move by less. Rows with a shift of 0 keep their bits.
+        """
         if not self.bounded_times:
             return raw["times"] + shift, shift
         times = self.mean_times(raw)

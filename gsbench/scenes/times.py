@@ -248,7 +248,10 @@ def _columns(names: Sequence[str], source: Path) -> list[_Column]:
 
 
 def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
-    """Return the numbers of each name; a date and time of day that every name has once is one number."""
+    """Return the numbers in the name of each image, such as 3 and 12 of cam3/frame_12.png, in their order.
+
+    If every name has one date and time of day, its digits together are one number, in seconds.
+    """
     plain = [without_suffix(name.replace("\\", "/")) for name in names]
     moments: list[re.Match[str] | None] = [None] * len(names)
     for pattern in _MOMENTS:

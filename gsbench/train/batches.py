@@ -48,7 +48,11 @@ def _order(views: int, seed: int, epoch: int) -> list[int]:
 
 
 def generator(seed: int, *purpose: int) -> torch.Generator:
-    """Return a random generator whose seed is a hash of the run's seed and more numbers, such as the step."""
+    """Return a random generator whose seed is a hash of the run's seed and more numbers, such as the step.
+
+    Taken are (): the first Gaussians; (epoch): the order of views; (step): density control; (step, 1): its noise; and
+    (step, DRAWS, view) with `gsbench.train.regularisers.DRAWS`: penalties.
+    """
     mixed = 0
     for number in (seed, *purpose):
         mixed = (mixed * 6364136223846793005 + number + 1442695040888963407) % (1 << 63)
