@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from forked import ENVIRONMENT, python_m
 
 if TYPE_CHECKING:
     from gsbench.measure.record import Record
+    from gsbench.run.identity import RunSpec
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZE = 16
@@ -86,22 +88,21 @@ def main_here(*arguments: str) -> int:
         GlobalHydra.instance().clear()
 
 
-def run_here(*words: str) -> tuple["Record", Path]:
-    """Do one run in this process, which costs no start of another one; return its record and its folder."""
-    import hydra
-    from omegaconf import OmegaConf
-
-    from gsbench.config import CONF, register_schema
-    from gsbench.run.execution import execute
+def spec_of(words: Sequence[str]) -> "RunSpec":
+    """Name a run as the command line does."""
+    from gsbench.launch.command import compose_run, hydra_with
     from gsbench.run.identity import identify
 
-    register_schema()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = hydra.compose("config", [*words], return_hydra_config=True)
-        choices = OmegaConf.to_container(composed.hydra.runtime.choices)
-        OmegaConf.set_struct(composed, False)
-        del composed.hydra
-        spec = identify(composed, choices, words)
-        record = execute(spec)
+    with hydra_with(None):
+        run = compose_run(words)
+        return identify(run.config, run.choices, run.overrides)
+
+
+def run_here(*words: str) -> tuple["Record", Path]:
+    """Do one run in this process, which costs no start of another one; return its record and its folder."""
+    from gsbench.run.execution import execute
+
+    spec = spec_of(words)
+    record = execute(spec)
     assert record is not None
     return record, spec.folder

@@ -38,8 +38,8 @@ def at_most(packed: Tensor, limit: int) -> Tensor:
 
     All are encoded as degree + 4 (waves - 1).
     """
-    own, most = order_of(packed), order_of(limit)
-    return ColorOrder(own.degree.clamp(max=most.degree), own.waves.clamp(max=most.waves)).packed
+    order, most = order_of(packed), order_of(limit)
+    return ColorOrder(order.degree.clamp(max=most.degree), order.waves.clamp(max=most.waves)).packed
 
 
 def coefficients_within(
@@ -54,10 +54,10 @@ def coefficients_within(
         degree: the SH degree of the stored coefficients.
         waves: the number of frequencies of the stored coefficients.
     """
-    own = order_of(packed)
+    order = order_of(packed)
     degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])
     frequencies = torch.arange(waves, device=packed.device)
-    return (frequencies[:, None] < own.waves[:, None, None]) & (degrees <= own.degree[:, None, None])
+    return (frequencies[:, None] < order.waves[:, None, None]) & (degrees <= order.degree[:, None, None])
 
 
 # Constants of the real spherical harmonics of degrees 1 to 3, with the order and the signs of 3DGS.

@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from gsbench.config_roles import facts
 from gsbench.errors import InputError, printable
 from gsbench.measure import record as files
 from gsbench.measure.record import Record
@@ -20,9 +21,6 @@ from gsbench.report.columns import CURVES, RUNS, VIEWS
 
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
-GATES = ("off", "end", "both")  # values of effects.gate
-
-
 NUMBERS = [column.name for column in RUNS if column.kind is float]
 
 
@@ -164,7 +162,7 @@ def gating(r: Record) -> str:
     """Return "gate=end" or the like where a run removes effects otherwise than its model does by default, else ""."""
     gate = _at(r.provenance.config, "effects.gate") or "off"
     is_default = gate == (_at(r.provenance.config, "model.gate") or "off")
-    return f"gate={gate}" if gate in GATES and not is_default else ""
+    return f"gate={gate}" if gate in facts("effects.gate").choices and not is_default else ""
 
 
 def _number(value: float | None) -> float:

@@ -212,8 +212,8 @@ def _samples(ours: pd.DataFrame, theirs: pd.DataFrame, quantity: str, reason: st
     return {
         "quantity": quantity, "ours": samples[0].mean(), "theirs": samples[1].mean(),
         "runs_ours": len(samples[0]), "runs_theirs": len(samples[1]),
-        "squares": float(sum(((one - one.mean()) ** 2).sum() for one in counted)),
-        "freedom": sum(max(len(one) - 1, 0) for one in counted), "bit_equal": bit_equal, "reason": reason,
+        "squares": float(sum(((x - x.mean()) ** 2).sum() for x in counted)),
+        "freedom": sum(max(len(x) - 1, 0) for x in counted), "bit_equal": bit_equal, "reason": reason,
     }  # fmt: skip
 
 

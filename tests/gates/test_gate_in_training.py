@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tiny_training
 import torch
 from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides
@@ -28,10 +29,8 @@ from gsbench.gates.sensitivity import probe
 from gsbench.measure import record
 from gsbench.measure.record import Gate
 from gsbench.run.load import load_run
-from gsbench.run.setup import build
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
-from gsbench.train.batches import generator
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import NO_FACTORS
 from gsbench.train.renderer import Renderer
@@ -40,15 +39,8 @@ STEPS = 100
 
 
 def trainer(*words: str, model: str = "7dgs", scene: Scene | None = None) -> Trainer:
-    """A trainer at step 0; unless a scene is given, of one with three views of val."""
-    config = compose(model, STEPS, "train.densify.reset_every=1000000", *words)
-    if scene is None:
-        square = moving_square()
-        scene = replace(square, val=square.train[:3], test=square.train[3:5])
-    untrained = build(config)
-    assert scene.points is not None
-    untrained.initialise(scene.points, scene.extent, generator(config.seed))
-    return Trainer(untrained, scene, scene.test, config)
+    """A trainer that resets no opacities."""
+    return tiny_training.trainer(model, "train.densify.reset_every=1000000", *words, scene=scene)
 
 
 def end(training: Trainer) -> dict[str, object]:

@@ -11,13 +11,9 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-import hydra
 import tables as site
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
-from tiny_run import run_here
+from tiny_run import run_here, spec_of
 
-from gsbench.config import CONF, register_schema
 from gsbench.config_roles import training_hash
 from gsbench.measure.record import Record
 from gsbench.report import frame, paper_tables, reproduction
@@ -25,7 +21,6 @@ from gsbench.report.frame import Results
 from gsbench.report.section import Section
 from gsbench.report.sections import built, experiment
 from gsbench.report.sections.budgets import BUDGETS
-from gsbench.run.identity import identify
 from gsbench.train import checkpoint
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "results" / "published"
@@ -186,14 +181,7 @@ def first_number(text: str) -> float:
 
 def identity(words: Sequence[str]) -> dict[str, str]:
     """The folder of a run, which has its variant, and the hash of all that changes its training."""
-    register_schema()
-    GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = hydra.compose("config", [*words], return_hydra_config=True)
-        choices = OmegaConf.to_container(composed.hydra.runtime.choices)
-        OmegaConf.set_struct(composed, False)
-        del composed.hydra
-        run = identify(composed, choices, words)
+    run = spec_of(words)
     return {"folder": str(run.folder), "hash": training_hash(run.plain)}
 
 
