@@ -67,11 +67,11 @@ def measure_all(
 
     tell("# What the kernels cost", "", *conditions(bounds), "")
     results: list[dict[str, Any]] = []
-    theirs = other.sections() if other else []
+    their_sections = other.sections() if other else []
     for section in sections:
         tell(f"## {section}", "", SECTIONS[section].__doc__ or "", "")
-        medians = other.medians(section) if other and section in theirs else {}
-        if other and section not in theirs:
+        medians = other.medians(section) if other and section in their_sections else {}
+        if other and section not in their_sections:
             tell(f"{other.short} has no section {section}: its column is empty.", "")
         header = HEADER + (f" x {other.short} |" if other else "")
         tell(header, "| --- |" + " ---: |" * (header.count("|") - 2))
@@ -122,8 +122,8 @@ def line(result: dict[str, Any]) -> str:
     each = "" if result["pixels"] is None else f"{1e6 * result['median'] / result['pixels']:.1f}"
     cells = [result["name"], numbers, each, met, limit, ratio]
     if "against_ms" in result:  # medians of this tree over those of another commit
-        theirs = result["against_ms"]
-        cells.append("" if theirs is None else f"{result['median'] / theirs:.2f}")
+        against = result["against_ms"]
+        cells.append("" if against is None else f"{result['median'] / against:.2f}")
     return f"| {' | '.join(cells)} |"
 
 

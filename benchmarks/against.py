@@ -74,24 +74,24 @@ def built(commit: str, log: Path) -> Iterator[Built]:
         raise InputError(f"--against: expected a commit of the repository {ROOT}, got {printable(commit)!r:.80}: "
                          "`git log` lists them")  # fmt: skip
     with TemporaryDirectory(prefix="gsbench-against-") as name:
-        found = Built(full, Path(name))
+        other = Built(full, Path(name))
         with tarfile.open(fileobj=io.BytesIO(_git("archive", full))) as files:
-            files.extractall(found.folder / "tree", filter="data")
-        print(f"{found.short}: building it, about a minute", file=sys.stderr)
-        _install(found, log)
-        yield found
+            files.extractall(other.folder / "tree", filter="data")
+        print(f"{other.short}: building it, about a minute", file=sys.stderr)
+        _install(other, log)
+        yield other
 
 
-def _install(found: Built, log: Path) -> None:
+def _install(commit: Built, log: Path) -> None:
     # Only the instruction set that is timed; not every commit has the word `native` for it.
     levels = f"cmake.define.GSB_LEVELS={kernels.native().active()}"
-    site, tree = (os.fspath(found.folder / name) for name in ("site", "tree"))
+    site, tree = (os.fspath(commit.folder / name) for name in ("site", "tree"))
     done = subprocess.run([sys.executable, *INSTALL, "--config-settings", levels, "--target", site, tree], check=False,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
     if done.returncode:
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text(done.stdout)
-        raise InputError(f"--against {found.short}: expected it to build, got {_last_line(done.stdout)}: read {log}, "
+        raise InputError(f"--against {commit.short}: expected it to build, got {_last_line(done.stdout)}: read {log}, "
                          "or choose another commit")  # fmt: skip
 
 

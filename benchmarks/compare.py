@@ -74,23 +74,23 @@ class Case:
     section: str
     name: str
     ours: Call
-    theirs: Call
+    other: Call
     leaves: list[Tensor]
-    their_leaves: list[Tensor]
+    other_leaves: list[Tensor]
     least_bytes: float | None = None  # that forward cannot do without
     least_alphas: float | None = None  # of at least 1/255
 
     def rows(self, place: Place) -> Iterator[Row]:
         """Forward without a graph, backward on a graph that is kept, and both."""
         passes = {"forward": 1, "backward": 2, "both": 3}  # a backward moves and blends everything about twice
-        ours = self.costs(place, self.ours, self.leaves)
-        theirs = self.costs(place, self.theirs, self.their_leaves) if place.gsplat else [None] * len(passes)
+        costs = self.costs(place, self.ours, self.leaves)
+        other_costs = self.costs(place, self.other, self.other_leaves) if place.gsplat else [None] * len(passes)
         with torch.no_grad():
-            difference = (self.ours() - self.theirs()).abs().mean().item() if place.gsplat else None
-        for (way, times), mine, other in zip(passes.items(), ours, theirs, strict=True):
-            yield compared(self.section, self.name, way, mine, other) | {
-                "ours_gb_s": self.least_bytes and times * self.least_bytes / mine.ms / 1e6,
-                "ours_galpha_s": self.least_alphas and times * self.least_alphas / mine.ms / 1e6,
+            difference = (self.ours() - self.other()).abs().mean().item() if place.gsplat else None
+        for (way, times), ours, other in zip(passes.items(), costs, other_costs, strict=True):
+            yield compared(self.section, self.name, way, ours, other) | {
+                "ours_gb_s": self.least_bytes and times * self.least_bytes / ours.ms / 1e6,
+                "ours_galpha_s": self.least_alphas and times * self.least_alphas / ours.ms / 1e6,
                 "difference": difference,
             }
 
@@ -120,9 +120,9 @@ def in_a_line(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
-def compared(section: str, case: str, way: str, ours: Cost, theirs: Cost | None) -> Row:
+def compared(section: str, case: str, way: str, ours: Cost, other: Cost | None) -> Row:
     row: Row = {"section": section, "case": case, "pass": way}
-    for who, found in (("ours", ours), ("theirs", theirs)):
-        if found is not None:
-            row |= {f"{who}_{name}": value for name, value in found._asdict().items()}
-    return row | ({"ratio": theirs.ms / ours.ms} if theirs else {})
+    for who, cost in (("ours", ours), ("theirs", other)):
+        if cost is not None:
+            row |= {f"{who}_{name}": value for name, value in cost._asdict().items()}
+    return row | ({"ratio": other.ms / ours.ms} if other else {})

@@ -99,9 +99,9 @@ def estimate(runs: Sequence[Run], iterations: int, time: Callable[[Run, int, int
                 costs[key] = step_cost(run, time)
             work.append(costs[key].hours(run.gaussians, iterations))
             walls.append(work[-1] / costs[key].speedup)
-        own = sum(work[begin:])
-        speedup = own / sum(walls[begin:])
-        yield f"| {dataset} | {name} | {len(work) - begin} | {speedup:.2f} | {own:.1f} |"
+        hours = sum(work[begin:])
+        speedup = hours / sum(walls[begin:])
+        yield f"| {dataset} | {name} | {len(work) - begin} | {speedup:.2f} | {hours:.1f} |"
     at_once = CORES // THREADS
     yield ""
     yield (f"{len(work)} runs of {iterations:,} steps: {sum(work):.1f} hours of CPU; {sum(walls):.1f} hours on 2 cores "

@@ -50,14 +50,14 @@ def main() -> None:
 
 def conditions(place: Place) -> dict[str, Any]:
     """Where: the device, its measured rates, and the versions."""
-    found: dict[str, Any] = {"processor": processor_name(), "git_commit": git_commit(), "versions": versions()}
+    facts: dict[str, Any] = {"processor": processor_name(), "git_commit": git_commit(), "versions": versions()}
     if place.on_gpu:
         a, b = torch.empty(2, 1 << 28, device=place.device).unbind()  # 1 GiB each, far beyond any cache
         square = torch.rand(8192, 8192, device=place.device)
-        found["device"] = torch.cuda.get_device_name()
-        found["copy_gb_s"] = 2 * a.numel() * 4 / place.cost(lambda: b.copy_(a)).ms / 1e6
-        found["float32_tflop_s"] = 2 * 8192**3 / place.cost(lambda: square @ square, 5).ms / 1e9
-    return found
+        facts["device"] = torch.cuda.get_device_name()
+        facts["copy_gb_s"] = 2 * a.numel() * 4 / place.cost(lambda: b.copy_(a)).ms / 1e6
+        facts["float32_tflop_s"] = 2 * 8192**3 / place.cost(lambda: square @ square, 5).ms / 1e9
+    return facts
 
 
 def write(folder: Path, name: str, machine: dict[str, Any], rows: list[Row]) -> None:

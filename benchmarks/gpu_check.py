@@ -68,9 +68,11 @@ class Check:
         self.say(f"== {name}: {' '.join(command)}")
         began = time.monotonic()
         env = {**os.environ, "PYTHONPATH": SOURCES, "PYTHONUNBUFFERED": "1", "PATH": PATH, **environment}
-        with tempfile.TemporaryFile("w+") as said:
+        with tempfile.TemporaryFile("w+") as output:
             try:
-                process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=said, stderr=said, start_new_session=True)
+                process = subprocess.Popen(
+                    command, cwd=ROOT, env=env, stdout=output, stderr=output, start_new_session=True
+                )
                 code = process.wait(seconds)
                 outcome = f"failed: exit code {code}" if code else "ok"
             except subprocess.TimeoutExpired:
@@ -79,8 +81,8 @@ class Check:
                 outcome = f"failed: not done after {seconds:.0f} s"
             except OSError as error:
                 outcome = f"failed: {error.strerror}: {error.filename}"
-            said.seek(0)
-            self.log.write(f"== {name} said:\n{said.read()}")
+            output.seek(0)
+            self.log.write(f"== {name} said:\n{output.read()}")
         return self.note(name, outcome, time.monotonic() - began)
 
     def note(self, name: str, outcome: str, seconds: float = 0.0) -> bool:

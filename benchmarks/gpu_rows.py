@@ -52,11 +52,11 @@ def raster_case(place: Place, case: str, N: int, size: int) -> Case:
     def ours() -> Tensor:
         return rasterize(means, equal, opacities, colors, viewmats, Ks, size, size).image
 
-    def theirs() -> Tensor:
+    def other() -> Tensor:
         return gsplat_image(means, quats, scales, opacities, colors, viewmats=viewmats, Ks=Ks, size=size)
 
     # 16 floats a Gaussian and four a pixel.
-    return Case("raster", case, ours, theirs, [*shared, equal], [*shared, quats, scales],
+    return Case("raster", case, ours, other, [*shared, equal], [*shared, quats, scales],
                 4.0 * (16 * N + 4 * size * size), useful_alphas(N, size))  # fmt: skip
 
 
@@ -98,20 +98,20 @@ def frame_case(place: Place, case: str, name: str, agr: bool, N: int, size: int)
 def two_ways(place: Place, fitted: GaussianModel, size: int) -> tuple[Call, Call]:
     """A model's picture by our kernels, and by slicing in torch and drawing by gsplat."""
     viewmats, Ks = place.put(camera(size))
-    seen_from, background = Camera(viewmats[0], Ks[0], size, size), torch.zeros(3, device=place.device)
+    view, background = Camera(viewmats[0], Ks[0], size, size), torch.zeros(3, device=place.device)
 
     def ours() -> Tensor:
         fitted.backend = AUTO
-        return render(fitted, seen_from, TIME, background)
+        return render(fitted, view, TIME, background)
 
-    def theirs() -> Tensor:
+    def other() -> Tensor:
         fitted.backend = REFERENCE
-        seen = fitted.slice(CameraTime.of(seen_from, TIME))
-        covars = seen.factors @ seen.factors.mT
-        return gsplat_image(seen.means, None, None, seen.opacities, seen.colors, covars=covars, viewmats=viewmats,
+        batch = fitted.slice(CameraTime.of(view, TIME))
+        covars = batch.factors @ batch.factors.mT
+        return gsplat_image(batch.means, None, None, batch.opacities, batch.colors, covars=covars, viewmats=viewmats,
                             Ks=Ks, size=size)[0]  # fmt: skip
 
-    return ours, theirs
+    return ours, other
 
 
 def replay_rows(place: Place) -> Iterator[Row]:
@@ -125,11 +125,11 @@ def replay_rows(place: Place) -> Iterator[Row]:
 def replay_row(place: Place, case: str, name: str, agr: bool, N: int, size: int) -> Row:
     fitted, background = model(name, N, agr=agr).to(place.device), torch.zeros(3, device=place.device)
     viewmats, Ks = place.put(camera(size))
-    seen = Camera(viewmats[0], Ks[0], size, size)
+    view = Camera(viewmats[0], Ks[0], size, size)
     graphed = GraphedFrames(fitted, background)
     with torch.no_grad():
-        launched = place.cost(lambda: render(fitted, seen, TIME, background))
-    return compared("replay", case, "forward", place.cost(lambda: graphed(seen, TIME)), launched)
+        launched = place.cost(lambda: render(fitted, view, TIME, background))
+    return compared("replay", case, "forward", place.cost(lambda: graphed(view, TIME)), launched)
 
 
 def step_rows(place: Place) -> Iterator[Row]:
@@ -145,8 +145,8 @@ def step_rows(place: Place) -> Iterator[Row]:
 
 def step_row(place: Place, case: str, agr: bool, N: int, size: int) -> Row:
     ours = training_step(model("7dgs", N, agr=agr).to(place.device), size, size, 1)
-    theirs = place.cost(their_step(place, agr, N, size)) if place.gsplat else None
-    return compared("step", case, "all", place.cost(ours), theirs)
+    other = place.cost(their_step(place, agr, N, size)) if place.gsplat else None
+    return compared("step", case, "all", place.cost(ours), other)
 
 
 def their_step(place: Place, agr: bool, N: int, size: int) -> Call:
@@ -168,5 +168,5 @@ def loss_rows(place: Place) -> Iterator[Row]:
         image, target = (torch.rand(size, size, 3, device=place.device) for _ in range(2))
         image.requires_grad_()
         ours = place.cost(lambda a=image, b=target: torch.autograd.grad(l1_ssim(a, b, 0.2), a))
-        theirs = place.cost(lambda a=image, b=target: torch.autograd.grad(photometric(a, b, 0.2, REFERENCE), a))
-        yield compared("loss", f"{size}x{size}, theirs is torch", "both", ours, theirs)
+        other = place.cost(lambda a=image, b=target: torch.autograd.grad(photometric(a, b, 0.2, REFERENCE), a))
+        yield compared("loss", f"{size}x{size}, theirs is torch", "both", ours, other)

@@ -32,8 +32,8 @@ def main() -> None:
                 draw_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEWPORT, room)
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
-        seen = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))
-        sum(x.square().sum() for x in tensors_of(seen)).backward()
+        batch = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))
+        sum(x.square().sum() for x in tensors_of(batch)).backward()
     image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()
     rows = torch.rand(4, 300, 7, device="cuda").unbind()

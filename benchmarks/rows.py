@@ -130,10 +130,10 @@ def instruction_sets() -> Iterator[Row]:
     image.requires_grad_()
     inputs, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(10_000)], camera(400)
     calls: dict[str, Callable[[], Any]] = {
-        f"{name} 50k slice and colours": lambda made=made: sum(
-            x.sum() for x in tensors_of(made.slice(query))
+        f"{name} 50k slice and colours": lambda fitted=fitted: sum(
+            x.sum() for x in tensors_of(fitted.slice(query))
         ).backward()
-        for name, made in ((name, model(name, 50_000, agr=name == "7dgs")) for name in ("3dgs", "4dgs", "6dgs", "7dgs"))
+        for name, fitted in ((n, model(n, 50_000, agr=n == "7dgs")) for n in ("3dgs", "4dgs", "6dgs", "7dgs"))
     }
     calls["raster 10k / 400x400"] = lambda: rasterize(*inputs, viewmats, Ks, 400, 400).image.sum().backward()
     calls["loss 400x400"] = lambda: l1_ssim(image, target, 0.2).backward()

@@ -51,19 +51,19 @@ def model(
     """
     g = torch.Generator().manual_seed(seed)
     lambdas = {"6dgs": {"lambda_d": 0.05}, "7dgs": {"lambda_d": 0.05, "lambda_t": 0.05}}
-    made = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}) | options)
-    made.initialise(Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g)), 1.0, g)
+    fitted = build(name, agr=agr, sh_degree=3, **lambdas.get(name, {}) | options)
+    fitted.initialise(Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g)), 1.0, g)
     with torch.no_grad():
-        for key, parameter in made.splats.items():
+        for key, parameter in fitted.splats.items():
             if key in (*KINDS, "shN"):
                 parameter.add_(0.02 * torch.randn(parameter.shape, generator=g))
             if key == "opacities":
                 parameter.copy_(torch.randn(N, generator=g))
-        logs = made.splats[made.geometry[0]]  # [N, 3 or more], of which those in space are set
-        space = made.rows["p"] if isinstance(made, CholeskyModel) else [0, 1, 2]
+        logs = fitted.splats[fitted.geometry[0]]  # [N, 3 or more], of which those in space are set
+        space = fitted.rows["p"] if isinstance(fitted, CholeskyModel) else [0, 1, 2]
         logs[:, space] = math.log(sigma) + SPREAD * torch.randn(N, 3, generator=g)
-    made.set_active(ActiveComponents(3, refine=agr, tunes_lambda=False))
-    return made
+    fitted.set_active(ActiveComponents(3, refine=agr, tunes_lambda=False))
+    return fitted
 
 
 class NoMoments:
@@ -81,16 +81,16 @@ def trained(name: str, N: int, **options: Any) -> GaussianModel:
 
     Mean times are spread around TIME until so few Gaussians reach it; some then lie outside of the clip.
     """
-    made = model(name, N, **options)
+    fitted = model(name, N, **options)
     query = CameraTime.at(torch.tensor([0.0, 0.0, -DISTANCE]), TIME)
     with torch.no_grad():
         if name == "dgs":  # whose mean times are inside (0, 1): its Gaussians live shortly instead
-            made.splats["precision"][:, 6] += SHORTER
-        offsets = made.splats["times"] - TIME
+            fitted.splats["precision"][:, 6] += SHORTER
+        offsets = fitted.splats["times"] - TIME
         log_spread = 0.0
         for halvings in range(12):  # the share that is visible falls with the spread
-            made.splats["times"].copy_(TIME + offsets * math.exp(log_spread))
-            seen = (made.slice(query).opacities >= ALPHA_MIN).float().mean()
-            log_spread += (1 if seen > VISIBLE else -1) * 4.0 / 2**halvings
-    Rows(made, NoMoments()).sort_by_time()
-    return made
+            fitted.splats["times"].copy_(TIME + offsets * math.exp(log_spread))
+            visible = (fitted.slice(query).opacities >= ALPHA_MIN).float().mean()
+            log_spread += (1 if visible > VISIBLE else -1) * 4.0 / 2**halvings
+    Rows(fitted, NoMoments()).sort_by_time()
+    return fitted

@@ -38,10 +38,10 @@ class Call:
         return self.outputs, slots
 
     def backward(
-        self, tensors: list[Tensor], slots: dict[str, Any], outputs: list[Tensor], given: Sequence[Tensor | None],
+        self, tensors: list[Tensor], slots: dict[str, Any], outputs: list[Tensor], upstream: Sequence[Tensor | None],
         wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:  # fmt: skip
-        self.arguments = tensors, slots, outputs, given, wanted, sums
+        self.arguments = tensors, slots, outputs, upstream, wanted, sums
         self.gradients = self.operation.backward(*self.arguments)
         return self.gradients
 
@@ -55,8 +55,8 @@ class Call:
 
     def learning(self) -> float:
         """Return the share of Gaussians for which a gradient is given."""
-        *_, given, _, _ = self.arguments
-        there = [g for g in given if g is not None]
+        *_, upstream, _, _ = self.arguments
+        there = [g for g in upstream if g is not None]
         N = _rows(there)
         learns = sum((g.reshape(N, -1) != 0).any(1) for g in there if g.numel() % N == 0)
         return float((torch.as_tensor(learns) > 0).float().mean())
@@ -67,10 +67,10 @@ class Call:
 
     def backward_bytes(self) -> float:
         """Count all gradients given; of Gaussians that have one the inputs; gradients written, or read and written."""
-        *_, given, _, sums = self.arguments
+        *_, upstream, _, sums = self.arguments
         added = _bytes([g for i, g in enumerate(self.gradients) if g is not None and i in (sums or {})])
         written = _bytes([g for i, g in enumerate(self.gradients) if g is not None and i not in (sums or {})])
-        given_bytes = _bytes([g for g in given if g is not None])
+        given_bytes = _bytes([g for g in upstream if g is not None])
         return given_bytes + self.learning() * (_bytes(self.tensors) + 2 * added) + written
 
 
@@ -96,8 +96,8 @@ def recorded(fitted: GaussianModel, view: View) -> dict[str, Call]:
     sums: dict[int, Tensor] = {}
     for _ in range(2):
         with Recording() as tape:
-            seen = fitted.slice(CameraTime.of(view.camera, view.time))
-            output = rasterize_slice(seen, view.camera, torch.zeros(3), fitted.backend)
+            batch = fitted.slice(CameraTime.of(view.camera, view.time))
+            output = rasterize_slice(batch, view.camera, torch.zeros(3), fitted.backend)
             loss = photometric(output.image, view.image[None], 0.2, fitted.backend)
         means2d = output.info.means2d
         tape.backward(loss, torch.ones_like(loss), [*sources, means2d], sums)
@@ -190,8 +190,8 @@ def blended_alphas(project: Call) -> float:
     tiles, ids = reference.bin_tiles(splats, viewport.width, viewport.height)
     across, total = -(-viewport.width // reference.TILE), 0
     offsets = torch.arange(reference.TILE) + 0.5
-    for tile, own in zip(*torch.unique_consecutive(tiles, return_counts=True), strict=True):
-        rows, ids = ids[:own], ids[own:]
+    for tile, count in zip(*torch.unique_consecutive(tiles, return_counts=True), strict=True):
+        rows, ids = ids[:count], ids[count:]
         dx = (tile % across * reference.TILE + offsets - splats.means2d[rows, :1])[:, None, :]
         dy = (tile // across * reference.TILE + offsets - splats.means2d[rows, 1:])[:, :, None]
         a, b, c = splats.conics[rows, :, None, None].unbind(1)

@@ -57,7 +57,7 @@ def resident() -> dict[str, float]:
     return {name: int(status[key].split()[0]) * 1024 / 1e9 for name, key in (("now", "VmRSS"), ("peak", "VmHWM"))}
 
 
-def told(what: str, began: float) -> None:
+def report(what: str, began: float) -> None:
     """Print seconds and memory after a part. The peak is that since the part before the training."""
     memory = resident()
     print(f"{what}: {time.perf_counter() - began:.0f} s, {memory['now']:.2f} GB resident, peak {memory['peak']:.2f} GB",
@@ -92,14 +92,14 @@ def measure(folder: Path, steps: int, gaussians: int) -> None:
     execution = Execution(identify(composed))
     began = time.perf_counter()
     model, scene = execution.prepare()
-    told(f"loaded {len(scene.train)} training and {len(scene.test)} test views of camera {TEST_CAMERA}", began)
+    report(f"loaded {len(scene.train)} training and {len(scene.test)} test views of camera {TEST_CAMERA}", began)
     began = time.perf_counter()
     trainer = execution.fit(model, scene)  # it starts a new peak
-    told(f"{steps} steps of batch {trainer.config.train.batch_size} with {len(model)} Gaussians", began)
+    report(f"{steps} steps of batch {trainer.config.train.batch_size} with {len(model)} Gaussians", began)
     view = scene.test[0]
     began = time.perf_counter()
     evaluate([(view.name, trainer.render(view), view.image)], background=scene.background, quantised=False, weights={})
-    told("one test view measured", began)
+    report("one test view measured", began)
 
 
 if __name__ == "__main__":

@@ -38,13 +38,13 @@ class Check:
 
     name: str
     state: str  # OK, ABSENT or BROKEN
-    found: str
+    detail: str
     todo: str = ""
 
     @property
     def line(self) -> str:
         """Return the check as one line of text."""
-        return printable(f"{self.state:7} {self.name:11} {self.found}" + (f" -> {self.todo}" if self.todo else ""))
+        return printable(f"{self.state:7} {self.name:11} {self.detail}" + (f" -> {self.todo}" if self.todo else ""))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -76,11 +76,11 @@ def _packages() -> Iterator[Check]:
     """Name the versions of the core packages, and which extras are complete."""
     core, extras = _requirements()
     missing = [name for name in core if _version(name) is None]
-    found = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "hydra-core"))
+    versions = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "hydra-core"))
     if missing:
         yield Check("packages", BROKEN, f"missing: {', '.join(missing)}", INSTALL)
     else:
-        yield Check("packages", OK, f"{found} and {len(core) - 3} more")
+        yield Check("packages", OK, f"{versions} and {len(core) - 3} more")
     there = [extra for extra, names in extras.items() if all(map(_version, names))]
     lacking = [extra for extra in extras if extra not in there]
     yield Check("extras", OK if there else ABSENT, ", ".join(there) or "none",
@@ -213,9 +213,9 @@ def _weights() -> Iterator[Check]:
 def _data() -> Iterator[Check]:
     from gsbench.fetch.sources import sources
 
-    found = [source for source in sources(Path("data")).values() if source.is_archive]
-    there = [str(source.target) for source in found if source.target.exists()]
-    absent = [source.name for source in found if not source.target.exists()]
+    archives = [source for source in sources(Path("data")).values() if source.is_archive]
+    there = [str(source.target) for source in archives if source.target.exists()]
+    absent = [source.name for source in archives if not source.target.exists()]
     embedded = importlib.util.find_spec("gsbench.scenes.sample") is not None
     yield Check("data", OK if embedded else BROKEN, ", ".join(["the embedded scenes" if embedded else "none", *there]),
                 f"for more: python -m gsbench.fetch {' '.join(absent)}" if absent else "")  # fmt: skip

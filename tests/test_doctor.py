@@ -34,8 +34,8 @@ def test_one_screen_names_every_part(capsys, monkeypatch):
     assert lines == [check.line for check in listed.values()]
     assert listed.keys() == {"gsbench", "python", "packages", "extras", "processor", "threads", "memory", "disk",
                             "compiler", "kernels", "gpu", "lpips alex", "lpips vgg", "data"}  # fmt: skip
-    assert torch.__version__ in listed["packages"].found
-    assert listed["memory"].found.startswith("3.0 of")
+    assert torch.__version__ in listed["packages"].detail
+    assert listed["memory"].detail.startswith("3.0 of")
     assert all(check.todo for check in listed.values() if check.state == ABSENT and check.name != "gpu")
 
 
@@ -56,7 +56,7 @@ def test_the_compiler_is_the_one_that_builds(capsys, monkeypatch, tmp_path):
     compiler.write_text("#!/bin/sh\necho my compiler 1.0\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
-    assert checks(capsys)["compiler"].found == "my compiler 1.0"
+    assert checks(capsys)["compiler"].detail == "my compiler 1.0"
 
 
 def test_kernels_that_render_something_else_are_found(capsys, monkeypatch):
@@ -84,10 +84,10 @@ def test_missing_packages_and_an_unforeseen_error_are_lines(capsys, monkeypatch)
     monkeypatch.setattr(metadata, "version", version)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: crash())
     listed = checks(capsys, status=1)
-    assert listed["packages"].found == "missing: scipy"
+    assert listed["packages"].detail == "missing: scipy"
     assert "view" in listed["extras"].todo
-    assert "view" not in listed["extras"].found
-    assert (listed["disk"].state, listed["disk"].found) == (BROKEN, "OSError: the disk")
+    assert "view" not in listed["extras"].detail
+    assert (listed["disk"].state, listed["disk"].detail) == (BROKEN, "OSError: the disk")
     assert listed["data"].state == OK
 
 
@@ -99,7 +99,7 @@ def test_a_gpu_is_named_with_its_kernels(built, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: device)
     monkeypatch.setattr(cuda, "_cuda", torch if built else None)
     listed = checks(capsys, status=0 if built else 1)["gpu"]
-    assert "Invented GPU, 80 GiB" in listed.found
+    assert "Invented GPU, 80 GiB" in listed.detail
     assert (listed.state == OK) == built == (not listed.todo)
 
 

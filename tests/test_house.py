@@ -29,15 +29,9 @@ LEAST_WORDS = 4
 VAGUE = {"found", "one", "own", "said", "told", "seen", "theirs", "mine", "given", "made"}
 # How often a room still gives such a name to something. A number may only fall; a room that is not here has none.
 VAGUE_NAMES: dict[str, int] = {
-    "benchmarks": 30,
-    "docs/site": 21,
-    "gsbench": 6,
-    "gsbench/fetch": 5,
-    "gsbench/kernels": 40,
     "gsbench/models": 8,
     "gsbench/raster": 1,
-    "gsbench/report": 11,
-    "tests": 5,
+    "gsbench/report": 7,
     "tests/models": 46,
     "tests/report": 30,
 }

@@ -95,11 +95,11 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = defaultdict(str, {key: value or "" for key, value in attrs})
-        self.ids.add(given["id"])
-        if tag == "a" and given["href"]:
-            self.links.append(given["href"])
-        self.loaded += [one for one in (given["src"], given["href"] if tag == "link" else "") if one]
+        values = defaultdict(str, {key: value or "" for key, value in attrs})
+        self.ids.add(values["id"])
+        if tag == "a" and values["href"]:
+            self.links.append(values["href"])
+        self.loaded += [link for link in (values["src"], values["href"] if tag == "link" else "") if link]
 
 
 def broken(site: Path) -> list[str]:
@@ -120,7 +120,7 @@ def broken(site: Path) -> list[str]:
 def test_code_that_a_page_shows_is_where_the_page_looks() -> None:
     """Catches a class that moved to another file, without building the site."""
     block = r"\{literalinclude\} \.\./(\S+)\n(?::\S+:.*\n)*?:pyobject: (\S+)"
-    shown = [found for page in (ROOT / "docs").glob("*.md") for found in re.findall(block, page.read_text())]
+    shown = [match for page in (ROOT / "docs").glob("*.md") for match in re.findall(block, page.read_text())]
     assert shown
     for file, name in shown:
         assert re.search(rf"^(class|def) {name}\b", (ROOT / file).read_text(), re.MULTILINE), (file, name)
@@ -140,8 +140,8 @@ def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
     assert broken(site) == []
     written = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert written <= {path.stem for path in site.glob("*.html")}
-    loaded = {one for path in site.rglob("*.html") for one in Page(path.read_text()).loaded}
-    assert not [one for one in loaded if one.startswith(("http:", "https:", "//"))]
+    loaded = {address for path in site.rglob("*.html") for address in Page(path.read_text()).loaded}
+    assert not [address for address in loaded if address.startswith(("http:", "https:", "//"))]
     assert "red ball" in (site / "api.html").read_text()
     assert "site.css" in (site / "results.html").read_text(), "without it, a table of ten columns is cut"
 

@@ -54,47 +54,50 @@ def name_of(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", Requirement(requirement).name).lower()
 
 
-def installed(requirements: Iterable[str], seen: set[str]) -> Iterator[metadata.Distribution]:
+def installed(requirements: Iterable[str], visited: set[str]) -> Iterator[metadata.Distribution]:
     """Yield what requirements bring along, as far as it is installed here and not in `seen`, which is added to."""
     for requirement in requirements:
         marker, name = Requirement(requirement).marker, name_of(requirement)
-        if name in seen or (marker and not marker.evaluate({"extra": ""})):
+        if name in visited or (marker and not marker.evaluate({"extra": ""})):
             continue
-        seen.add(name)
+        visited.add(name)
         try:
-            found = metadata.distribution(name)
+            package = metadata.distribution(name)
         except metadata.PackageNotFoundError:
             continue
-        yield found
-        yield from installed(found.requires or [], seen)
+        yield package
+        yield from installed(package.requires or [], visited)
 
 
 def of_users() -> list[str]:
     """Return the requirements of gsbench and of all extras but those of developers."""
-    return [*PROJECT["project"]["dependencies"], *(one for extra in EXTRAS.keys() - {*OF_DEVELOPERS}
-            for one in EXTRAS[extra])]  # fmt: skip
+    return [*PROJECT["project"]["dependencies"], *(requirement for extra in EXTRAS.keys() - {*OF_DEVELOPERS}
+            for requirement in EXTRAS[extra])]  # fmt: skip
 
 
 def direct() -> dict[str, str]:
     """Return what gsbench itself depends on, and for what: the core, an extra, or the build."""
-    found: dict[str, str] = {}
+    groups_by_name: dict[str, str] = {}
     groups = {"core": PROJECT["project"]["dependencies"], "build": PROJECT["build-system"]["requires"], **EXTRAS}
     for group in (*(name for name in groups if name not in OF_DEVELOPERS), *OF_DEVELOPERS):
         for requirement in groups[group]:
-            found.setdefault(name_of(requirement), group)
-    return found
+            groups_by_name.setdefault(name_of(requirement), group)
+    return groups_by_name
 
 
 def licence_of(distribution: metadata.Distribution) -> str:
     """Return what the metadata say: the SPDX expression, a licence field that is a name, else the classifiers."""
-    said = distribution.metadata
-    field = (said.get("License") or "").strip()
+    facts = distribution.metadata
+    field = (facts.get("License") or "").strip()
     is_name = re.fullmatch(r"[A-Za-z0-9.+-]+( (AND|OR|WITH) [A-Za-z0-9.+-]+)*", field) and field != "UNKNOWN"
-    classifiers = [one.rpartition(" :: ")[2] for one in said.get_all("Classifier") or []
-                   if one.startswith("License :: OSI Approved ::") or one == "License :: Public Domain"]  # fmt: skip
-    short = ", ".join(SHORT.get(one, one.removesuffix(" License")) for one in classifiers)
-    unsaid = UNSAID.get(name_of(said["Name"]), field.partition("\n")[0])
-    return said.get("License-Expression") or (field if is_name else "") or short or unsaid
+    classifiers = [
+        line.rpartition(" :: ")[2]
+        for line in facts.get_all("Classifier") or []
+        if line.startswith("License :: OSI Approved ::") or line == "License :: Public Domain"
+    ]
+    short = ", ".join(SHORT.get(name, name.removesuffix(" License")) for name in classifiers)
+    unsaid = UNSAID.get(name_of(facts["Name"]), field.partition("\n")[0])
+    return facts.get("License-Expression") or (field if is_name else "") or short or unsaid
 
 
 def tables() -> str:
@@ -105,23 +108,23 @@ def tables() -> str:
             version, licence = "", NOT_INSTALLED[name]
         else:
             try:
-                found = metadata.distribution(name)
+                package = metadata.distribution(name)
             except metadata.PackageNotFoundError:
                 sys.exit(f"licences: expected {name} to be installed, it is not: run make docs first")
-            version, licence = found.version.partition("+")[0], licence_of(found)
+            version, licence = package.version.partition("+")[0], licence_of(package)
         licence = f"**{licence}**" if "GPL" in licence else licence
         rows.append(f"| {name} | {version} | {group} | {'; '.join(filter(None, (licence, NOTES.get(name))))} |")
     rows += ["", "These bring along, to users:", "", "| package | version | licence |", "| --- | --- | --- |"]
-    for one in along():
-        rows.append(f"| {name_of(one.metadata['Name'])} | {one.version} | {licence_of(one)} |")
+    for package in along():
+        rows.append(f"| {name_of(package.metadata['Name'])} | {package.version} | {licence_of(package)} |")
     return "\n".join(rows)
 
 
 def along() -> list[metadata.Distribution]:
     """Return what users install that gsbench does not name, sorted by name; without what only torch for CUDA brings."""
     named = direct()
-    found = {name_of(one.metadata["Name"]): one for one in installed(of_users(), set())}
-    return [found[name] for name in sorted(found) if name not in named and not CUDA.match(name)]
+    packages = {name_of(package.metadata["Name"]): package for package in installed(of_users(), set())}
+    return [packages[name] for name in sorted(packages) if name not in named and not CUDA.match(name)]
 
 
 def sbom() -> dict[str, Any]:
@@ -131,12 +134,15 @@ def sbom() -> dict[str, Any]:
         return {"type": kind, "name": name, "version": version, "purl": f"pkg:pypi/{name}@{version}",
                 "licenses": [{"license": {"name": licence}}]}  # fmt: skip
 
-    found = {name_of(one.metadata["Name"]): one for one in installed(of_users(), set())}
+    packages = {name_of(package.metadata["Name"]): package for package in installed(of_users(), set())}
     project = PROJECT["project"]
     return {
         "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1,
         "metadata": {"component": component("application", project["name"], __version__, project["license"])},
-        "components": [component("library", name, one.version, licence_of(one)) for name, one in sorted(found.items())],
+        "components": [
+            component("library", name, package.version, licence_of(package))
+            for name, package in sorted(packages.items())
+        ],
     }  # fmt: skip
 
 

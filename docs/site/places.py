@@ -42,8 +42,8 @@ def draw(folder: Path, seed: int) -> list[tuple[str, str]]:
     chance = random.Random(seed)
     drawn = []
     for kind in (paragraphs, docstrings):
-        found = [(where, " ".join(text.split())) for where, text in kind(folder)]
-        fit = [one for one in found if LEAST_WORDS <= len(one[1].split()) <= MOST_WORDS]
+        texts = [(where, " ".join(text.split())) for where, text in kind(folder)]
+        fit = [text for text in texts if LEAST_WORDS <= len(text[1].split()) <= MOST_WORDS]
         drawn += chance.sample(fit, PLACES // 2)
     return drawn
 
@@ -51,5 +51,5 @@ def draw(folder: Path, seed: int) -> list[tuple[str, str]]:
 if __name__ == "__main__":
     number = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     root = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).resolve().parents[2]
-    for i, (place, said) in enumerate(draw(root, number), 1):
-        print(f"{i}. [{place}]\n   {said}\n")
+    for i, (place, passage) in enumerate(draw(root, number), 1):
+        print(f"{i}. [{place}]\n   {passage}\n")

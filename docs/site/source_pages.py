@@ -44,7 +44,7 @@ class SourceLinks(SphinxTransform):
         """Find what a link leads to, from docs/ or, in the words of README.md, from the root; None: not a file here."""
         root = root_of(self.app)
         places = [(folder / path).resolve() for folder in (Path(self.env.srcdir), root)]
-        return next((one for one in places if path and one.exists() and one.is_relative_to(root)), None)
+        return next((place for place in places if path and place.exists() and place.is_relative_to(root)), None)
 
 
 def root_of(app: Sphinx) -> Path:
@@ -56,8 +56,8 @@ def linked(env: Any) -> set[str]:
     """Return the files that pages link to, which Sphinx keeps between builds."""
     if not hasattr(env, "linked_files"):
         env.linked_files = set()
-    found: set[str] = env.linked_files
-    return found
+    files: set[str] = env.linked_files
+    return files
 
 
 def pages(app: Sphinx) -> Iterator[tuple[str, dict[str, str], str]]:

@@ -43,7 +43,7 @@ def row_of(path: Path) -> str:
     name = f"[`{path.stem}`](../conf/model/{path.name})"
     about = first_sentence(path)
     if composed.model.candidates:
-        chosen = " or ".join(f"`{one.name}`" for one in composed.model.candidates.values())
+        chosen = " or ".join(f"`{candidate.name}`" for candidate in composed.model.candidates.values())
         return f"| {name} | {about} | what the chosen one does: {chosen} | |"
     model = find(composed.model.name)
     observes = " and ".join(model.observes) or "neither"
@@ -76,8 +76,8 @@ def filled(page: str, published: Path = PUBLISHED) -> str:
     text = (ROOT / page).read_text()
     for name, write in TABLES[page].items():
         first, last = MARKS[0].format(name), MARKS[1]
-        before, found, rest = text.partition(first)
-        assert found, f"{page}: expected the line {first}"
+        before, mark, rest = text.partition(first)
+        assert mark, f"{page}: expected the line {first}"
         text = f"{before}{first}\n\n{write(published)}\n\n{last}{rest.partition(last)[2]}"
     return text
 

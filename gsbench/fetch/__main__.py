@@ -15,25 +15,28 @@ def main(arguments: list[str] | None = None) -> int:
 
     Return the exit code: 0, or 2 if a download failed. Each failure is printed as one line on stderr.
     """
-    made = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
-    made.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
-    made.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
-    made.add_argument("--json", action="store_true", help="print --list as JSON")
-    made.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
-    made.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
-    options = made.parse_args(arguments)
+    parser = argparse.ArgumentParser(prog="python -m gsbench.fetch", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="dnerf, pbr, lpips-alex or lpips-vgg")
+    parser.add_argument("--list", action="store_true", help="print what can be fetched, and what is there")
+    parser.add_argument("--json", action="store_true", help="print --list as JSON")
+    parser.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
+    parser.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
+    options = parser.parse_args(arguments)
     if not options.names and not options.list:
-        made.error("expected a NAME, or --list")
+        parser.error("expected a NAME, or --list")
     if options.json and not options.list:
-        made.error("--json: expected --list beside it")
+        parser.error("--json: expected --list beside it")
     try:
         known = sources(folder_of(options.to))
     except InputError as error:
         print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
         return 2
     if options.json:
-        print(as_json([{"name": one.name, "what": one.what, "target": one.target, "there": one.target.exists()}
-                       for one in known.values()]))  # fmt: skip
+        listed = [
+            {"name": source.name, "what": source.what, "target": source.target, "there": source.target.exists()}
+            for source in known.values()
+        ]
+        print(as_json(listed))
         return 0
     failed = 0
     for name in list(known) if options.list else options.names:
@@ -100,11 +103,11 @@ def fetch(source: Source) -> str:
             f"{scenes(scenes_in(source.folder))}")  # fmt: skip
 
 
-def scenes(found: dict[Path, list[str]]) -> str:
+def scenes(folders: dict[Path, list[str]]) -> str:
     """Return a text that lists the folders of downloaded scenes, as values of `data.root`, with their scene names."""
-    if not found:
+    if not folders:
         return "no scene with a transforms_train.json is in it"
-    return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in found.items()))
+    return printable("; ".join(f"data.root={root} has {', '.join(names)}" for root, names in folders.items()))
 
 
 if __name__ == "__main__":

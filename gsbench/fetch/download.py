@@ -59,9 +59,9 @@ def by_hand(source: Source, path: Path) -> str:
 
 def check(path: Path, source: Source, advice: str) -> None:
     """Raise InputError if the SHA-256 of a file does not begin with the expected digits."""
-    found = sha256_of(path)
-    if source.sha256 and not found.startswith(source.sha256):
-        raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {found[:8]}..: "
+    digest = sha256_of(path)
+    if source.sha256 and not digest.startswith(source.sha256):
+        raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {digest[:8]}..: "
                          f"{advice}", docs="data.md#fetching")  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def check(member: zipfile.ZipInfo, archive: Path) -> None:
 
 def scenes_in(folder: Path) -> dict[Path, list[str]]:
     """Return the folders below `folder` that contain scenes, with the names of these scenes."""
-    found: dict[Path, list[str]] = {}
+    folders: dict[Path, list[str]] = {}
     for marker in sorted(folder.rglob("transforms_train.json")):
-        found.setdefault(marker.parent.parent, []).append(marker.parent.name)
-    return found
+        folders.setdefault(marker.parent.parent, []).append(marker.parent.name)
+    return folders

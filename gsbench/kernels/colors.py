@@ -14,14 +14,14 @@ from gsbench.kernels.headers import MAX_WAVES
 from gsbench.kernels.operation import Operation
 
 
-def _bases(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def _bases(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return the number of SH coefficients that are stored for each frequency in time."""
-    shN, degree, waves = given["shN"], numbers["degree"], numbers["waves"]
+    shN, degree, waves = tensors["shN"], numbers["degree"], numbers["waves"]
     stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
     if stored % waves or stored // waves < (degree + 1) ** 2:
         raise InputError(f"show_colors: expected (degree + 1)^2 coefficients for each frequency, got degree={degree}, "
                          f"waves={waves} and {stored} coefficients")  # fmt: skip
-    if waves > 1 and "times" not in given:
+    if waves > 1 and "times" not in tensors:
         raise InputError("show_colors: expected times and a time, as colours change with them (waves > 1)")
     return {"bases": stored // waves}
 

@@ -28,7 +28,7 @@ class _Similarity(Operation):
                     "target": Input("?one height width 3", Gradient.REFUSED, _TARGET)},
             outputs={"loss": Output(""), "gradient": Output("numbers", gradient=False)},
             numbers={"ssim_weight": float, "with_gradient": bool},
-            derive=lambda given, numbers: {"numbers": given["image"].numel() if numbers["with_gradient"] else 0},
+            derive=lambda tensors, numbers: {"numbers": tensors["image"].numel() if numbers["with_gradient"] else 0},
         )  # fmt: skip
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
@@ -52,10 +52,10 @@ class _Similarity(Operation):
         return {}
 
     def backward(
-        self, tensors: Tensors, slots: Slots, outputs: Tensors, given: Sequence[Tensor | None],
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
         wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:  # fmt: skip
-        return [None if given[0] is None else (given[0] * outputs[1]).view_as(tensors[0]), None]
+        return [None if upstream[0] is None else (upstream[0] * outputs[1]).view_as(tensors[0]), None]
 
 
 _similarity = _Similarity()

@@ -54,15 +54,15 @@ def slice_direct(
         InputError: tensors are not float32 on one device, their shapes do not match, `center` or `time` requires a
             gradient, or `conditioned` exceeds N.
     """
-    seen = _direct(means, directions, times, scales, quats, precision, coupling, shares, opacities, center, time,
+    outputs = _direct(means, directions, times, scales, quats, precision, coupling, shares, opacities, center, time,
                    EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
-    return seen[0], seen[1], seen[2]
+    return outputs[0], outputs[1], outputs[2]
 
 
-def _beta_widths(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def _beta_widths(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return how many Gaussians change, and the numbers of parameters over direction and, if it is given, time."""
-    K = 3 + ("times" in given)
-    return conditioned_rows(given, numbers) | {"precisions": 3 + K, "couplings": 3 * K, "exponents": 1 + K}
+    K = 3 + ("times" in tensors)
+    return conditioned_rows(tensors, numbers) | {"precisions": 3 + K, "couplings": 3 * K, "exponents": 1 + K}
 
 
 _direct_beta = Operation(
@@ -111,9 +111,9 @@ def slice_direct_beta(
         InputError: tensors are not float32 on one device, their shapes do not match, `center` or `time` requires a
             gradient, or `conditioned` exceeds N.
     """
-    seen = _direct_beta(means, directions, times, scales, skew, precision, coupling, betas, opacities, center,
+    outputs = _direct_beta(means, directions, times, scales, skew, precision, coupling, betas, opacities, center,
                         None if times is None else time, EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
-    return seen[0], seen[1], seen[2], seen[3]
+    return outputs[0], outputs[1], outputs[2], outputs[3]
 
 
 _free_time = Operation(
@@ -156,6 +156,6 @@ def slice_free_time(
         InputError: tensors are not float32 on one device, their shapes do not match, `time` requires a gradient, or
             `conditioned` exceeds N.
     """
-    seen = _free_time(means, times, scales, quats, durations, velocities, opacities, time,
+    outputs = _free_time(means, times, scales, quats, durations, velocities, opacities, time,
                       EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
-    return seen[0], seen[1], seen[2]
+    return outputs[0], outputs[1], outputs[2]

@@ -53,30 +53,30 @@ class Operation:
             inputs: the input tensors, by the argument names of the kernel.
             outputs: the output tensors, by the argument names of the kernel.
             numbers: the type of each argument that is not a tensor; an int may also be a dimension of a tensor.
-            derive: computes dimensions that are not dimensions of an input, from the given tensors and numbers.
+            derive: computes dimensions that are not dimensions of an input, from the tensors and numbers of a call.
             scratch: the shape of memory, initialised to zero, that the backward kernel needs on a GPU.
             memory: the name of the outputs in the error message if memory does not suffice.
         """
         self.name = name
         self.inputs, self.outputs = inputs, outputs
         self.numbers = numbers or {}
-        given = list(inputs.values())
-        self.adds = {i for i, x in enumerate(given) if x.gradient is Gradient.ADDED}
-        self._differentiable = [x.gradient not in (Gradient.NONE, Gradient.REFUSED) for x in given]
+        declared = list(inputs.values())
+        self.adds = {i for i, x in enumerate(declared) if x.gradient is Gradient.ADDED}
+        self._differentiable = [x.gradient not in (Gradient.NONE, Gradient.REFUSED) for x in declared]
         self._carries = [x.gradient for x in outputs.values()]
-        self._optional = {i for i, x in enumerate(given) if x.left_out_with}
-        self._shapes = [sizes_of(x.shape) for x in given]
-        self._lists = {i: x.shape for i, x in enumerate(given) if x.is_list}  # size names of inputs with is_list
+        self._optional = {i for i, x in enumerate(declared) if x.left_out_with}
+        self._shapes = [sizes_of(x.shape) for x in declared]
+        self._lists = {i: x.shape for i, x in enumerate(declared) if x.is_list}  # size names of inputs with is_list
         self._derive = derive
         self._scratch = sizes_of(scratch) if scratch is not None else None
         self._memory = memory
         # The argument names of the kernels; None if an input has no gradient.
         self._out = [(f"out.{key}", sizes_of(x.shape)) for key, x in outputs.items()]
-        self._given = [f"given.{key}" for key in outputs]
+        self._grad_out = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key, x in outputs.items() if x.gradient} - _MAY_BE_NULL
-        self._grad = [f"grad.{key}" if own else None for key, own in zip(inputs, self._differentiable, strict=True)]
-        self._on_request = {i for i, x in enumerate(given) if x.gradient is Gradient.ON_REQUEST}
-        self._zeroed = {i for i, x in enumerate(given) if x.gradient in _STARTS_AT_ZERO}
+        self._grad = [f"grad.{key}" if has else None for key, has in zip(inputs, self._differentiable, strict=True)]
+        self._on_request = {i for i, x in enumerate(declared) if x.gradient is Gradient.ON_REQUEST}
+        self._zeroed = {i for i, x in enumerate(declared) if x.gradient in _STARTS_AT_ZERO}
         self._kinds: list[tuple[type, ...]] = [
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
@@ -161,7 +161,7 @@ class Operation:
         tensors: Tensors,
         slots: Slots,
         outputs: Tensors,
-        given: Sequence[Tensor | None],
+        upstream: Sequence[Tensor | None],
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
@@ -171,7 +171,7 @@ class Operation:
             tensors: the inputs of `run`.
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
-            given: the gradient of each output; None for zero.
+            upstream: the gradient of each output; None for zero.
             wanted: whether the caller needs the gradient of each input; a gradient that is declared ON_REQUEST is
                 computed only if the caller needs it.
             sums: for the index of each input whose gradient is declared ADDED, the tensor to which this gradient is
@@ -180,7 +180,7 @@ class Operation:
         like = tensors[0]
         library = library_of(like.device.type)
         kept: list[Tensor | None] = []  # tensors that must not be freed before the kernel has run
-        for name, g, x in zip(self._given, given, outputs, strict=True):
+        for name, g, x in zip(self._grad_out, upstream, outputs, strict=True):
             if g is None and name in self._needed:
                 g = torch.zeros_like(x)
             kept.append(None if g is None else g if g.is_contiguous() else g.contiguous())
@@ -236,26 +236,26 @@ class Operation:
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
         there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
         for group in {x.left_out_with for x in self.inputs.values()} - {None}:
-            together = {key: own for (key, x), own in zip(self.inputs.items(), there, strict=True)
+            together = {key: is_there for (key, x), is_there in zip(self.inputs.items(), there, strict=True)
                         if x.left_out_with == group}  # fmt: skip
             if len(set(together.values())) > 1:  # kernels expect all addresses of a group
                 raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
-        for (key, declared), x, own in zip(self.inputs.items(), tensors, there, strict=True):
-            if own:
+        for (key, declared), x, is_there in zip(self.inputs.items(), tensors, there, strict=True):
+            if is_there:
                 check_tensor(x, f"{self.name}: {key}", declared.dtypes)
         if self._derive is not None:
-            given = {key: x for key, x, own in zip(self.inputs, tensors, there, strict=True) if own}
-            slots.update(self._derive(given, slots))
+            present = {key: x for key, x, is_there in zip(self.inputs, tensors, there, strict=True) if is_there}
+            slots.update(self._derive(present, slots))
         device = tensors[0].device
-        for key, shape, x, own in zip(self.inputs, self._shapes, tensors, there, strict=True):
-            if not own:
+        for key, shape, x, is_there in zip(self.inputs, self._shapes, tensors, there, strict=True):
+            if not is_there:
                 continue
             actual, expected = list(x.shape), list(shape)
             if expected and isinstance(first := expected[0], str) and first.startswith("?"):  # it may be left out
                 expected = expected[1:] if len(actual) < len(expected) else [first[1:], *expected[1:]]
             good = len(actual) == len(expected)
-            for size, found in zip(expected, actual, strict=False):
-                good = good and found == (slots.setdefault(size, found) if isinstance(size, str) else size)
+            for size, actual_size in zip(expected, actual, strict=False):
+                good = good and actual_size == (slots.setdefault(size, actual_size) if isinstance(size, str) else size)
             if not good:
                 known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
                 raise InputError(f"{self.name}: expected {key} of shape {known}, got {actual}")
@@ -301,13 +301,20 @@ class _Eager(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Any, ...]:
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
         operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)
-        found = zip(tensors, operation.backward(tensors, slots, outputs, given, wanted), wanted, strict=True)
+        gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
         # Unlike the registered operator, it makes no zeros that nobody asked for.
-        return None, None, *[(torch.zeros_like(x) if g is None else g) if asked else None for x, g, asked in found]
+        return (
+            None,
+            None,
+            *[
+                (torch.zeros_like(x) if g is None else g) if asked else None
+                for x, g, asked in zip(tensors, gradients, wanted, strict=True)
+            ],
+        )
 
 
 # Output gradients that may be null, which these kernels treat as zero.
@@ -366,9 +373,10 @@ def _register(operation: Operation) -> Callable[..., Any]:
         return operation.forward(tensors, values)
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
-        values, (outputs, given, wanted) = rest[:count], rest[count:]
-        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, given, wanted)
-        return _apart([torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)], given)
+        values, (outputs, upstream, wanted) = rest[:count], rest[count:]
+        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted)
+        dense = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
+        return _apart(dense, upstream)
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
         ctx.tensors = len(inputs[0])
@@ -376,9 +384,9 @@ def _register(operation: Operation) -> Callable[..., Any]:
         ctx.save_for_backward(*inputs[0], *output)
         ctx.numbers = inputs[1:]
 
-    def gradient(ctx: Any, given: list[Tensor | None]) -> tuple[Any, ...]:
+    def gradient(ctx: Any, upstream: list[Tensor | None]) -> tuple[Any, ...]:
         tensors, outputs = ctx.saved_tensors[: ctx.tensors], ctx.saved_tensors[ctx.tensors :]
-        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), given, ctx.wanted)
+        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), upstream, ctx.wanted)
         wanted = [g if asked else None for g, asked in zip(gradients, ctx.wanted, strict=True)]
         return wanted, *(None,) * count
 

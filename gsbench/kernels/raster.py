@@ -88,14 +88,14 @@ def project(
     return Splats(*_project(means, factors, opacities, viewmats, Ks, shapes, *viewport))._replace(shapes=shapes)
 
 
-def _of_images(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
-    colors = given["colors"]
-    C, D, sets = given["means2d"].shape[0], colors.shape[-1], colors.shape[0] if colors.dim() == 3 else 1
+def _of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+    colors = tensors["colors"]
+    C, D, sets = tensors["means2d"].shape[0], colors.shape[-1], colors.shape[0] if colors.dim() == 3 else 1
     if sets not in (1, C):
         raise InputError(f"blend: expected one set of colours, or one a camera, got {sets} for {C} cameras")
     tiles = C * count_tiles(numbers["width"], numbers["height"])
     return {"color_per_camera": int(C > 1 and sets == C), "lists": tiles + 1, "D": D,
-            "sums": GEOMETRY + ("shapes" in given) + D, "state": tiles // C * TILE_PIXELS}  # fmt: skip
+            "sums": GEOMETRY + ("shapes" in tensors) + D, "state": tiles // C * TILE_PIXELS}  # fmt: skip
 
 
 _blend = Operation(

@@ -102,13 +102,13 @@ class _Refine(Operation):
         return self._slots(tensors, numbers)
 
     def backward(
-        self, tensors: Tensors, slots: Slots, outputs: Tensors, given: Sequence[Tensor | None],
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
         wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:  # fmt: skip
         values, weights = slots["rows"], slots["layers"]
         like, networks = values[0], slots["networks"]
         library, features = library_of(like.device.type), networks - 1
-        dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(given, values, strict=True)]
+        dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(upstream, values, strict=True)]
         moved = [allocate("gradients of AGR's features", x, x.shape) for x in values[:features]]
         g_weights = {key: torch.zeros_like(x) for key, x in weights.items()}
         scratch = None
@@ -118,42 +118,42 @@ class _Refine(Operation):
         slots |= {"given.values": addresses(dense), "grad.values": addresses(moved), "grad.scratch": address(scratch)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
         library.call("refine_backward", slots, like)
-        own = _Inputs.of(tensors).of_layers(g_weights)
-        return [*moved, *dense[features:], *own, None, None, None, None]
+        of_weights = _Inputs.of(tensors).of_layers(g_weights)
+        return [*moved, *dense[features:], *of_weights, None, None, None, None]
 
     def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         """Return the kernel arguments by name, and the tensors that must not be freed before the kernels have run."""
         slots = self.match(tensors, numbers).copy()
-        given = _Inputs.of(tensors)
-        values, weights = in_rows(given.values), given.layers()
-        intervals = None if given.intervals is None else given.intervals.contiguous()
-        slots |= {"values": addresses(values), "intervals": address(intervals), "time": address(given.time),
-                  "rows": values, "layers": weights, "kept": (intervals, given.time)}  # fmt: skip
+        inputs = _Inputs.of(tensors)
+        values, weights = in_rows(inputs.values), inputs.layers()
+        intervals = None if inputs.intervals is None else inputs.intervals.contiguous()
+        slots |= {"values": addresses(values), "intervals": address(intervals), "time": address(inputs.time),
+                  "rows": values, "layers": weights, "kept": (intervals, inputs.time)}  # fmt: skip
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        given = _Inputs.of(tensors)
-        listed = given.named()
+        inputs = _Inputs.of(tensors)
+        listed = inputs.named()
         for name, x in listed:
             check_tensor(x, f"refine: {name}", (torch.float32,))
             if x.dim() == 0 and name != "time":
                 raise InputError(f"refine: {name}: expected at least one dimension, got none")
-        moved = [x.shape[-1] for x in given.values]
-        networks, rest = divmod(len(given.weight_in), HIDDEN)
+        moved = [x.shape[-1] for x in inputs.values]
+        networks, rest = divmod(len(inputs.weight_in), HIDDEN)
         last = networks - 1
         if rest or not 1 <= last < len(moved):
             raise InputError(f"refine: expected {HIDDEN} rows of weight_in for each feature and {HIDDEN} for all other "
-                             f"values, got {len(given.weight_in)} for {len(moved)} values")  # fmt: skip
+                             f"values, got {len(inputs.weight_in)} for {len(moved)} values")  # fmt: skip
         if networks > MAX_NETWORKS or len(moved) > MAX_VALUES:
             raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
                              f"got {networks} and {len(moved)}")  # fmt: skip
         widths = [*moved[:last], sum(moved[last:])]
-        like, features, outputs, hidden = given.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
+        like, features, outputs, hidden = inputs.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
         rows = first_rows("refine: rows", numbers[0], like)
         shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
-        shapes += [(hidden, features + len(given.gamma)), (hidden,), (outputs, HIDDEN), (outputs,)]
-        shapes += [(outputs,), (len(given.gamma),)]
-        if given.intervals is not None:
+        shapes += [(hidden, features + len(inputs.gamma)), (hidden,), (outputs, HIDDEN), (outputs,)]
+        shapes += [(outputs,), (len(inputs.gamma),)]
+        if inputs.intervals is not None:
             shapes += [(rows, 2), ()]
         for (name, x), shape in zip(listed, shapes, strict=True):
             if tuple(x.shape) != shape or x.device != like.device:

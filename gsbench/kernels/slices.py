@@ -31,19 +31,19 @@ _triangular = Operation(
     },
     outputs=SLICE,
     numbers={"half": float, "conditioned_first": bool, "form": int, "subtracts": bool, "conditioned": int},
-    derive=lambda given, numbers: _entries(given) | conditioned_rows(given, numbers),
+    derive=lambda tensors, numbers: _entries(tensors) | conditioned_rows(tensors, numbers),
     memory="a slice's Gaussians",
 )
 
 
-def conditioned_rows(given: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def conditioned_rows(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return how many Gaussians, counted from the first, change with the camera and the time."""
-    return {"conditioned": first_rows("conditioned", numbers["conditioned"], given["means"])}
+    return {"conditioned": first_rows("conditioned", numbers["conditioned"], tensors["means"])}
 
 
-def _entries(given: dict[str, Tensor]) -> dict[str, int]:
+def _entries(tensors: dict[str, Tensor]) -> dict[str, int]:
     """Return the numbers of rows and of trained entries of a Cholesky factor over position, time and direction."""
-    k = 3 * ("directions" in given) + ("times" in given)
+    k = 3 * ("directions" in tensors) + ("times" in tensors)
     if k == 0:
         raise InputError("slice_triangular: expected directions, times or both, got neither")
     return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
@@ -103,11 +103,11 @@ def slice_triangular(
             missing, `center` or `time` requires a gradient, or `conditioned` exceeds N.
     """
     timed = times is not None
-    seen = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
+    outputs = _triangular(means, directions, times, log_diagonal, shape, motion, coupling, opacities, center,
                        time if timed else None, log_lambda_d, log_lambda_t if timed else None,
                        0.5 if directional_half else 1.0, conditioned_first, form, subtracts,
                        EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
-    return seen[0], seen[1], seen[2]
+    return outputs[0], outputs[1], outputs[2]
 
 
 _rotated = Operation(
@@ -168,9 +168,9 @@ def slice_rotated(
     Raises:
         InputError: tensors are not float32 on one device, their shapes do not match, or `conditioned` exceeds N.
     """
-    seen = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
+    outputs = _rotated(means, times, scales, left_quats, right_quats, opacities, clock, time, log_lambda_t,
                     EVERY_ROW if conditioned is None else conditioned)  # fmt: skip
-    return seen[0], seen[1], seen[2]
+    return outputs[0], outputs[1], outputs[2]
 
 
 _universal = Operation(
@@ -188,8 +188,8 @@ _universal = Operation(
         "time": Input("", Gradient.REFUSED, left_out_with="time"),
     },
     outputs=SLICE | {"shapes": Output("N")},
-    derive=lambda given, _: (
-        {"rows": 7, "entries": 18, "exponents": 5} if "times" in given else {"rows": 6, "entries": 12, "exponents": 4}
+    derive=lambda tensors, _: (
+        {"rows": 7, "entries": 18, "exponents": 5} if "times" in tensors else {"rows": 6, "entries": 12, "exponents": 4}
     ),
     memory="a slice's Gaussians",
 )
@@ -227,9 +227,9 @@ def slice_universal(
         InputError: tensors are not float32 on one device, their shapes do not match, or `center` or `time` requires a
             gradient.
     """
-    seen = _universal(means, directions, times, scales, skew, lower, betas, opacities, center,
+    outputs = _universal(means, directions, times, scales, skew, lower, betas, opacities, center,
                       time if times is not None else None)  # fmt: skip
-    return seen[0], seen[1], seen[2], seen[3]
+    return outputs[0], outputs[1], outputs[2], outputs[3]
 
 
 _static = Operation(
@@ -254,5 +254,5 @@ def slice_static(
     Raises:
         InputError: tensors are not float32 on one device, or their shapes do not match.
     """
-    seen = _static(scales, quats, opacities)
-    return seen[0], seen[1]
+    outputs = _static(scales, quats, opacities)
+    return outputs[0], outputs[1]

@@ -52,7 +52,7 @@ class Differentiable(Protocol):
         tensors: list[Tensor],
         slots: dict[str, Any],
         outputs: list[Tensor],
-        given: Sequence[Tensor | None],
+        upstream: Sequence[Tensor | None],
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
@@ -87,8 +87,8 @@ class Tape:
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
-        own = operation.differentiable(tensors)
-        wanted = [through and x.requires_grad for x, through in zip(tensors, own, strict=True)]
+        differentiable = operation.differentiable(tensors)
+        wanted = [through and x.requires_grad for x, through in zip(tensors, differentiable, strict=True)]
         if any(wanted):
             for x, through in zip(outputs, operation.carries_gradient(outputs), strict=True):
                 if through:
@@ -118,7 +118,7 @@ class _Gradients:
         self.notes = notes
         self.sources = {id(x): x for x in sources}
         self.sums = sums
-        self.found: dict[int, Tensor] = {}
+        self.gradients: dict[int, Tensor] = {}
         self.uses = Counter([id(x) for note in notes for x in note.tensors])
 
     def give(self, x: Tensor, gradient: Tensor) -> None:
@@ -126,31 +126,31 @@ class _Gradients:
         self._add(x, gradient)
         if x.grad_fn is None:
             return
-        own = [y for note in self.notes for y in note.outputs if y.requires_grad]
-        ends = [y for y in (*self.sources.values(), *own) if y.requires_grad and y is not x]
+        outputs = [y for note in self.notes for y in note.outputs if y.requires_grad]
+        ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and y is not x]
         gradients = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
-        for end, found in zip(ends, gradients, strict=True):
-            if found is not None:
-                self._add(end, found.clone())  # torch may return two gradients that share memory
+        for end, of_end in zip(ends, gradients, strict=True):
+            if of_end is not None:
+                self._add(end, of_end.clone())  # torch may return two gradients that share memory
 
     def _add(self, x: Tensor, gradient: Tensor) -> None:
-        before = self.found.get(id(x))
-        self.found[id(x)] = gradient if before is None else before + gradient
+        before = self.gradients.get(id(x))
+        self.gradients[id(x)] = gradient if before is None else before + gradient
 
     def through(self, note: _Note) -> None:
         """Run the backward kernel of one recorded call, if one of its outputs has a gradient."""
-        given = [self.found.get(id(x)) for x in note.outputs]
-        if all(g is None for g in given):
+        upstream = [self.gradients.get(id(x)) for x in note.outputs]
+        if all(g is None for g in upstream):
             return
         # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
         whole, there = {}, {}
         for i in note.operation.adds:
             key = id(note.tensors[i])
-            if key in self.sources and self.uses[key] == 1 and key not in self.found:
+            if key in self.sources and self.uses[key] == 1 and key not in self.gradients:
                 whole[i] = key
                 if key in self.sums:
                     there[i] = self.sums[key]
-        gradients = note.operation.backward(note.tensors, note.slots, note.outputs, given, note.wanted, there)
+        gradients = note.operation.backward(note.tensors, note.slots, note.outputs, upstream, note.wanted, there)
         for i, (x, gradient, wanted) in enumerate(zip(note.tensors, gradients, note.wanted, strict=True)):
             if gradient is None or not wanted:
                 continue
@@ -162,6 +162,6 @@ class _Gradients:
     def finish(self) -> None:
         """Add the gradients of all source tensors to the caller's sums of gradients."""
         for key in self.sources:
-            gradient = self.found.get(key)
+            gradient = self.gradients.get(key)
             if gradient is not None:
                 add_to(self.sums, key, gradient)

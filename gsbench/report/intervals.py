@@ -107,8 +107,8 @@ class Estimate:
         return math.exp(high)
 
     def _half(self, level: float) -> float:
-        own = math.hypot(*(spread.half_width(level) for spread in self.levels))
-        return max(own, self.floor.half_width(level) if self.floor else 0.0)
+        width = math.hypot(*(spread.half_width(level) for spread in self.levels))
+        return max(width, self.floor.half_width(level) if self.floor else 0.0)
 
 
 def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
@@ -132,9 +132,9 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     of_seeds = _combined([Spread(scene.mean(1).var(ddof=1) / len(scene), len(scene) - 1) for scene in scenes])
     if min(scene.shape[1] for scene in scenes) < 2:
         return Estimate(mean, count, seeds, "seeds", (of_seeds,), each=each)
-    own = _combined([_without_rest(scene) for scene in scenes])
+    without_rest = _combined([_without_rest(scene) for scene in scenes])
     of_views = _combined([Spread(s.mean(0).var(ddof=1) / s.shape[1], s.shape[1] - 1) for s in scenes])
-    return Estimate(mean, count, seeds, "seeds and views", (own, of_views), of_seeds, each)
+    return Estimate(mean, count, seeds, "seeds and views", (without_rest, of_views), of_seeds, each)
 
 
 def over_seeds(values: Sequence[float]) -> Estimate:

@@ -22,7 +22,7 @@ def departure(record: Record) -> str:
     }
     if record.status != "ok" and record.protocol.get("resolution") == "not loaded":
         del expected["size"]  # a run that failed before it saw an image
-    return ", ".join(name for name, (theirs, papers) in expected.items() if theirs != papers)
+    return ", ".join(name for name, (value, of_paper) in expected.items() if value != of_paper)
 
 
 def has_images_of_paper(record: Record) -> bool:
@@ -33,7 +33,7 @@ def has_images_of_paper(record: Record) -> bool:
     protocol = PROTOCOLS.get(record.dataset)
     if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
         return False
-    return all(theirs == papers for theirs, papers in _of_images(record, protocol).values())
+    return all(value == of_paper for value, of_paper in _of_images(record, protocol).values())
 
 
 def _of_images(record: Record, protocol: Protocol) -> dict[str, tuple[Any, Any]]:
