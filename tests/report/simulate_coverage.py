@@ -35,8 +35,8 @@ def draw(shape: tuple[int, int, int], spread: tuple[float, float, float], truth:
 
 
 def ours(values: np.ndarray, _: np.random.Generator) -> tuple[float, float]:
-    found = estimate(list(values))
-    return found.low, found.high
+    of = estimate(list(values))
+    return of.low, of.high
 
 
 def percentile_bootstrap(values: np.ndarray, random: np.random.Generator) -> tuple[float, float]:
@@ -45,14 +45,10 @@ def percentile_bootstrap(values: np.ndarray, random: np.random.Generator) -> tup
     means = []
     for _ in range(500):
         drawn = random.integers(scenes, size=scenes) if scenes > 2 else range(scenes)
-        means.append(
-            np.mean(
-                [
-                    values[s][random.integers(seeds, size=seeds)][:, random.integers(views, size=views)].mean()
-                    for s in drawn
-                ]
-            )
-        )
+        of_scenes = [
+            values[s][random.integers(seeds, size=seeds)][:, random.integers(views, size=views)].mean() for s in drawn
+        ]
+        means.append(np.mean(of_scenes))
     low, high = np.quantile(means, [0.025, 0.975])
     return low, high
 
@@ -72,6 +68,6 @@ if __name__ == "__main__":
     print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for name, spread in SPREADS.items():
         for shape in SHAPES:
-            mine = coverage(ours, shape, spread, 10_000)
+            holds = coverage(ours, shape, spread, 10_000)
             plain = coverage(percentile_bootstrap, shape, spread, 400)
-            print(f"| {name} | {' | '.join(map(str, shape))} | {100 * mine:.1f} % | {100 * plain:.0f} % |", flush=True)
+            print(f"| {name} | {' | '.join(map(str, shape))} | {100 * holds:.1f} % | {100 * plain:.0f} % |", flush=True)

@@ -1,14 +1,12 @@
 """Published studies: three tables that give back every record as it was, and refuse what no study has written."""
 
-import dataclasses
 import gzip
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
-from make_golden import make
-from many_records import HOSTILE, frontier, gates
+from records import HOSTILE, but, frontier, gates, lost, make
 
 from gsbench.errors import InputError
 from gsbench.measure import record as files
@@ -17,42 +15,23 @@ from gsbench.measure.record import LengthChoice, OnDemand, Record, Region, Stop,
 from gsbench.report import frame, study
 from gsbench.report.publish import publish
 
-TEXTS = (
-    "",
-    "1",
-    "1e5",
-    "1.0 ",
-    "true",
-    "null",
-    "NaN",
-    "[1",
-    '"',
-    "=1+1",
-    "-2",
-    "+3",
-    "@x",
-    " a,b\n\t",
-    "ü\u202e",
-    HOSTILE,
-)
+TEXTS = ("", "1", "1e5", "1.0 ", "true", "null", "NaN", "[1", '"', "=1+1", "-2", "+3", "@x", " a,b\n\t", "ü\u202e",
+         HOSTILE)  # fmt: skip
 
 
 def hard() -> list[Record]:
     """Records whose every kind of value could be read back as another one."""
-    base = make()
-    config = {"texts": list(TEXTS), "empty": {}, "none": None, "zero": 0, "zeros": 0.0, "yes": True, "tiny": 5e-324} | {
-        str(i): text for i, text in enumerate(TEXTS)
-    }
-    odd = make(
-        "4dgs", seed=2, per_view=[ViewScore(text, 0.1 + 0.2, lpips_alex=None) for text in TEXTS],
+    config = {"texts": list(TEXTS), "empty": {}, "none": None, "zero": 0, "zeros": 0.0, "yes": True, "tiny": 5e-324}
+    config |= {str(i): text for i, text in enumerate(TEXTS)}
+    odd = but(
+        make("4dgs", seed=2, missing={"psnr_train": "=cmd", "lpips_vgg": ""}),
+        per_view=[ViewScore(text, 0.1 + 0.2, lpips_alex=None) for text in TEXTS],
         curve=[Point(1, 0.1, None), Point(2, 1 / 3, 20.0)], stop=Stop(2, 1), on_demand=OnDemand(gates=gates()),
         length_choice=LengthChoice(10, []), regions={"moving": Region("masks", 1, 0.1, "d")}, exact=["a"],
-        dataset=HOSTILE, overrides=list(TEXTS), missing={"psnr_train": "=cmd", "lpips_vgg": ""},
-        metrics=dict(base.metrics or {}, psnr_train=None, lpips_vgg=None),
-        provenance=dataclasses.replace(base.provenance, config=config, data_notes=["\x1b[31m"], git_commit="12e4567"),
+        dataset=HOSTILE, overrides=list(TEXTS), metrics={"psnr_train": None, "lpips_vgg": None},
+        provenance={"config": config, "data_notes": ["\x1b[31m"], "git_commit": "12e4567"},
     )  # fmt: skip
-    lost = make(seed=1, status="failed", reason="=out", metrics=None, missing={}, cost=None, per_view=[], curve=[])
-    return [base, odd, lost, *frontier(("3dgs",), ("suzanne",), 2, views=3)]
+    return [make(), odd, lost(make(seed=1), "=out"), *frontier(("3dgs",), ("suzanne",), 2, views=3)]
 
 
 def test_a_study_gives_back_its_records(tmp_path: Path):
@@ -70,19 +49,18 @@ def test_a_study_gives_back_its_records(tmp_path: Path):
 
 def test_a_record_that_no_table_can_hold_is_refused(tmp_path: Path):
     """Catches a key with a dot, which comes back as two keys, in a study that is already published."""
-    config = {"a.b": 1, "a": {"c": 2}}
     with pytest.raises(InputError, match="expected a record that tables can hold"):
-        study.write([make(provenance=dataclasses.replace(make().provenance, config=config))], tmp_path)
+        study.write([but(make(), provenance={"config": {"a.b": 1, "a": {"c": 2}}})], tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def edited(old: str, new: str) -> Callable[[Path], object]:
+def edited(before: str, after: str) -> Callable[[Path], object]:
     """Replace a text of runs.csv."""
 
     def edit(folder: Path) -> None:
         path = folder / study.RUNS_FILE
-        assert old in path.read_text()
-        path.write_text(path.read_text().replace(old, new, 1))
+        assert before in path.read_text()
+        path.write_text(path.read_text().replace(before, after, 1))
 
     return edit
 
@@ -120,21 +98,17 @@ def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_p
     """Catches a failed or dirty run among published ones, one that is there twice, and one that is lost."""
     to, folder = tmp_path / "published/mini", tmp_path / "mini"
 
-    def written(*records: Record) -> Path:
+    def published(*records: Record) -> str:
         for record in records:
             files.write(record, folder / str(record.seed) / files.FILE_NAME)
-        return folder
+        return publish(folder, to)
 
-    assert "2 runs in" in publish(written(make(seed=0), make(seed=1)), to)
-    assert "3 runs in" in publish(written(make(seed=1, psnr=30.0), make(seed=2)), to)
+    assert "2 runs in" in published(make(seed=0), make(seed=1))
+    assert "3 runs in" in published(make(seed=1, psnr=30.0), make(seed=2))
     assert frame.load(to).runs[["seed", "psnr_db"]].to_numpy().tolist() == [[0, 25.0], [1, 30.0], [2, 25.0]]
     before = {path: path.read_bytes() for path in to.iterdir()}
-    clean = make().provenance
-    for bad in (
-        make(seed=3, provenance=dataclasses.replace(clean, git_commit="0123-dirty")),
-        make(seed=3, provenance=dataclasses.replace(clean, git_commit=None)),
-        make(seed=3, status="failed", reason="x", metrics=None, missing={}, cost=None),
-    ):
+    dirty = [but(make(seed=3), provenance={"git_commit": commit}) for commit in ("0123-dirty", None)]
+    for bad in (*dirty, lost(make(seed=3))):
         with pytest.raises(InputError, match="expected finished runs of clean commits"):
-            publish(written(bad), to)
+            published(bad)
     assert {path: path.read_bytes() for path in to.iterdir()} == before
