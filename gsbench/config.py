@@ -33,7 +33,8 @@ class DataConfig:
     scenes: list[str] = key([], "scenes of scene=all", role="place")
     repair: list[str] | None = key(None, "damaged images, replaced by the frame before")
     background: str = key("black", "background of images", choices=("black", "white"))
-    initial_lambda: float = key(0.5, "initial lambda_t and lambda_d of 7DGS")
+    initial_lambda: float = key(0.5, "initial lambda_d of 7DGS")
+    initial_lambda_t: float = key(0.5, "its initial lambda_t", absent=0.5)
     initial_points: int = key(100_000, "random points, if needed", low=4)
     initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see",
                                            low=1e-6, high=1e6)  # fmt: skip
