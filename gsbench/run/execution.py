@@ -356,9 +356,6 @@ def too_long(record: Record) -> str:
             f"be better (docs/runs.md#how-a-run-ends)")  # fmt: skip
 
 
-STALE = "record.stale.json"  # that of a finished run, kept beside the record of a later execution that did not finish
-
-
 def finished(spec: RunSpec, scene: Scene) -> Record | None:
     """Return the record of an earlier run if it is ok and has the same settings and data; otherwise None.
 

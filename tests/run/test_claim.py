@@ -1,29 +1,57 @@
 """A run is claimed before it is done: of equal commands one trains, and what a killed one left is taken over."""
 
+import contextlib
 import errno
 import multiprocessing
 import os
-import re
 import shutil
-import signal
-import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 import pytest
-from tiny_run import ROOT, command, environment, overrides, write_moving_square
+from tiny_run import overrides, spec_of
 
 from gsbench.errors import InputError
 from gsbench.measure import atomic
-from gsbench.run import progress
-from gsbench.run.progress import Progress
+from gsbench.run import execution, progress
+from gsbench.run.progress import FILE_NAME, Progress
 
 CROWD, ROUNDS = 6, 15
-HERE = socket.gethostname()
+
+
+def names(folder: Path) -> list[str]:
+    """The files of a folder."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def without_locks(_: Path) -> None:
+    raise OSError(errno.ENOLCK, "No locks available")
+
+
+@pytest.fixture
+def mounts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Path]]:
+    """Where processes see the folder `disk`: there, or on two mounts that share no locks and cache as NFS does."""
+    disk, mounted = tmp_path / "disk", list[Path]()
+    disk.mkdir()
+    if request.param != "two mounts":
+        yield [disk]
+        return
+    if shutil.which("bindfs") is None or not os.access("/dev/fuse", os.W_OK):
+        pytest.skip("needs bindfs and FUSE")
+    try:
+        for mount in (tmp_path / "one", tmp_path / "other"):
+            mount.mkdir()
+            cached = "attr_timeout=5,entry_timeout=5"
+            if subprocess.run(["bindfs", "-o", cached, disk, mount], check=False).returncode:
+                pytest.skip("FUSE cannot be mounted here")
+            mounted.append(mount)
+        yield mounted
+    finally:
+        for mount in mounted:
+            subprocess.run(["fusermount", "-u", "-z", mount], check=True)
 
 
 def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
@@ -37,51 +65,21 @@ def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
 
 
 @pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
-@pytest.mark.parametrize("locks", [True, False])
+@pytest.mark.parametrize("mounts", ["locks", "no locks", "two mounts"], indirect=True)
 def test_of_many_processes_one_has_the_run(
-    left: str, locks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    left: str, mounts: list[Path], request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a claim that is looked for and then made, so that several make it, and one that nobody takes over."""
-    if not locks:
+    """Catches a claim that is looked for and then made, so that several make it, one that nobody takes over, and a run
+    that two hosts do, as their mounts share no locks and show each other's files late."""
+    if "no locks" in request.node.name:
         monkeypatch.setattr(progress, "_locked", without_locks)
-    one_of_many_has_each_run(tmp_path, [tmp_path], left)
-
-
-@pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
-def test_of_many_processes_on_two_mounts_one_has_the_run(left: str, two_mounts: list[Path], tmp_path: Path) -> None:
-    """Catches a run that two hosts do, as their mounts share no locks and show each other's files late."""
-    one_of_many_has_each_run(tmp_path / "disk", two_mounts, left)
-
-
-@pytest.fixture
-def two_mounts(tmp_path: Path) -> Iterator[list[Path]]:
-    """Two mounts of the folder `disk`, each with locks and a cache of names and attributes of its own, as on NFS."""
-    if shutil.which("bindfs") is None or not os.access("/dev/fuse", os.W_OK):
-        pytest.skip("needs bindfs and FUSE")
-    mounts = [tmp_path / name for name in ("one", "other")]
-    mounted = []
-    (tmp_path / "disk").mkdir()
-    try:
-        for mount in mounts:
-            mount.mkdir()
-            cached = "attr_timeout=5,entry_timeout=5"
-            if subprocess.run(["bindfs", "-o", cached, tmp_path / "disk", mount], check=False).returncode:
-                pytest.skip("FUSE cannot be mounted here")
-            mounted.append(mount)
-        yield mounts
-    finally:
-        for mount in mounted:
-            subprocess.run(["fusermount", "-u", "-z", mount], check=True)
-
-
-def one_of_many_has_each_run(disk: Path, mounts: list[Path], left: str) -> None:
-    """Let processes compete by several mounts of one disk, with what is left of an earlier claim."""
-    for number in range(ROUNDS):
-        (disk / str(number)).mkdir()
+    folders = [tmp_path / "disk" / str(number) for number in range(ROUNDS)]
+    for folder in folders:
+        folder.mkdir()
         if left == "a dead claim":
-            progress.write(disk / str(number), Progress(["seed=0"], born=1))
+            progress.write(folder, Progress(["seed=0"], born=1))
         elif left == "half a claim":
-            (disk / str(number) / progress.FILE_NAME).write_text('{"overrides": [')
+            (folder / FILE_NAME).write_text('{"overrides": [')
     fork = multiprocessing.get_context("fork")
     start, ended = fork.Barrier(CROWD), fork.Barrier(CROWD)
     crowd = [fork.Process(target=compete, args=(mounts[i % len(mounts)], start, ended)) for i in range(CROWD)]
@@ -90,14 +88,8 @@ def one_of_many_has_each_run(disk: Path, mounts: list[Path], left: str) -> None:
     for process in crowd:
         process.join(60)
         assert process.exitcode == 0
-    for number in range(ROUNDS):
-        names = sorted(path.name for path in (disk / str(number)).iterdir())
-        assert [name.partition(".")[0] for name in names] == ["progress", "won"], names
-        assert names[1] == f"won.{progress.read(disk / str(number) / progress.FILE_NAME).pid}"
-
-
-def without_locks(_: Path) -> None:
-    raise OSError(errno.ENOLCK, "No locks available")
+    for folder in folders:
+        assert names(folder) == [FILE_NAME, f"won.{progress.read(folder / FILE_NAME).pid}"]
 
 
 def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -> None:
@@ -113,47 +105,42 @@ def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -
             progress.write(tmp_path, other)
             assert progress.take_claim(tmp_path, claim) == (other if living else None)
             progress.release_claim(tmp_path, claim)
-            assert (tmp_path / progress.FILE_NAME).exists() == living  # what is another's stays
+            assert (tmp_path / FILE_NAME).exists() == living  # what is another's stays
     finally:
         sleeper.kill()
         sleeper.wait()
     progress.write(tmp_path, beside)
     assert progress.take_claim(tmp_path, claim) is None
-    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+    assert names(tmp_path) == [FILE_NAME]
     progress.release_claim(tmp_path / "gone", claim)
 
 
 @pytest.mark.parametrize("times", [2, 1000])
 def test_a_stale_handle_makes_no_claim_a_dead_one(times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a live claim that is removed because its file was replaced on the server while it was read."""
-    elsewhere = Progress([], host="elsewhere")
+    elsewhere, opened, stale = Progress([], host="elsewhere"), os.open, iter(range(times))
     progress.write(tmp_path, elsewhere)
-    stale = iter(range(times))
-    opened = os.open
 
     def open_stale(path: Path, *flags: int) -> int:
-        if Path(path).name == progress.FILE_NAME and next(stale, None) is not None:
+        if Path(path).name == FILE_NAME and next(stale, None) is not None:
             raise OSError(errno.ESTALE, "Stale file handle", str(path))
         return opened(path, *flags)
 
     with monkeypatch.context() as patched:
         patched.setattr(progress.os, "open", open_stale)
-        if times == 2:
+        with pytest.raises(OSError, match="Stale file handle") if times > 2 else contextlib.nullcontext():
             assert progress.take_claim(tmp_path, Progress([])) == elsewhere
-        else:
-            with pytest.raises(OSError, match="Stale file handle"):
-                progress.take_claim(tmp_path, Progress([]))
-            progress.release_claim(tmp_path, elsewhere)
-    assert progress.read(tmp_path / progress.FILE_NAME) == elsewhere
+        progress.release_claim(tmp_path, elsewhere if times > 2 else Progress([]))
+    assert progress.read(tmp_path / FILE_NAME) == elsewhere
 
 
 def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path: Path) -> None:
     """Catches a claim that is removed by a process which read the one before it."""
     dead, claim = progress.encode(Progress([], born=1)), Progress([])
     progress.write(tmp_path, claim)
-    progress._remove(tmp_path / progress.FILE_NAME, dead, Progress([], host="elsewhere"))
-    assert progress.read(tmp_path / progress.FILE_NAME) == claim
-    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+    progress._remove(tmp_path / FILE_NAME, dead, Progress([], host="elsewhere"))
+    assert progress.read(tmp_path / FILE_NAME) == claim
+    assert names(tmp_path) == [FILE_NAME]
 
 
 @pytest.mark.parametrize("alive", [True, False])
@@ -163,17 +150,16 @@ def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, mon
     progress.write(tmp_path, Progress([], born=1))
     with monkeypatch.context() as patched:  # a process that is killed at this moment
         patched.setattr(Path, "unlink", lambda *_, **__: None)
-        content = (tmp_path / progress.FILE_NAME).read_bytes()
-        progress._remove(
-            tmp_path / progress.FILE_NAME, content, Progress([], host="elsewhere" if alive else HERE, born=1)
-        )
+        content = (tmp_path / FILE_NAME).read_bytes()
+        other = Progress([], born=1)
+        progress._remove(tmp_path / FILE_NAME, content, replace(other, host="elsewhere") if alive else other)
     if alive:
         with pytest.raises(InputError, match="claim it again and again"):
             progress.take_claim(tmp_path, Progress([]))
-        assert (tmp_path / progress.FILE_NAME).read_bytes() == content
+        assert (tmp_path / FILE_NAME).read_bytes() == content
     else:
         assert progress.take_claim(tmp_path, Progress([])) is None
-        assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".tmp")] == [progress.FILE_NAME]
+        assert [name for name in names(tmp_path) if not name.endswith(".tmp")] == [FILE_NAME]
 
 
 def test_a_lock_that_is_held_for_ever_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,36 +180,29 @@ def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, mon
 
     monkeypatch.setattr(atomic.os, "link", link)
     assert progress.take_claim(tmp_path, Progress(["a=1"])) is None
-    other = Progress(["a=1"], host=socket.gethostname() + "2")
-    holder = progress.take_claim(tmp_path, other)
+    holder = progress.take_claim(tmp_path, Progress(["a=1"], host="elsewhere"))
     assert holder is not None
     assert holder.pid == os.getpid()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [progress.FILE_NAME]
+    assert names(tmp_path) == [FILE_NAME]
 
 
-@pytest.mark.slow
-def test_of_three_commands_at_once_one_trains(tmp_path: Path) -> None:
-    """Catches a claim that is made once the scene is loaded: all three trained."""
-    data = write_moving_square(tmp_path / "data")
-    long = ("model=3dgs", "train.iterations=100000", "train.curve_points=1", "train.densify.stop=1")
-    arguments = overrides(data, tmp_path / "r", *long)
-    runs = [subprocess.Popen(command(*arguments), cwd=ROOT, env=environment(), stderr=subprocess.PIPE, text=True)
-            for _ in range(3)]  # fmt: skip
-    try:
-        deadline, others = time.monotonic() + 240, []
-        while len(others) < 2 and time.monotonic() < deadline:
-            time.sleep(0.1)
-            others = [run for run in runs if run.poll() is not None]
-        (winner,) = (run for run in runs if run.poll() is None)
-        for run in others:
-            errors = run.communicate()[1]
-            assert run.returncode == 0, errors
-            lines = [line for line in errors.splitlines() if re.search(rf"left to process {winner.pid} on ", line)]
-            assert len(lines) == 1, errors
-        winner.send_signal(signal.SIGTERM)
-        assert "stopped " in winner.communicate(timeout=60)[1]
-        assert not list((tmp_path / "r").rglob(progress.FILE_NAME))
-    finally:
-        for run in runs:
-            run.kill()
-            run.wait()
+def test_a_run_that_another_process_does_is_left_to_it(
+    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches two sweeps on one folder that train the same run twice, and a claim made once the scene is loaded."""
+    spec = spec_of(overrides(square, tmp_path, "model=3dgs", "train.iterations=3"))
+    loaded, claims = execution.load_scene, list[Path]()
+    monkeypatch.setattr(
+        execution, "load_scene", lambda config: claims.extend(spec.folder.glob(FILE_NAME)) or loaded(config)
+    )
+    spec.folder.mkdir(parents=True)
+    progress.write(spec.folder, Progress([], host="elsewhere", pid=12, step=7))
+    assert execution.execute(spec) is None
+    assert "left to process 12 on elsewhere, which is at step 7 of it" in capsys.readouterr().err
+    assert not claims
+    progress.write(spec.folder, Progress([], host="elsewhere", updated=0.0))
+    record = execution.execute(spec)
+    assert record is not None
+    assert record.status == "ok"
+    assert claims == [spec.folder / FILE_NAME]
+    assert not claims[0].exists()

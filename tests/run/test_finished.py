@@ -1,8 +1,10 @@
 """A run that finished before: kept, measured again or trained again, and the reason is said."""
 
-import dataclasses
 import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,165 +18,146 @@ from gsbench.train import checkpoint
 from gsbench.train.loop import Trainer
 
 WORDS = ("model=3dgs", "train.iterations=4")
+KEPT = "finished before, kept: PSNR "
+
+
+@dataclass
+class Finished:
+    """A run of 4 steps that is finished: its results, its record and its folder, which each test may change."""
+
+    data: Path
+    results: Path
+    first: Record
+    folder: Path
+
+    def again(self, *words: str) -> Record:
+        """Do it again with other words; return the new record."""
+        return run_here(*overrides(self.data, self.results, *WORDS, *words))[0]
+
+    def lose_checkpoint(self) -> None:
+        """Delete its checkpoint."""
+        (self.folder / checkpoint.FILE_NAME).unlink()
+
+    def change(self, **changed: Any) -> None:
+        """Let its record have another provenance, as one that was made elsewhere or before has."""
+        other = replace(self.first, provenance=replace(self.first.provenance, **changed))
+        files.write(other, self.folder / files.FILE_NAME)
+
+    def of_older_config(self) -> None:
+        """Let its record be that of a longer training, and lose its checkpoint."""
+        config = self.first.provenance.config
+        self.change(config=config | {"train": config["train"] | {"iterations": 1000}})
+        self.lose_checkpoint()
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, square: Path) -> tuple[Record, Path, Path]:
-    """A finished run of 4 steps, its results and its folder."""
+def original(tmp_path_factory: pytest.TempPathFactory, square: Path) -> Finished:
     results = tmp_path_factory.mktemp("results")
-    record, folder = run_here(*overrides(square, results, *WORDS))
-    assert record.status == "ok"
-    return record, results, folder
-
-
-class Trained(Exception):  # noqa: N818
-    """A step of training, where none should be."""
+    return Finished(square, results, *run_here(*overrides(square, results, *WORDS)))
 
 
 @pytest.fixture
-def again(tmp_path: Path, square: Path, done, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
-    """Do the finished run again with other words, and return the new record and what was said."""
-    first, before, folder = done
-    results = tmp_path / "results"
-    shutil.copytree(before, results)
-
-    def no_step(*_: object) -> None:
-        raise Trained
-
-    def repeat(*more: str, change: object = None, trains: bool = False) -> tuple[Record, str]:
-        if not trains:
-            monkeypatch.setattr(Trainer, "train_step", no_step)
-        if callable(change):
-            change(repeat.folder)
-        capfd.readouterr()
-        record, _ = run_here(*overrides(square, results, *WORDS, *more))
-        return record, "".join(capfd.readouterr())
-
-    repeat.first, repeat.folder = first, results / folder.relative_to(before)
-    return repeat
+def run(original: Finished, tmp_path: Path) -> Finished:
+    results = shutil.copytree(original.results, tmp_path / "results")
+    return replace(original, results=results, folder=results / original.folder.relative_to(original.results))
 
 
-def weights(monkeypatch: pytest.MonkeyPatch, *, here: bool) -> None:
-    """Pretend that the weights of LPIPS' VGG, which takes images as small as these, are or are not on this machine."""
+@pytest.fixture
+def trains(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Refuse a step of training, unless a test says that there is one."""
+    if not getattr(request, "param", False):
+        monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained again"))
 
-    def load(backbone: str, *_: object):
-        if backbone != "vgg" or not here:
+
+@pytest.fixture
+def weights(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """The networks of LPIPS whose weights are on this machine, as far as the run knows; at first none."""
+    here = set[str]()
+
+    def load(backbone: str, *_: object) -> Callable[..., torch.Tensor]:
+        if backbone not in here:
             raise perceptual.BackboneMissing("no trunk weights")
         return lambda *_: torch.tensor([0.25])
 
     monkeypatch.setattr(perceptual, "load", load)
-    monkeypatch.setattr(perceptual, "is_here", lambda backbone, _: here and backbone == "vgg")
+    monkeypatch.setattr(perceptual, "is_here", lambda backbone, _: backbone in here)
+    return here
 
 
-def no_checkpoint(folder: Path) -> None:
-    (folder / checkpoint.FILE_NAME).unlink()
-
-
-def test_what_is_kept_says_where_it_was_measured(again) -> None:
-    """Catches a stranger who takes a kept record's seconds for his own machine's."""
-
-    def elsewhere(folder: Path) -> None:
-        provenance = dataclasses.replace(
-            again.first.provenance, device="another CPU", hardware=None, time="2026-01-02T"
-        )
-        files.write(dataclasses.replace(again.first, provenance=provenance), folder / files.FILE_NAME)
-
-    assert "finished before, kept: PSNR " in again()[1]
-    assert "on this machine; " in again()[1]
-    threads = again.first.provenance.machine.rpartition(", ")[2]
-    assert f"measured 2026-01-02 on another CPU, {threads}; " in again(change=elsewhere)[1]
-
-
-def test_a_place_is_no_setting(again, square: Path, tmp_path: Path) -> None:
-    """Catches a training repeated, for want of its checkpoint, because the data were moved or are saved less often."""
-    (tmp_path / "moved").symlink_to(square)
-    record, output = again(f"data.root={tmp_path / 'moved'}", "train.checkpoint_minutes=9", change=no_checkpoint)
-    assert record == again.first
-    assert "finished before, kept" in output
-
-
-def test_a_release_trains_nothing_again(again, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a version in the name of a run, in its hash or in its checkpoint, which would cost every training."""
-    monkeypatch.setattr(provenance, "__version__", "9.9.9")
-    record, output = again()
-    assert record == again.first
-    assert "finished before, kept" in output
-    record, _ = again("protocol.quantise=true")  # measured from the checkpoint: `again` refuses a step
-    assert record.status == "ok"
-    assert record.provenance.versions["gsbench"] == "9.9.9"
-
-
-def changed(record: Record, folder: Path, *, with_checkpoint: bool = False, **provenance: object) -> None:
-    """Let the record of a finished run have another provenance, as one that was made before has."""
-    other = dataclasses.replace(record.provenance, **provenance)
-    files.write(dataclasses.replace(record, provenance=other), folder / files.FILE_NAME)
-    if not with_checkpoint:
-        no_checkpoint(folder)
-
-
-def of_older_config(record: Record, folder: Path) -> None:
-    config = record.provenance.config
-    changed(record, folder, config={**config, "train": config["train"] | {"iterations": 1000}})
-
-
-QUANTISED = "protocol.quantise True instead of False"
+QUANTISED = "what is measured is another (protocol.quantise True instead of False): "
 
 
 @pytest.mark.parametrize(
     ("words", "change", "reason", "trains"),
     [
-        (["protocol.quantise=true"], lambda *_: None, f"what is measured is another ({QUANTISED}): measured again",
-         False),
-        (["protocol.quantise=true"], lambda _, folder: no_checkpoint(folder),
-         f"({QUANTISED}): its checkpoint is gone: running again", True),
-        ([], of_older_config, "the training is another (train.iterations 4 instead of 1000): running again", True),
-        ([], lambda record, folder: changed(record, folder, with_checkpoint=True, data_hash="0" * 64),
-         "the scene's data has changed: running again", False),
+        ((), lambda _: None, f"{KEPT}.* on this machine; ", False),
+        ((), lambda run: run.change(device="another CPU", hardware=None, time="2026-01-02T"),
+         "measured 2026-01-02 on another CPU, {threads}; ", False),
+        (("train.checkpoint_minutes=9", "data.root={moved}"), Finished.lose_checkpoint, KEPT, False),
+        (("protocol.quantise=true",), lambda _: None, rf"{QUANTISED}measured again", False),
+        (("protocol.quantise=true",), Finished.lose_checkpoint, f"{QUANTISED}its checkpoint is gone: running again",
+         True),
+        ((), Finished.of_older_config,
+         r"the training is another (train.iterations 4 instead of 1000): running again", True),
+        ((), lambda run: run.change(data_hash="0" * 64), "the scene's data has changed: running again", False),
     ],
-    ids=["measured", "no checkpoint", "training", "data"],
+    ids=["kept", "elsewhere", "moved", "measured", "no checkpoint", "training", "data"],
+    indirect=["trains"],
 )  # fmt: skip
-def test_what_differs_is_named(again, words: list[str], change, reason: str, trains: bool) -> None:
-    """Catches a run that is done again for no reason that is said, and a training of hours announced as a measurement;
-    `again` refuses a step of training unless the run trains."""
-    record, output = again(*words, change=lambda folder: change(again.first, folder), trains=trains)
-    assert reason in output
-    assert record.protocol["quantise"] is bool(words)
+@pytest.mark.usefixtures("trains")
+def test_what_differs_is_named_and_nothing_else_is_done(
+    words: tuple[str, ...], change: Callable[[Finished], None], reason: str, run: Finished, tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a training of hours that is announced as a measurement, repeated because data were moved, or done for no
+    reason that is said, and a stranger who takes a kept record's seconds for his own machine's."""
+    (tmp_path / "moved").symlink_to(run.data)
+    change(run)
+    record = run.again(*(word.format(moved=tmp_path / "moved") for word in words))
+    threads = run.first.provenance.machine.rpartition(", ")[2]
+    output, parts = "".join(capfd.readouterr()), reason.format(threads=threads).split(".*")
+    assert all(part in output for part in parts), output
+    assert (record.metrics == run.first.metrics) == (record.protocol["quantise"] is False)
+    assert record.protocol["quantise"] is ("protocol.quantise=true" in words)
+    assert not reason.startswith(KEPT) or record == run.first
 
 
-def test_weights_that_come_are_measured_from_the_checkpoint(again, monkeypatch) -> None:
-    """Catches a training that LPIPS weights cost, and a column that stays empty although they are there."""
-    assert again.first.metrics["lpips_vgg"] is None
-    weights(monkeypatch, here=True)
-    record, output = again()
-    assert "it has no LPIPS (vgg), whose weights are here now: measured again" in output
-    assert record.metrics["lpips_vgg"] == 0.25
-    assert record.metrics["psnr"] == again.first.metrics["psnr"]
+@pytest.mark.usefixtures("trains")
+def test_a_release_trains_nothing_again(run: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a version in the name of a run, in its hash or in its checkpoint, which would cost every training."""
+    monkeypatch.setattr(provenance, "__version__", "9.9.9")
+    assert run.again() == run.first
+    record = run.again("protocol.quantise=true")
+    assert record.status == "ok"
+    assert record.provenance.versions["gsbench"] == "9.9.9"
 
 
-def test_weights_that_come_after_the_checkpoint_went_cost_nothing(again, monkeypatch) -> None:
-    """Catches a training repeated for an LPIPS column: a record without its checkpoint is kept as it is."""
-    weights(monkeypatch, here=True)
-    record, output = again("protocol.lpips_vgg=weights.pth", change=no_checkpoint)
-    assert "whose weights are here now, but its checkpoint is gone: kept without" in output
-    assert record == again.first
-
-
-def test_weights_that_go_take_nothing_with_them(again, monkeypatch) -> None:
-    """Catches LPIPS that is lost, or a training repeated, because the weights are no longer here or not named."""
-    weights(monkeypatch, here=True)
-    measured, _ = again("protocol.lpips_vgg=weights.pth")
-    weights(monkeypatch, here=False)
-    record, output = again(change=no_checkpoint)
-    assert record == measured
-    assert record.metrics["lpips_vgg"] == 0.25
-    assert "finished before, kept" in output
-
-
-def test_weights_that_are_named_and_missing_lose_no_record(again, tmp_path: Path) -> None:
-    """Catches a finished record lost to a path that is wrong: it is refused, and comes back with the right one."""
-    refused, _ = again(f"protocol.lpips_vgg={tmp_path / 'gone.pth'}")
+@pytest.mark.usefixtures("trains")
+def test_weights_that_come_and_go_cost_no_training(
+    run: Finished, weights: set[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a training that LPIPS weights cost, a column that stays empty although they are there, one that is lost
+    as they go, and a finished record lost to a path that is wrong."""
+    assert run.first.metrics is not None
+    assert run.first.metrics["lpips_vgg"] is None
+    weights.add("vgg")
+    measured = run.again("protocol.lpips_vgg=weights.pth")
+    assert "it has no LPIPS (vgg), whose weights are here now: measured again" in capfd.readouterr().err
+    assert measured.metrics == run.first.metrics | {"lpips_vgg": 0.25}
+    weights.clear()
+    refused = run.again(f"protocol.lpips_vgg={tmp_path / 'gone.pth'}")
     assert refused.status == "failed"
-    assert "kept in record.stale.json" in str(files.read(again.folder / files.FILE_NAME).reason)
-    assert again()[0] == again.first
+    assert "kept in record.stale.json" in str(files.read(run.folder / files.FILE_NAME).reason)
+    run.lose_checkpoint()
+    assert run.again() == measured
+
+    run.change()  # without LPIPS again, and without a checkpoint to measure it
+    weights.add("vgg")
+    assert run.again("protocol.lpips_vgg=weights.pth") == run.first
+    assert "whose weights are here now, but its checkpoint is gone: kept without" in capfd.readouterr().err
+
+
+def test_weights_that_are_named_must_exist(tmp_path: Path) -> None:
+    """Catches a file that is named and missing, in whose place another is loaded."""
     with pytest.raises(InputError):
         perceptual.load("vgg", tmp_path / "gone.pth")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_run import gsbench, overrides, write_moving_square
+from tiny_run import overrides, run_here
 
 import gsbench as package
 from gsbench.errors import InputError
@@ -17,13 +17,9 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run of 7DGS with AGR."""
-    root = tmp_path_factory.mktemp("run")
-    done = gsbench(*overrides(write_moving_square(root / "data"), root / "r", "model=7dgs", "train.iterations=20"))
-    assert done.returncode == 0, done.stderr
-    (path,) = record.find(root)
-    return path.parent
+    return run_here(*overrides(square, tmp_path_factory.mktemp("r"), "model=7dgs", "train.iterations=20"))[1]
 
 
 def test_the_loaded_model_renders_what_was_measured(folder: Path) -> None:

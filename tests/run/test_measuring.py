@@ -1,10 +1,15 @@
-"""What a finished training is measured by: PSNR at the iteration that was best on val, and at the last one."""
+"""What a finished training is measured by, PSNR at its best iteration on val too, and the line that it ends with."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tiny_run import overrides, run_here, write_moving_square
+from report.make_golden import make
+from tiny_run import overrides, run_here
 
+from gsbench.measure.curve import Point
+from gsbench.measure.record import Stop
+from gsbench.run.execution import summary
 from gsbench.scenes import View
 from gsbench.train.loop import Trainer
 
@@ -12,27 +17,44 @@ from gsbench.train.loop import Trainer
 SCRIPTED = {10: (20.0, 30.0), 20: (24.0, 31.0), 30: (22.0, 33.0)}
 
 
-@pytest.mark.parametrize(
-    ("split", "on_val", "on_test"), [("test", 31.0, 33.0), ("val", None, 24.0)], ids=["of test", "of val"]
-)
+@pytest.mark.parametrize(("split", "on_val", "on_test"), [("test", 31.0, 33.0), ("val", None, 24.0)])
 def test_the_best_iteration_is_chosen_on_val(
-    split: str, on_val: float | None, on_test: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    split: str, on_val: float | None, on_test: float, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches PSNR on val in place of that on test, the last iteration or the best on test in place of the best on val,
     and a number where results are measured on val themselves."""
 
     def psnr(trainer: Trainer, views: list[View]) -> float:
-        names = {view.name.split("/")[0] for view in views}
         at = min(trainer.step + 1, max(SCRIPTED))
-        return {"val": SCRIPTED[at][0], "test": SCRIPTED[at][1], "train": 40.0}[names.pop()]
+        return {"val": SCRIPTED[at][0], "test": SCRIPTED[at][1], "train": 40.0}[views[0].name.split("/")[0]]
 
     monkeypatch.setattr(Trainer, "psnr", psnr)
-    data = write_moving_square(tmp_path / "data")
-    record, _ = run_here(*overrides(data, tmp_path / "results", "model=3dgs", f"scene.eval_split={split}",
-                                    "train.curve_points=3", "protocol.best_on_test=true"))  # fmt: skip
+    words = ("model=3dgs", f"scene.eval_split={split}", "train.curve_points=3", "protocol.best_on_test=true")
+    record, _ = run_here(*overrides(square, tmp_path, *words))
     assert record.metrics is not None
     assert [point.psnr_val for point in record.curve] == [20.0, 24.0, 22.0]
     assert record.metrics["psnr_best_on_val"] == on_val
     assert record.metrics["psnr_best_on_test"] == on_test
     assert ("psnr_best_on_val" in record.missing) == (on_val is None)
     assert record.metrics["psnr_train"] == 40.0
+
+
+@pytest.mark.parametrize(
+    ("last", "sentence"),
+    [(24.5, "PSNR on val was 0.50 dB higher at iteration 600: a shorter training may be better"), (24.95, None),
+     (25.2, None), (None, None)],
+)  # fmt: skip
+def test_a_training_that_was_better_earlier_says_so(last: float | None, sentence: str | None) -> None:
+    """Catches a training that overfits in silence, and one that is called too long for less than seeds differ by."""
+    record = replace(make(), curve=[Point(300, 1.0, 24.0), Point(600, 2.0, 25.0), Point(900, 3.0, last)])
+    assert (sentence or "PSNR") in summary(record)
+    for silent in (replace(record, stop=Stop(iteration=900, kept=600)), replace(record, curve=[]), make()):
+        assert "higher" not in summary(silent)
+    assert sentence or "higher" not in summary(record)
+
+
+def test_views_at_the_cap_are_named() -> None:
+    """Catches a PSNR that nobody can tell from one without a view that is rendered exactly."""
+    exact = summary(replace(make(), exact=["test/r_3"]))
+    assert ". PSNR of test/r_3 is infinite or nearly so and counts as 100 dB" in exact
+    assert "counts as" not in summary(make())

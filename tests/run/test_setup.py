@@ -4,16 +4,14 @@ import hashlib
 from pathlib import Path
 
 import cv2
-import hydra
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from scenes.test_technicolor import COUNT, HEADER, damage, row
 from scenes.tiny_scene import edit, write_tiny
-from tiny_run import overrides, run_here, write_moving_square
+from tiny_run import overrides, run_here, spec_of
 
-from gsbench.config import CONF, Config, register_schema
+from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
 from gsbench.run.setup import load_scene, scene_folder
@@ -23,10 +21,7 @@ from gsbench.scenes.technicolor import CAMERAS
 
 def config(root: Path, scene: str) -> Config:
     """The config of `python -m gsbench +exp=pbr scene=SCENE data.root=ROOT`."""
-    register_schema()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = hydra.compose("config", ["+exp=pbr", f"scene={scene}", f"data.root={root}"])
-    return OmegaConf.to_object(composed)  # type: ignore[return-value]
+    return spec_of(["+exp=pbr", f"scene={scene}", f"data.root={root}"]).config
 
 
 @pytest.mark.parametrize(
@@ -54,19 +49,14 @@ def test_the_scene_has_the_name_of_the_paper_or_of_the_release(scene: str, folde
 )
 def test_a_missing_scene_is_named_as_in_paper_and_release(scene: str, names: str, tried: str, tmp_path: Path) -> None:
     """Catches a message that sends a reader of the paper, or of the release, after a folder that is not there."""
-    with pytest.raises(InputError) as caught:
+    places = tried.format(tmp_path)
+    with pytest.raises(InputError, match=rf"a folder {names} with a scene.*looked for {places};.*gaozhongpai\.github"):
         scene_folder(config(tmp_path, scene))
-    message = str(caught.value)
-    assert f"expected a folder {names} with a scene" in message
-    assert f"looked for {tried.format(tmp_path)};" in message
-    assert "gaozhongpai.github.io/7dgs" in message
-    assert "\n" not in message
 
 
-def test_the_record_has_the_protocol(tmp_path: Path) -> None:
+def test_the_record_has_the_protocol(square: Path, tmp_path: Path) -> None:
     """Catches images of another filter under a record that is silent about it, and a best on test that is left out."""
-    data = write_moving_square(tmp_path / "data")
-    words = [*overrides(data, tmp_path / "r", "model=dgs", "train.iterations=2"), "protocol.pictures=0"]
+    words = overrides(square, tmp_path, "model=dgs", "train.iterations=2", "protocol.pictures=0")
     record, folder = run_here(*words, "protocol=dgs2026")
     assert record.status == "ok", record.reason
     assert record.protocol["resize"] == "pillow"
@@ -112,10 +102,9 @@ def write_trained(path: Path, count: int = 8, away: int = 0) -> TrainedGaussians
 
 
 @pytest.fixture
-def words(tmp_path: Path) -> list[str]:
+def words(square: Path, tmp_path: Path) -> list[str]:
     """The overrides of a run of one step that starts from a.ply."""
-    data = write_moving_square(tmp_path / "data")
-    return [*overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
+    return [*overrides(square, tmp_path / "r", "model=3dgs", "train.iterations=1"), f"+init.ply={tmp_path}/a.ply"]
 
 
 @pytest.mark.parametrize("model", ["3dgs", "7dgs"])
@@ -137,29 +126,28 @@ def test_a_run_starts_from_a_ply(model: str, words: list[str], tmp_path: Path) -
 @pytest.mark.parametrize(
     ("count", "away", "more", "reason"),
     [
-        (3, 0, [], "at least 4 Gaussians"),
-        (8, 0, ["+init.ply_sha256=" + 64 * "0"], "SHA-256"),
-        (8, 8, [], "no training camera sees one of the 8"),
-        (8, 0, ["+init.ply_sha256=0", "init.ply=null"], "init.ply_sha256"),
+        (3, 0, "", "at least 4 Gaussians"),
+        (8, 0, f"+init.ply_sha256={64 * '0'}", "SHA-256"),
+        (8, 8, "", "no training camera sees one of the 8"),
+        (8, 0, "+init.ply_sha256=0 init.ply=null", "init.ply_sha256"),
+        (8, 6, "", None),
+        (8, 3, "", None),
     ],
 )
 def test_a_ply_that_cannot_be_the_start_is_refused(
-    count: int, away: int, more: list[str], reason: str, words: list[str], tmp_path: Path
-) -> None:
-    """Catches a refusal without a record, a hash that nothing is compared with, and a training of black images."""
+    count: int, away: int, more: str, reason: str | None, words: list[str], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Catches a refusal without a record, a hash that nothing is compared with, a training of black images, and one of
+    a few Gaussians in sight without a line."""
     write_trained(tmp_path / "a.ply", count, away)
-    record, _ = run_here(*words, *more)
-    assert record.status == "failed"
-    assert reason in (record.reason or "")
+    record, _ = run_here(*words, *more.split())
+    assert record.status == ("failed" if reason else "ok")
+    assert (reason or "") in (record.reason or "")
+    assert ("the training cameras see 25% of the Gaussians" in capsys.readouterr().err) == (away == 6)
 
 
-def test_few_gaussians_in_sight_are_named_and_an_endless_file_is_refused(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches a training of a few Gaussians without a line, and a file that is read before the run has a name."""
-    for away, is_named in ((6, True), (3, False)):
-        write_trained(tmp_path / "a.ply", 8, away)
-        assert run_here(*words)[0].status == "ok"
-        assert ("the training cameras see 25% of the Gaussians" in capsys.readouterr().err) == is_named
+def test_an_endless_file_is_refused(words: list[str]) -> None:
+    """Catches a file that is read before the run has a name."""
     with pytest.raises(InputError, match=r"init\.ply='/dev/zero': expected a file, found a device"):
         run_here(*words[:-1], "+init.ply=/dev/zero")
