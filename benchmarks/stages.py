@@ -10,8 +10,9 @@ from benchmarks.scene import trained
 from benchmarks.timing import Row
 from benchmarks.training import adam_of, one_view, training_step
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, HIDDEN, TRANSMITTANCE_MIN
+from gsbench.kernels.operation import Operation
 from gsbench.kernels.raster import Splats, Viewport, bin_tiles, flag_values
-from gsbench.kernels.tape import Differentiable, Tape
+from gsbench.kernels.tape import Tape
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import rasterize_slice
 from gsbench.raster import reference
@@ -27,7 +28,7 @@ STAGES = {"refine": "AGR", "slice_triangular": "slice", "slice_rotated": "slice"
 class Call:
     """An operation of a step, with the arguments of its forward and its last backward kernel."""
 
-    def __init__(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> None:
+    def __init__(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> None:
         """Keep the forward call; the tape makes it."""
         self.operation, self.tensors, self.numbers = operation, tensors, numbers
         self.name, self.adds = operation.name, operation.adds
@@ -82,7 +83,7 @@ class Recording(Tape):
         super().__init__()
         self.calls: dict[str, Call] = {}
 
-    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
         call = self.calls[operation.name] = Call(operation, tensors, numbers)
         return super().record(call, tensors, numbers)
 

@@ -1,4 +1,7 @@
-"""Update parameters by Adam in place: some Gaussians of one parameter, or several whole parameters in one call."""
+"""Update parameters by Adam in place, several of them in one call, and check that gradients are finite.
+
+A small model has about twelve parameters, and the overhead of a torch call costs as much as the update of one.
+"""
 
 from collections.abc import Sequence
 
@@ -14,49 +17,30 @@ from gsbench.kernels.tensors import check_number, check_tensor
 
 @torch.no_grad()
 def adam(
-    parameter: Tensor,  # [N, ...]
+    parameter: Tensor,  # [N, ...], updated
     gradient: Tensor,  # [N, ...]
-    mean: Tensor,  # [N, ...]
-    square: Tensor,  # [N, ...]
-    drawn: Tensor,  # [N] bool
-    rate: float,
-    betas: list[float],
-    eps: float,
-    step: Tensor,  # []
+    mean: Tensor,  # [N, ...] the running mean of the gradient, updated
+    square: Tensor,  # [N, ...] the running mean of the squared gradient, updated
+    drawn: Tensor,  # [N] bool: the rows to update
+    rate: float,  # the learning rate
+    betas: list[float],  # the decay rates of the two running means
+    eps: float,  # added to the square root of the mean square
+    step: Tensor,  # [] the number of this update, from 1
 ) -> None:
     """Do one Adam update (Kingma & Ba 2015, algorithm 1) of those rows (Gaussians) of a parameter that `drawn` selects.
-
-    Args:
-        parameter: the tensor to update.
-        gradient: the gradient of the loss with respect to the parameter.
-        mean: the running mean of the gradient, updated too.
-        square: the running mean of the squared gradient, updated too.
-        drawn: the rows to update.
-        rate: the learning rate.
-        betas: the decay rates of the two running means.
-        eps: added to the square root of the mean square.
-        step: the number of this update, from 1.
 
     Raises:
         InputError: tensors are not contiguous float32 on one device, or their shapes do not match.
     """
-    named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square}
+    named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square, "drawn": drawn, "step": step}
     for name, x in named.items():
-        check_tensor(x, f"adam: {name}", (torch.float32,))
-        if x.shape != parameter.shape:
-            raise InputError(f"adam: expected {name} of shape {list(parameter.shape)}, got {list(x.shape)}")
-        if x.device != parameter.device:
-            raise InputError(f"adam: expected {name} on {parameter.device}, got it on {x.device}")
-    if not parameter.dim():
-        raise InputError("adam: expected parameter of at least one dimension, got none")
-    check_tensor(drawn, "adam: drawn", (torch.bool,))
-    if drawn.shape != parameter.shape[:1] or drawn.device != parameter.device:
-        raise InputError(f"adam: expected drawn of shape {list(parameter.shape[:1])} on {parameter.device}, got "
-                         f"{list(drawn.shape)} on {drawn.device}")  # fmt: skip
-    check_tensor(step, "adam: step", (torch.float32,))
-    if step.shape != () or step.device != parameter.device:
-        raise InputError(f"adam: expected step of shape [] on {parameter.device}, got {list(step.shape)} on "
-                         f"{step.device}")  # fmt: skip
+        check_tensor(x, f"adam: {name}", (torch.bool if name == "drawn" else torch.float32,))
+        if not parameter.dim():
+            raise InputError("adam: expected parameter of at least one dimension, got none")
+        shape = {"drawn": parameter.shape[:1], "step": torch.Size()}.get(name, parameter.shape)
+        if x.shape != shape or x.device != parameter.device:
+            raise InputError(f"adam: expected {name} of shape {list(shape)} on {parameter.device}, got "
+                             f"{list(x.shape)} on {x.device}")  # fmt: skip
     if not isinstance(betas, list | tuple) or len(betas) != 2:
         raise InputError(f"adam: expected two betas, got {betas!r:.80}")
     for name, number in (("rate", rate), ("eps", eps), ("betas", betas[0]), ("betas", betas[1])):
@@ -65,8 +49,8 @@ def adam(
         raise InputError("adam: expected parameter, mean and square row by row in memory: call .contiguous()")
     if not len(parameter):
         return
-    rows, of = in_rows([gradient, drawn])
-    slots = {"N": len(parameter), "width": parameter[0].numel(), "drawn": address(of), "gradient": address(rows),
+    gradient, drawn = in_rows([gradient, drawn])
+    slots = {"N": len(parameter), "width": parameter[0].numel(), "drawn": address(drawn), "gradient": address(gradient),
              "rate": rate, "beta1": betas[0], "beta2": betas[1], "eps": eps, "step": address(step),
              "out.parameter": address(parameter), "out.mean": address(mean), "out.square": address(square)}  # fmt: skip
     library_of(parameter.device.type).call("adam", slots, parameter)
@@ -74,29 +58,16 @@ def adam(
 
 @torch.no_grad()
 def adam_all(
-    parameters: Sequence[Tensor],
+    parameters: Sequence[Tensor],  # of any shape, updated
     gradients: Sequence[Tensor],
-    means: Sequence[Tensor],
-    squares: Sequence[Tensor],
-    steps: Sequence[Tensor],  # of []
-    rates: Sequence[float],
-    betas: list[float],
-    eps: float,
+    means: Sequence[Tensor],  # the running means of the gradients, updated
+    squares: Sequence[Tensor],  # the running means of the squared gradients, updated
+    steps: Sequence[Tensor],  # of []: the number of this update for each parameter, from 1
+    rates: Sequence[float],  # the learning rates
+    betas: list[float],  # the decay rates of the two running means
+    eps: float,  # added to the square root of the mean square
 ) -> None:
     """Update several parameters on the CPU by Adam, each with its own learning rate, as `torch.optim.Adam` does.
-
-    All parameters are updated in one call: a small model has about twelve, and the overhead of a torch call costs as
-    much as the update of one parameter.
-
-    Args:
-        parameters: the tensors to update, of any shape.
-        gradients: the gradients of the loss with respect to the parameters.
-        means: the running means of the gradients, updated too.
-        squares: the running means of the squared gradients, updated too.
-        steps: the number of this update for each parameter, from 1.
-        rates: the learning rates.
-        betas: the decay rates of the two running means.
-        eps: added to the square root of the mean square.
 
     Raises:
         InputError: tensors are not contiguous float32 on the CPU, or their shapes do not match.
@@ -123,3 +94,18 @@ def adam_all(
             "out.squares": addresses(squares[part]),
         }
         library_of("cpu").call("adam_all", slots, parameters[0])
+
+
+@torch.no_grad()
+def are_finite(arrays: Sequence[Tensor]) -> bool:
+    """Return whether all numbers of some float32 arrays on the CPU, of any shapes, are finite."""
+    rows = in_rows(list(arrays))
+    for first in range(0, len(rows), MAX_ADAM):
+        part = rows[first : first + MAX_ADAM]
+        flags = part[0].new_zeros(1, dtype=torch.int64)
+        slots = {"count": len(part), "numbers": tuple([x.numel() for x in part]), "arrays": addresses(part),
+                 "out.flags": flags.data_ptr()}  # fmt: skip
+        library_of("cpu").call("flag_arrays", slots, flags)
+        if flags.item():
+            return False
+    return True

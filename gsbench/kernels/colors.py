@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import MAX_WAVES
-from gsbench.kernels.operation import Operation
+from gsbench.kernels.operation import Gradient, Input, Operation, Output
 
 
 def _bases(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:

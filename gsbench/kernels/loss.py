@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.kernels.operation import Operation, Tensors, address, in_rows
+from gsbench.kernels.operation import Gradient, Input, Operation, Output, Tensors, address, in_rows
 from gsbench.kernels.tensors import check_number, check_tensor
 
 _TARGET = (torch.float32, torch.uint8)
@@ -48,14 +47,15 @@ class _Similarity(Operation):
         library.call(self.name, slots, image)
         return [parts.sum() if parts.shape[0] > 1 else parts[0], gradient], slots
 
-    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
         return {}
 
     def backward(
         self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
         wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:  # fmt: skip
-        return [None if upstream[0] is None else (upstream[0] * outputs[1]).view_as(tensors[0]), None]
+        by_loss = upstream[0]
+        return [None if by_loss is None else (by_loss * outputs[1]).view_as(tensors[0]), None]
 
 
 _similarity = _Similarity()

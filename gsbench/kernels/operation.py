@@ -5,7 +5,10 @@ An operation is a pair of compiled kernels, forward and backward. An active tape
 and what looks at each operator (torch.compile, dispatch modes) sees the registered `torch.ops.gsbench.NAME`.
 """
 
+import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
 from types import NoneType
 from typing import Any
 
@@ -15,21 +18,68 @@ from torch.autograd.function import once_differentiable
 from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from gsbench.errors import InputError
-from gsbench.kernels import tape
-from gsbench.kernels.fields import Gradient, Input, Output, sizes_of
 from gsbench.kernels.library import Slots, allocate, library_of
 from gsbench.kernels.tensors import check_tensor
 
 Tensors = list[Tensor]  # an input that is left out is an empty 1D tensor
 Sizes = dict[str, int]
+Shape = tuple[int | str, ...]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
-_STARTS_AT_ZERO = (Gradient.ADDED, Gradient.SUMMED, Gradient.ON_REQUEST)
 _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # accepted Python types
+_NOTHING = torch.Size([0])
+_MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})  # gradients of outputs of which a null address means zero
 
-
+active = threading.local()  # active.tape records the calls of this thread, if it is there and not None
 EVERY_ROW = 2**62  # stands for all rows
 MOST_KNOWN = 64  # the most calls whose shapes are cached; densification makes new shapes all the time
+
+
+class Gradient(Enum):
+    """How a backward kernel returns the gradient of an input: by overwriting memory, by adding to it, or not at all."""
+
+    WRITTEN = auto()  # overwrites every entry
+    ADDED = auto()  # adds to every entry, so that all views of a batch share one gradient
+    SUMMED = auto()  # a sum over all Gaussians: each GPU block adds its part, to memory that is zero at first
+    ON_REQUEST = auto()  # as SUMMED, but computed only if the caller needs it
+    NONE = auto()  # no gradient is computed; inputs may require one
+    REFUSED = auto()  # there is no gradient; an input that requires one is an error
+
+
+_STARTS_AT_ZERO = (Gradient.ADDED, Gradient.SUMMED, Gradient.ON_REQUEST)
+
+
+@dataclass(frozen=True)
+class Input:
+    """A tensor that an operation (a pair of forward and backward kernels) reads.
+
+    Args:
+        shape: dimensions such as "N 3" or "C height width D". A dimension is a number or a name; equal names in one
+            operation mean equal sizes. A first dimension that may be missing starts with a question mark.
+        gradient: how the backward kernel returns the gradient.
+        dtypes: the accepted types: float32, or int32 for indices.
+        left_out_with: makes the input optional; inputs with the same value here are left out together.
+        is_list: the tensor has one dimension, whose size changes from call to call and is used for no other tensor.
+    """
+
+    shape: str
+    gradient: Gradient = Gradient.WRITTEN
+    dtypes: tuple[torch.dtype, ...] = (torch.float32,)
+    left_out_with: str | None = None
+    is_list: bool = False
+
+
+@dataclass(frozen=True)
+class Output:
+    """A tensor that an operation returns: its shape as in `Input`, and whether it has a gradient."""
+
+    shape: str
+    gradient: bool = True
+
+
+def sizes_of(shape: str) -> Shape:
+    """Split a shape such as "N 3" into its dimensions; numbers become integers."""
+    return tuple(int(size) if size.isdigit() else size for size in shape.split())
 
 
 class Operation:
@@ -42,6 +92,7 @@ class Operation:
         inputs: dict[str, Input],
         outputs: dict[str, Output],
         numbers: dict[str, type] | None = None,
+        defaults: dict[str, Any] | None = None,
         derive: Callable[[dict[str, Tensor], Slots], Sizes] | None = None,
         scratch: str | None = None,
         memory: str = "results",
@@ -53,20 +104,23 @@ class Operation:
             inputs: the input tensors, by the argument names of the kernel.
             outputs: the output tensors, by the argument names of the kernel.
             numbers: the type of each argument that is not a tensor; an int may also be a dimension of a tensor.
-            derive: computes dimensions that are not dimensions of an input, from the tensors and numbers of a call.
+            defaults: the values of numbers that a call may leave out.
+            derive: computes dimensions that are not dimensions of an input, from the present tensors and the numbers.
             scratch: the shape of memory, initialised to zero, that the backward kernel needs on a GPU.
             memory: the name of the outputs in the error message if memory does not suffice.
         """
         self.name = name
         self.inputs, self.outputs = inputs, outputs
-        self.numbers = numbers or {}
-        declared = list(inputs.values())
-        self.adds = {i for i, x in enumerate(declared) if x.gradient is Gradient.ADDED}
-        self._differentiable = [x.gradient not in (Gradient.NONE, Gradient.REFUSED) for x in declared]
+        self.numbers, self.defaults = numbers or {}, defaults or {}
+        kinds = [x.gradient for x in inputs.values()]
+        self.adds = {i for i, kind in enumerate(kinds) if kind is Gradient.ADDED}
+        self._differentiable = [kind not in (Gradient.NONE, Gradient.REFUSED) for kind in kinds]
+        self._on_request = {i for i, kind in enumerate(kinds) if kind is Gradient.ON_REQUEST}
+        self._zeroed = {i for i, kind in enumerate(kinds) if kind in _STARTS_AT_ZERO}
         self._carries = [x.gradient for x in outputs.values()]
-        self._optional = {i for i, x in enumerate(declared) if x.left_out_with}
-        self._shapes = [sizes_of(x.shape) for x in declared]
-        self._lists = {i: x.shape for i, x in enumerate(declared) if x.is_list}  # size names of inputs with is_list
+        self._optional = {i for i, x in enumerate(inputs.values()) if x.left_out_with}
+        self._shapes = [sizes_of(x.shape) for x in inputs.values()]
+        self._lists = {i: x.shape for i, x in enumerate(inputs.values()) if x.is_list}  # names of their sizes
         self._derive = derive
         self._scratch = sizes_of(scratch) if scratch is not None else None
         self._memory = memory
@@ -75,8 +129,6 @@ class Operation:
         self._grad_out = [f"given.{key}" for key in outputs]
         self._needed = {f"given.{key}" for key, x in outputs.items() if x.gradient} - _MAY_BE_NULL
         self._grad = [f"grad.{key}" if has else None for key, has in zip(inputs, self._differentiable, strict=True)]
-        self._on_request = {i for i, x in enumerate(declared) if x.gradient is Gradient.ON_REQUEST}
-        self._zeroed = {i for i, x in enumerate(declared) if x.gradient in _STARTS_AT_ZERO}
         self._kinds: list[tuple[type, ...]] = [
             (Tensor, NoneType) if i in self._optional else (Tensor,) for i in range(len(inputs))
         ]
@@ -85,25 +137,36 @@ class Operation:
         self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
         self._traced = _register(self)
 
-    def __call__(self, *arguments: Any) -> Tensors:
-        """Run the kernel with tensors (None for an optional one), then numbers, in the order of the declaration.
+    def __call__(self, *arguments: Any, **by_name: Any) -> Tensors:
+        """Run the kernel with tensors and then numbers, in the order of the declaration or by name.
+
+        An optional tensor may be left out or None, and so may a number that has a default.
 
         Raises:
             InputError: shapes do not match, tensors are not float32 on one device, or an input requires a gradient that
                 the operation does not compute.
         """
+        if len(arguments) < len(self._kinds):
+            arguments = self._in_order(arguments, by_name)
         tensors, numbers = self.split(arguments)
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):
             if declared.gradient is Gradient.REFUSED and x.requires_grad:
                 raise InputError(f"{self.name} has no gradient by {key}: detach it")
-        recording = tape.current()
-        if recording is not None:
+        if (recording := getattr(active, "tape", None)) is not None:
             return recording.record(self, tensors, numbers)
         differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
         if torch.compiler.is_compiling() or (differentiated and _get_current_dispatch_mode() is not None):
             traced: Tensors = self._traced(tensors, *numbers)
             return traced
-        return list(_Eager.apply(self, numbers, *tensors)) if differentiated else self.forward(tensors, numbers)
+        return list(_Eager.apply(self, numbers, *tensors)) if differentiated else self.run(tensors, numbers)[0]
+
+    def _in_order(self, arguments: tuple[Any, ...], by_name: dict[str, Any]) -> tuple[Any, ...]:
+        """Return the arguments of a call in the order of the declaration; None has become the default."""
+        names = [*self.inputs, *self.numbers]
+        known = dict(zip(names, arguments, strict=False)) | by_name
+        if unknown := sorted(known.keys() - names):
+            raise InputError(f"{self.name}: expected {', '.join(names)}, got {unknown[0]} too")
+        return tuple([self.defaults.get(name) if known.get(name) is None else known[name] for name in names])
 
     def split(self, arguments: Sequence[Any]) -> tuple[Tensors, tuple[Any, ...]]:
         """Split the arguments of a call into tensors and numbers."""
@@ -123,36 +186,28 @@ class Operation:
 
     # ---- forward and backward
 
-    def forward(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """Run the forward kernel and return the outputs, without recording the call for the backward pass."""
-        return self.run(tensors, numbers)[0]
-
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
-        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs."""
-        slots, like, outputs = self._slots_of(tensors, numbers), tensors[0], []
+        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs.
+
+        The call is not recorded for the backward pass.
+        """
+        slots, like, outputs = self.prepare(tensors, numbers), tensors[0], []
         for key, shape in self._out:
-            outputs.append(allocate(self._memory, like, tuple([slots[x] if isinstance(x, str) else x for x in shape])))
+            outputs.append(allocate(self._memory, like, _filled(shape, slots)))
             slots[key] = outputs[-1].data_ptr()
         library_of(like.device.type).call(self.name, slots, like)
         return outputs, slots
 
-    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        """Return the kernel arguments of an earlier `run` again, for `backward`.
-
-        Autograd saves only the tensors: their addresses, which the kernel needs, are looked up anew.
-        """
-        slots = self._slots_of(tensors, numbers)
-        slots.update({key: x.data_ptr() for (key, _), x in zip(self._out, outputs, strict=True)})
-        return slots
-
-    def _slots_of(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
-        """Return the kernel arguments of a call by name: sizes, numbers and addresses of the inputs.
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
+        """Return the kernel arguments of a call by name: sizes, numbers, and addresses of inputs and `outputs`.
 
         The entry `rows` holds the tensors, so that their memory is not freed.
         """
         slots = self.match(tensors, numbers).copy()
         rows = slots["rows"] = in_rows(tensors)
         for key, x in zip(self.inputs, rows, strict=True):
+            slots[key] = x.data_ptr()
+        for (key, _), x in zip(self._out, outputs, strict=False):
             slots[key] = x.data_ptr()
         return slots
 
@@ -171,7 +226,7 @@ class Operation:
             tensors: the inputs of `run`.
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
-            upstream: the gradient of each output; None for zero.
+            upstream: the gradient of the loss by each output; None for zero.
             wanted: whether the caller needs the gradient of each input; a gradient that is declared ON_REQUEST is
                 computed only if the caller needs it.
             sums: for the index of each input whose gradient is declared ADDED, the tensor to which this gradient is
@@ -204,8 +259,7 @@ class Operation:
             slots[key] = gradient.data_ptr()
         if self._scratch is not None:
             if library.needs_scratch:
-                shape = tuple([slots[x] if isinstance(x, str) else x for x in self._scratch])
-                kept.append(allocate("scratch space of gradients", like, shape).zero_())
+                kept.append(allocate("scratch space of gradients", like, _filled(self._scratch, slots)).zero_())
                 slots["grad.scratch"] = address(kept[-1])
             else:
                 slots["grad.scratch"] = 0
@@ -234,29 +288,26 @@ class Operation:
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
-        there = [not self._is_left_out(i, x) for i, x in enumerate(tensors)]
+        listed = list(zip(self.inputs.items(), self._shapes, tensors, strict=True))
+        present = [part for i, part in enumerate(listed) if not self._is_left_out(i, part[2])]
+        names = {key for (key, _), _, _ in present}
         for group in {x.left_out_with for x in self.inputs.values()} - {None}:
-            together = {key: is_there for (key, x), is_there in zip(self.inputs.items(), there, strict=True)
-                        if x.left_out_with == group}  # fmt: skip
-            if len(set(together.values())) > 1:  # kernels expect all addresses of a group
+            together = [key for key, x in self.inputs.items() if x.left_out_with == group]
+            if 0 < len(names.intersection(together)) < len(together):  # kernels expect all addresses of a group
                 raise InputError(f"{self.name}: expected all of {', '.join(together)}, or none of them")
-        for (key, declared), x, is_there in zip(self.inputs.items(), tensors, there, strict=True):
-            if is_there:
-                check_tensor(x, f"{self.name}: {key}", declared.dtypes)
+        for (key, declared), _, x in present:
+            check_tensor(x, f"{self.name}: {key}", declared.dtypes)
         if self._derive is not None:
-            present = {key: x for key, x, is_there in zip(self.inputs, tensors, there, strict=True) if is_there}
-            slots.update(self._derive(present, slots))
+            slots.update(self._derive({key: x for (key, _), _, x in present}, slots))
         device = tensors[0].device
-        for key, shape, x, is_there in zip(self.inputs, self._shapes, tensors, there, strict=True):
-            if not is_there:
-                continue
+        for (key, _), shape, x in present:
             actual, expected = list(x.shape), list(shape)
             if expected and isinstance(first := expected[0], str) and first.startswith("?"):  # it may be left out
                 expected = expected[1:] if len(actual) < len(expected) else [first[1:], *expected[1:]]
-            good = len(actual) == len(expected)
-            for size, actual_size in zip(expected, actual, strict=False):
-                good = good and actual_size == (slots.setdefault(size, actual_size) if isinstance(size, str) else size)
-            if not good:
+            fits = len(actual) == len(expected)
+            for size, length in zip(expected, actual, strict=False):
+                fits = fits and length == (slots.setdefault(size, length) if isinstance(size, str) else size)
+            if not fits:
                 known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
                 raise InputError(f"{self.name}: expected {key} of shape {known}, got {actual}")
             if x.device != device:
@@ -278,8 +329,7 @@ class Operation:
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         """Return uninitialised outputs of the right shapes, for torch.compile."""
         slots = self._match(tensors, numbers)
-        shapes = [[slots[x] if isinstance(x, str) else x for x in shape] for _, shape in self._out]
-        return [tensors[0].new_empty(shape) for shape in shapes]
+        return [tensors[0].new_empty(_filled(shape, slots)) for _, shape in self._out]
 
     def fake_backward(self, tensors: Tensors) -> Tensors:
         """Return uninitialised gradients of the right shapes, for torch.compile."""
@@ -291,7 +341,7 @@ class _Eager(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, operation: Operation, numbers: tuple[Any, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
-        outputs = operation.forward(list(tensors), numbers)
+        outputs, _ = operation.run(list(tensors), numbers)
         ctx.operation, ctx.numbers, ctx.inputs = operation, numbers, len(tensors)
         ctx.save_for_backward(*tensors, *outputs)
         carries = operation.carries_gradient(outputs)
@@ -304,22 +354,16 @@ class _Eager(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Any, ...]:
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
         operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
-        slots = operation.prepare(tensors, ctx.numbers, outputs)
+        slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
         gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
         # Unlike the registered operator, it makes no zeros that nobody asked for.
-        return (
-            None,
-            None,
-            *[
-                (torch.zeros_like(x) if g is None else g) if asked else None
-                for x, g, asked in zip(tensors, gradients, wanted, strict=True)
-            ],
-        )
+        return None, None, *[(torch.zeros_like(x) if g is None else g) if asked else None
+                             for x, g, asked in zip(tensors, gradients, wanted, strict=True)]  # fmt: skip
 
 
-# Output gradients that may be null, which these kernels treat as zero.
-_MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})
-_NOTHING = torch.Size([0])
+def _filled(shape: Shape, slots: Slots) -> tuple[int, ...]:
+    """Return a declared shape with the sizes of a call in the place of their names."""
+    return tuple([slots[x] if isinstance(x, str) else x for x in shape])
 
 
 def address(x: Tensor | None) -> int:
@@ -370,13 +414,15 @@ def _register(operation: Operation) -> Callable[..., Any]:
     schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)
 
     def forward(tensors: Tensors, *values: Any) -> Tensors:
-        return operation.forward(tensors, values)
+        return operation.run(tensors, values)[0]
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
         values, (outputs, upstream, wanted) = rest[:count], rest[count:]
-        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted)
-        dense = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
-        return _apart(dense, upstream)
+        gradients = operation.backward(
+            tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted
+        )
+        filled = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
+        return _apart(filled, upstream)
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
         ctx.tensors = len(inputs[0])
@@ -393,7 +439,7 @@ def _register(operation: Operation) -> Callable[..., Any]:
     forward_op = torch.library.custom_op(f"gsbench::{name}", forward, mutates_args=(), schema=schema)
     backward_op = torch.library.custom_op(
         f"gsbench::{name}_backward", backward, mutates_args=(),
-        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] given, bool[] wanted) -> Tensor[]",
+        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] upstream, bool[] wanted) -> Tensor[]",
     )  # fmt: skip
     forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
     backward_op.register_fake(lambda tensors, *_: operation.fake_backward(tensors))

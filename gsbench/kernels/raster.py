@@ -9,10 +9,9 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels import recording
-from gsbench.kernels.fields import Gradient, Input, Output
 from gsbench.kernels.headers import TILE
 from gsbench.kernels.library import Library, allocate, library_of
-from gsbench.kernels.operation import Operation, address, in_rows
+from gsbench.kernels.operation import Gradient, Input, Operation, Output, address, in_rows
 from gsbench.process.memory import require
 
 TILE_PIXELS = TILE * TILE

@@ -39,7 +39,7 @@ class _Inputs(NamedTuple):
                    None if left_out else intervals, None if left_out else time)  # fmt: skip
 
     def named(self) -> list[tuple[str, Tensor]]:
-        """Return all given tensors in order, each with its name for error messages."""
+        """Return all tensors in order, each with its name for error messages."""
         each = [(name, x if isinstance(x, list) else [x]) for name, x in self._asdict().items() if x is not None]
         return [(name, x) for name, listed in each for x in listed]
 
@@ -60,7 +60,7 @@ class _Inputs(NamedTuple):
         return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
-        """Return the gradients of the original weights, given the gradients of the weights that `layers` returns."""
+        """Return the gradients of the original weights from those of the weights that `layers` returns."""
         read = g["weight_in"].shape[1]
         g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
@@ -92,14 +92,11 @@ class _Refine(Operation):
         return [True] * len(outputs)
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
-        slots = self._slots(tensors, numbers)
+        slots = self.prepare(tensors, numbers)
         values = slots["rows"]
         out = [allocate(self._memory, x, x.shape) for x in values]
         library_of(values[0].device.type).call("refine", slots | {"out.values": addresses(out)}, values[0])
         return out, slots
-
-    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Tensors) -> Slots:
-        return self._slots(tensors, numbers)
 
     def backward(
         self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
@@ -118,10 +115,10 @@ class _Refine(Operation):
         slots |= {"given.values": addresses(dense), "grad.values": addresses(moved), "grad.scratch": address(scratch)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
         library.call("refine_backward", slots, like)
-        of_weights = _Inputs.of(tensors).of_layers(g_weights)
-        return [*moved, *dense[features:], *of_weights, None, None, None, None]
+        of_layers = _Inputs.of(tensors).of_layers(g_weights)
+        return [*moved, *dense[features:], *of_layers, None, None, None, None]
 
-    def _slots(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+    def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
         """Return the kernel arguments by name, and the tensors that must not be freed before the kernels have run."""
         slots = self.match(tensors, numbers).copy()
         inputs = _Inputs.of(tensors)

@@ -5,23 +5,16 @@ kernels. Autograd still differentiates other code: if a tensor with a `grad_fn` 
 gradient on to autograd. So models written in torch also train.
 """
 
-from __future__ import annotations
-
-import threading
 from collections import Counter
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-_in_charge = threading.local()  # each thread has its own
-
-
-def current() -> Tape | None:
-    """Return the tape (list of kernel calls for a backward pass) that is active in this thread, or None."""
-    return getattr(_in_charge, "tape", None)
+from gsbench.kernels.library import Slots
+from gsbench.kernels.operation import Operation, active
 
 
 def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
@@ -32,38 +25,13 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
         sums[key] = gradient
 
 
-class Differentiable(Protocol):
-    """The interface of a function that a tape can record and run backwards, such as a pair of kernels (`Operation`)."""
+class _Call(NamedTuple):
+    """A recorded call of an operation."""
 
-    name: str
-    adds: set[int]  # the indices of inputs whose gradients the backward kernel adds to given memory
-
-    def run(self, tensors: list[Tensor], numbers: Sequence[Any]) -> tuple[list[Tensor], dict[str, Any]]:
-        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs."""
-
-    def differentiable(self, tensors: list[Tensor]) -> list[bool]:
-        """Return for each input whether the operation computes its gradient."""
-
-    def carries_gradient(self, outputs: list[Tensor]) -> list[bool]:
-        """Return for each output whether it has a gradient."""
-
-    def backward(
-        self,
-        tensors: list[Tensor],
-        slots: dict[str, Any],
-        outputs: list[Tensor],
-        upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool],
-        sums: dict[int, Tensor] | None = None,
-    ) -> list[Tensor | None]:
-        """Return the gradients of the inputs, given the gradients of the outputs."""
-
-
-class _Note(NamedTuple):
-    operation: Differentiable
+    operation: Operation
     tensors: list[Tensor]
     wanted: list[bool]
-    slots: dict[str, Any]
+    slots: Slots
     outputs: list[Tensor]
 
 
@@ -72,28 +40,28 @@ class Tape:
 
     def __init__(self) -> None:
         """Create a tape without operations."""
-        self._notes: list[_Note] = []
+        self._calls: list[_Call] = []
 
     def __enter__(self) -> Self:
-        self._outer = current()
-        _in_charge.tape = self
+        self._outer = getattr(active, "tape", None)
+        active.tape = self
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        _in_charge.tape = self._outer
+        active.tape = self._outer
 
-    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
         """Run a kernel, and record the call if an input requires a gradient that the backward kernel computes."""
         outputs, slots = operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
-        differentiable = operation.differentiable(tensors)
-        wanted = [through and x.requires_grad for x, through in zip(tensors, differentiable, strict=True)]
+        has_gradient = operation.differentiable(tensors)
+        wanted = [has and x.requires_grad for x, has in zip(tensors, has_gradient, strict=True)]
         if any(wanted):
-            for x, through in zip(outputs, operation.carries_gradient(outputs), strict=True):
-                if through:
+            for x, has in zip(outputs, operation.carries_gradient(outputs), strict=True):
+                if has:
                     x.requires_grad_()  # so that autograd records what torch computes from this output
-            self._notes.append(_Note(operation, tensors, wanted, slots, outputs))
+            self._calls.append(_Call(operation, tensors, wanted, slots, outputs))
         return outputs
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
@@ -104,64 +72,59 @@ class Tape:
         `seed` is the gradient of the loss itself, by which all gradients are multiplied. The added gradients are
         bitwise the same whether `sums` is empty or not. A tape may run backwards several times, with different seeds.
         """
-        at = _Gradients(self._notes, sources, sums)
-        at.give(loss, seed)
-        for note in reversed(self._notes):
-            at.through(note)
-        at.finish()
+        gradients = _Gradients(self._calls, sources, sums)
+        gradients.propagate(loss, seed)
+        for call in reversed(self._calls):
+            gradients.run_backward(call)
+        for key in gradients.sources:
+            if (gradient := gradients.by_id.get(key)) is not None:
+                add_to(sums, key, gradient)
 
 
 class _Gradients:
     """The gradients of tensors that one backward pass of a tape has computed so far."""
 
-    def __init__(self, notes: list[_Note], sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
-        self.notes = notes
+    def __init__(self, calls: list[_Call], sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
+        self.calls = calls
         self.sources = {id(x): x for x in sources}
         self.sums = sums
-        self.gradients: dict[int, Tensor] = {}
-        self.uses = Counter([id(x) for note in notes for x in note.tensors])
+        self.by_id: dict[int, Tensor] = {}  # the gradient of each tensor
+        self.uses = Counter([id(x) for call in calls for x in call.tensors])
 
-    def give(self, x: Tensor, gradient: Tensor) -> None:
+    def propagate(self, x: Tensor, gradient: Tensor) -> None:
         """Add a gradient to that of the tensor `x`; if `x` has a `grad_fn`, backpropagate it through autograd."""
         self._add(x, gradient)
         if x.grad_fn is None:
             return
-        outputs = [y for note in self.notes for y in note.outputs if y.requires_grad]
+        outputs = [y for call in self.calls for y in call.outputs if y.requires_grad]
         ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and y is not x]
-        gradients = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
-        for end, of_end in zip(ends, gradients, strict=True):
-            if of_end is not None:
-                self._add(end, of_end.clone())  # torch may return two gradients that share memory
+        by_ends = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
+        for end, by_end in zip(ends, by_ends, strict=True):
+            if by_end is not None:
+                self._add(end, by_end.clone())  # torch may return two gradients that share memory
 
     def _add(self, x: Tensor, gradient: Tensor) -> None:
-        before = self.gradients.get(id(x))
-        self.gradients[id(x)] = gradient if before is None else before + gradient
+        before = self.by_id.get(id(x))
+        self.by_id[id(x)] = gradient if before is None else before + gradient
 
-    def through(self, note: _Note) -> None:
+    def run_backward(self, call: _Call) -> None:
         """Run the backward kernel of one recorded call, if one of its outputs has a gradient."""
-        upstream = [self.gradients.get(id(x)) for x in note.outputs]
+        upstream = [self.by_id.get(id(x)) for x in call.outputs]
         if all(g is None for g in upstream):
             return
         # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
-        whole, there = {}, {}
-        for i in note.operation.adds:
-            key = id(note.tensors[i])
-            if key in self.sources and self.uses[key] == 1 and key not in self.gradients:
+        whole, sums = {}, {}
+        for i in call.operation.adds:
+            key = id(call.tensors[i])
+            if key in self.sources and self.uses[key] == 1 and key not in self.by_id:
                 whole[i] = key
                 if key in self.sums:
-                    there[i] = self.sums[key]
-        gradients = note.operation.backward(note.tensors, note.slots, note.outputs, upstream, note.wanted, there)
-        for i, (x, gradient, wanted) in enumerate(zip(note.tensors, gradients, note.wanted, strict=True)):
+                    sums[i] = self.sums[key]
+        gradients = call.operation.backward(call.tensors, call.slots, call.outputs, upstream, call.wanted, sums)
+        for i, (x, gradient, wanted) in enumerate(zip(call.tensors, gradients, call.wanted, strict=True)):
             if gradient is None or not wanted:
                 continue
             if i in whole:
                 self.sums[whole[i]] = gradient
             else:
-                self.give(x, gradient)
-
-    def finish(self) -> None:
-        """Add the gradients of all source tensors to the caller's sums of gradients."""
-        for key in self.sources:
-            gradient = self.gradients.get(key)
-            if gradient is not None:
-                add_to(self.sums, key, gradient)
+                self.propagate(x, gradient)

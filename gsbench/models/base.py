@@ -16,6 +16,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import ALPHA_MIN
+from gsbench.kernels.operation import Operation
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.appearance import ColorOrder, sh_colors
 from gsbench.models.camera_time import CameraTime, unit
@@ -285,6 +286,16 @@ class GaussianModel(nn.Module, ABC):
         means, factors, opacity_factor, shapes = self.condition(raw, query)
         return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
 
+    def slice_by(self, operation: Operation, raw: Raw, query: CameraTime, **numbers: Any) -> Geometry:
+        """Compute the 3D Gaussians for a camera and a time by a kernel.
+
+        Its inputs are found by their names: raw parameters, `center`, `time`, `log_lambda_t` and `log_lambda_d`.
+        """
+        known = raw | {"center": query.center} | {f"log_lambda_{name[0]}": x for name, x in self.log_lambda.items()}
+        if "time" in self.observes and query.time is not None:
+            known["time"] = query.time
+        return Geometry(*operation(**{name: known[name] for name in operation.inputs if name in known}, **numbers))
+
     @property
     def orders(self) -> Tensor | None:
         """The SH degree and number of frequencies of each colour, [N], as in `ColorOrder.packed`; None: all."""
@@ -405,14 +416,3 @@ class GaussianModel(nn.Module, ABC):
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)
-
-
-def slice_by(
-    kernel: Callable[..., Any],  # returns means, factors, opacities and, of Beta profiles, exponents
-    raw: Raw,
-    names: Sequence[str],  # of the raw parameters that it takes first; None stands for one that the model lacks
-    *others: Tensor | None,
-    **options: Any,
-) -> Geometry:
-    """Compute the 3D Gaussians at a camera and time by a kernel."""
-    return Geometry(*kernel(*map(raw.get, names), *others, **options))

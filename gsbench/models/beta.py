@@ -15,7 +15,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_universal
 from gsbench.kernels.tensors import check_positive
-from gsbench.models.base import SHRINK, GaussianModel, Raw, slice_by
+from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
 from gsbench.models.portable_math import exp, log, log1p, sqrt
@@ -217,8 +217,7 @@ class UniversalBetaModel(BetaModel):
         """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the modulation."""
         if self.modulation != "whitened" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        names = ("means", "directions", "times", "scales", "skew", "lower", "betas", "opacities")
-        return slice_by(slice_universal, raw, names, query.center, query.time)
+        return self.slice_by(slice_universal, raw, query)
 
     def hold_lifetimes(self, least: float) -> None:
         """Raise the size of time such that the Gaussian exp(-b y_t^2) of each opacity factor is at least `least` long.

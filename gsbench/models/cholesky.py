@@ -124,27 +124,19 @@ class CholeskyModel(JointModel):
         has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
         if not has_kernel or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        directed, timed = "direction" in self.observes, "time" in self.observes
-        geometry = slice_triangular(
-            raw["means"],
-            self.mean_directions(raw) if directed else None,
-            self.mean_times(raw) if timed else None,
-            raw["log_diagonal"],
-            raw["shape"],
-            raw["motion"],
-            raw["coupling"] if "coupling" in raw else raw["motion"].detach()[:, :0],
-            raw["opacities"],
-            query.center,
-            query.time,
-            self.log_lambda["direction"] if directed else None,
-            self.log_lambda["time"] if timed else None,
+        parameters = raw | {"coupling": raw.get("coupling", raw["motion"].detach()[:, :0])}
+        parameters |= {"times": self.mean_times(raw)} if "time" in self.observes else {}
+        parameters |= {"directions": self.mean_directions(raw)} if "direction" in self.observes else {}
+        return self.slice_by(
+            slice_triangular,
+            parameters,
+            query,
+            half=0.5 if self.directional_half else 1.0,
             conditioned_first=self.factor_order == "conditioned_first",
             form=OFF_DIAGONALS.index(self.layout.form),
-            directional_half=self.directional_half,
             subtracts=self.scheme == "cholesky",
             conditioned=self.conditioned,
         )
-        return Geometry(*geometry)
 
     def spatial_scales(self) -> Tensor:
         """Return the diagonal entries of position in each Cholesky factor, [N, 3]."""

@@ -12,7 +12,7 @@ from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR_MIN
 from gsbench.kernels.slices import slice_rotated
 from gsbench.models.appearance import ColorOrder, coefficients_within, order_of, sh_time_colors
-from gsbench.models.base import SHRINK, Raw, slice_by
+from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
@@ -175,10 +175,7 @@ class Gaussians4DModel(JointModel, gates=True):
         """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
         if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        assert query.time is not None
-        names = ("means", "times", "scales", "left_quats", "right_quats", "opacities")
-        at = self.clock, query.time, self.log_lambda["time"]
-        return slice_by(slice_rotated, raw, names, *at, conditioned=self.conditioned)
+        return self.slice_by(slice_rotated, raw | {"clock": self.clock}, query, conditioned=self.conditioned)
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""

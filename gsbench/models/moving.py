@@ -16,9 +16,9 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import DIRECT_FADING
-from gsbench.kernels.moving import slice_direct, slice_direct_beta, slice_free_time
+from gsbench.kernels.slices import slice_direct, slice_direct_beta, slice_free_time
 from gsbench.kernels.tensors import check_positive
-from gsbench.models.base import Raw, slice_by
+from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
 from gsbench.models.camera_time import CameraTime, times_inside, unit
 from gsbench.models.effect_sets import EffectSets
@@ -128,9 +128,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         """Compute the moved 3D Gaussians by the backend's kernel if it has one, else in torch."""
         if not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        assert query.time is not None
-        names = ("means", "times", "scales", "quats", "durations", "velocities", "opacities")
-        return slice_by(slice_free_time, raw, names, query.time, conditioned=self.conditioned)
+        return self.slice_by(slice_free_time, raw, query, conditioned=self.conditioned)
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
@@ -219,9 +217,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         """Compute the moved 3D Gaussians by a kernel, or in torch if the backend has none for this `coupling`."""
         if self.coupling != "text" or not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        assert query.time is not None
-        names = ("means", "directions", "times", "scales", "quats", "precision", "coupling", "shares", "opacities")
-        return slice_by(slice_direct, raw, names, query.center, query.time, conditioned=self.conditioned)
+        return self.slice_by(slice_direct, raw, query, conditioned=self.conditioned)
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
@@ -328,8 +324,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         """Compute the moved 3D Gaussians and their exponents by the backend's kernel if it has one, else in torch."""
         if not self.backend.serves(raw["means"]):
             return super().slice_geometry(raw, query)
-        names = ("means", "directions", "times", "scales", "skew", "precision", "coupling", "betas", "opacities")
-        return slice_by(slice_direct_beta, raw, names, query.center, query.time, conditioned=self.conditioned)
+        return self.slice_by(slice_direct_beta, raw, query, conditioned=self.conditioned)
 
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return mean times [N] and standard deviations [N] of the Gaussians exp(-b z^2); None without time.

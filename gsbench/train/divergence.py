@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from gsbench.kernels.adam import are_finite
 from gsbench.kernels.backends import CPU
-from gsbench.kernels.finite import are_finite
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models import GaussianModel
 

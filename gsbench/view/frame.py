@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsbench.gates.gate import most_cost
 from gsbench.gates.picture import cost_colors, effect_set_colors
-from gsbench.kernels.tape import Differentiable, Tape
+from gsbench.kernels.operation import Operation
+from gsbench.kernels.tape import Tape
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
@@ -81,7 +82,7 @@ class StageWatch(Tape):
         super().__init__()
         self._laps = Laps(device)
 
-    def record(self, operation: Differentiable, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
         """Run a kernel; if a stage of the frame ends just before or just after this kernel, store the stage's time."""
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])

@@ -11,9 +11,16 @@ from torch import Tensor
 from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.moving import slice_direct, slice_direct_beta, slice_free_time
 from gsbench.kernels.refine import HIDDEN, refine
-from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular, slice_universal
+from gsbench.kernels.slices import (
+    slice_direct,
+    slice_direct_beta,
+    slice_free_time,
+    slice_rotated,
+    slice_static,
+    slice_triangular,
+    slice_universal,
+)
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
 from gsbench.models.slicing import slice_gaussians
 from gsbench.raster import rasterize

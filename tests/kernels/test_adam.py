@@ -68,7 +68,7 @@ X = torch.zeros(4, 2)
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({1: torch.zeros(4, 3)}, r"expected gradient of shape \[4, 2\], got \[4, 3\]"),
+        ({1: torch.zeros(4, 3)}, r"expected gradient of shape \[4, 2\] on cpu, got \[4, 3\]"),
         ({4: torch.ones(3, dtype=torch.bool)}, r"expected drawn of shape \[4\]"),
     ],
 )

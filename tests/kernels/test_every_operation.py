@@ -15,8 +15,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels.fields import Gradient, sizes_of
-from gsbench.kernels.operation import EVERY_ROW, Operation
+from gsbench.kernels.operation import EVERY_ROW, Gradient, Operation, sizes_of
 from gsbench.kernels.raster import count_tiles
 
 N, C, WIDTH, HEIGHT = 5, 2, 20, 18

@@ -8,7 +8,7 @@ from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels.library import library_of
 from gsbench.kernels.operation import MOST_KNOWN, Operation
-from gsbench.kernels.slices import _static, slice_static
+from gsbench.kernels.slices import slice_static
 
 
 @pytest.mark.parametrize("operation", declared(), ids=lambda operation: operation.name)
@@ -47,8 +47,10 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
     Gaussians that are kept for ever."""
     matched: list[int] = []
-    match = _static._match
-    monkeypatch.setattr(_static, "_match", lambda tensors, numbers: (matched.append(1), match(tensors, numbers))[1])
+    match = slice_static._match
+    monkeypatch.setattr(
+        slice_static, "_match", lambda tensors, numbers: (matched.append(1), match(tensors, numbers))[1]
+    )
     for _ in range(3):
         for N in (1003, 1005):
             factors, opacities = slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
@@ -57,7 +59,7 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(matched) <= 2
     for N in range(2 * MOST_KNOWN):
         slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
-    assert len(_static._known) <= MOST_KNOWN
+    assert len(slice_static._known) <= MOST_KNOWN
 
 
 def test_the_extension_counts_and_types_its_values() -> None:

@@ -230,10 +230,10 @@ def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     """Catches a tape that keeps every tensor of a rendering."""
     with Tape() as tape, torch.no_grad():
         slice_static(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))
-    assert not tape._notes
+    assert not tape._calls
     with Tape() as tape:
         slice_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
-    assert not tape._notes
+    assert not tape._calls
 
 
 class Calls(TorchDispatchMode):

@@ -13,7 +13,7 @@ from tiny_training import moving_square, trainer
 from torch import nn
 
 from gsbench import models
-from gsbench.kernels.finite import are_finite
+from gsbench.kernels.adam import are_finite
 from gsbench.scenes import View
 from gsbench.train import checkpoint, divergence
 from gsbench.train.batches import generator
