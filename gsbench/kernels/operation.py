@@ -418,9 +418,7 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
         values, (outputs, upstream, wanted) = rest[:count], rest[count:]
-        gradients = operation.backward(
-            tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted
-        )
+        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted)
         filled = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
         return _apart(filled, upstream)
 
