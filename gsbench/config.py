@@ -202,6 +202,9 @@ class Config:
     launch: LaunchConfig = group(LaunchConfig, role="launching")
 
 
+PATHS = ("results", "data.root", "init.ply", "protocol.lpips_alex", "protocol.lpips_vgg")  # keys that hold a path
+
+
 def register_schema() -> None:
     """Let Hydra check conf/config.yaml and its groups against the dataclasses of this module."""
     from hydra.core.config_store import ConfigStore

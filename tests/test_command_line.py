@@ -127,11 +127,30 @@ def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["train.iterations=0"], "train.iterations: expected at least 1, got 0"),
+        (["-m", "train.iterations=1,0"], "train.iterations: expected at least 1, got 0"),
+        (["train.coarse=[[1,3000]]"], "train.coarse: expected pairs"),
+        (["model=auto", "model.candidates.static.min_opacity=1"], "model=auto, candidate static: model.min_opacity: "),
+    ],
+)
+def test_a_wrong_value_is_refused_before_the_first_run(
+    words: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a sweep whose wrong run fails after hours, and a folder of a run that never was."""
+    assert main_here("+exp=mini", "scene=suzanne", *words, f"results={tmp_path}") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"gsbench: error: {reason}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_failed_run_says_its_reason_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches the reason on stdout and on stderr, which a terminal shows twice."""
-    assert main_here("+exp=mini", "scene=suzanne", "train.iterations=0", f"results={tmp_path}") == 1
+    assert main_here("+exp=mini", "scene=suzanne", "scene.downscale=20", f"results={tmp_path}") == 1
     printed = capsys.readouterr()
-    assert (printed.out + printed.err).count("train.iterations: expected") == 1
+    assert (printed.out + printed.err).count("scene.downscale=20: expected") == 1
     assert "failed; " in printed.out
     assert "record.json" in printed.out
 

@@ -19,7 +19,7 @@ from gsbench.config_roles import facts, flat, measuring_differences, training_di
 from gsbench.errors import InputError
 from gsbench.measure.record import MAX_POINTS
 from gsbench.measure.speed import LEAST_RENDERS
-from gsbench.run.checks import check_config
+from gsbench.run.settings import check_settings
 from gsbench.run.setup import BACKGROUNDS, LEAST_GAUSSIANS
 from gsbench.scenes import RESIZES
 from gsbench.train.density.control import RULES
@@ -54,8 +54,8 @@ def test_values_out_of_a_range_or_no_choice_are_refused(dotted: str, config: Con
             part = getattr(part, group)
         setattr(part, name, value)
         with pytest.raises(InputError, match=rf"^{dotted}( 'nothing' is not known|: expected)"):
-            check_config(broken)
-    check_config(config)
+            check_settings(broken)
+    check_settings(config)
 
 
 def test_rates_of_any_name_have_a_range(config: Config) -> None:
@@ -63,7 +63,7 @@ def test_rates_of_any_name_have_a_range(config: Config) -> None:
     broken = copy.deepcopy(config)
     broken.model.lr["means"].start = -1
     with pytest.raises(InputError, match=r"^model\.lr\.means\.start: expected at least 0, got -1"):
-        check_config(broken)
+        check_settings(broken)
 
 
 @pytest.mark.parametrize("key", ["train.cooldown_from", "train.average_from"])
@@ -72,7 +72,7 @@ def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
     broken = copy.deepcopy(config)
     setattr(broken.train, key.removeprefix("train."), 30_000)
     with pytest.raises(InputError, match=f"^{key}: expected a step below train.recipe_iterations=30000"):
-        check_config(broken)
+        check_settings(broken)
 
 
 def test_facts_are_those_of_the_code() -> None:

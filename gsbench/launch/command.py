@@ -4,6 +4,7 @@
 """
 
 import argparse
+import copy
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,10 +24,10 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import CONF, register_schema
-from gsbench.config_roles import facts, flat
+from gsbench.config import CONF, PATHS, register_schema
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
+from gsbench.run.settings import check_settings
 
 NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{].*|''|\"\"|")  # values for Hydra
 QUESTIONS = ("--hydra-help", "--cfg", "-c", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
@@ -144,12 +145,21 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
         del config["hydra"]
     check_complete(config)
     try:
-        launch: Any = OmegaConf.to_container(config.launch, resolve=True)
+        check_settings(OmegaConf.to_object(_with_paths(config)))  # type: ignore[arg-type]
     except OmegaConfBaseException as error:
         raise InputError(explain(error)) from None
-    for name, value in flat(launch, "launch."):  # before a job is submitted; the run itself checks all other keys
-        facts(name).check(name, value)
     return RunConfig(list(overrides), config, choices)
+
+
+def _with_paths(config: DictConfig) -> DictConfig:
+    """Return a config of a Slurm job with a text for each path that names a variable of its node, such as TMPDIR."""
+    config = copy.deepcopy(config)
+    for key in PATHS if config.launch.by == "slurm" else ():
+        try:
+            OmegaConf.select(config, key)
+        except OmegaConfBaseException:
+            OmegaConf.update(config, key, "known on the node")
+    return config
 
 
 def check_complete(config: DictConfig) -> None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gsbench.config import PATHS
 from gsbench.errors import InputError, one_line, printable
 from gsbench.launch import plan
 from gsbench.launch.plan import Plan
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 SUBMITTING = 300  # time limit of sbatch, seconds; after it, jobs may run that no plan knows
 POLL = 10.0  # seconds between two looks at Slurm's queue
 STOPPED = 128 + signal.SIGUSR2  # exit status
-PATHS = ("results", "data.root", "init.ply", "protocol.lpips_alex", "protocol.lpips_vgg")  # keys that hold a path
 SCRIPT = """\
 #!/bin/bash
 # Written by gsbench: each job of the array does the run of its number.

@@ -1,91 +1,27 @@
-"""Check the settings of a run, the device, the folder and the scene, before the first training step."""
+"""Check that this machine, the folder of a run and its scene can do what its settings ask, before the first step."""
 
-import dataclasses
-import itertools
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from gsbench.config import Config, LearningRate
-from gsbench.config_roles import facts, flat
+from gsbench.config import Config
 from gsbench.errors import InputError, did_you_mean, one_line
 from gsbench.kernels.backends import resolve
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.models import GaussianModel
+from gsbench.run.settings import lpips_weights
 from gsbench.scenes import Scene, View
 from gsbench.train.hooks import hook_types
 from gsbench.train.losses import WINDOW
 
 
-def check_config(config: Config) -> None:
-    """Raise InputError if a setting is invalid, or if this machine lacks the device, backend or LPIPS weights."""
-    check_values(config)
+def check_machine(config: Config) -> None:
+    """Raise InputError if this machine lacks the device, the backend or the LPIPS weights of the settings."""
     check_device(config.device)
     resolve(config.raster.backend, torch.device(config.device).type)
     for backbone, file in lpips_weights(config).items():
         perceptual.load(backbone, file, config.device)
-
-
-def check_values(config: Config) -> None:
-    """Raise InputError if a setting is invalid on every machine, for instance out of its range."""
-    _check_keys(config)
-    for dotted, value in flat(dataclasses.asdict(config)):
-        facts(dotted).check(dotted, value)
-    _check_steps(config)
-    for hook in hook_types():
-        hook.check(config)
-    _check_coarse(config.train.coarse or [])
-    for name, rate in config.model.lr.items():
-        _check_rate(f"model.lr.{name}", rate)
-
-
-def lpips_weights(config: Config) -> dict[str, Path]:
-    """Return the weight files of LPIPS networks in the settings, by network ("alex", "vgg")."""
-    files = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
-    return {backbone: Path(file).expanduser() for backbone, file in files.items() if file}
-
-
-def _check_keys(value: Any, place: str = "") -> None:
-    """Raise InputError if the settings have an unknown key, which Hydra's `+key=` adds without an error."""
-    known = {field.name for field in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else None
-    members = value if isinstance(value, dict) else vars(value) if known else {}
-    for name, member in members.items():
-        dotted = f"{place}.{name}".lstrip(".")
-        if known is not None and name not in known:
-            raise InputError(f"config key '{dotted}' is not known. {did_you_mean(name, known)}")
-        _check_keys(member, dotted)
-
-
-def _check_steps(config: Config) -> None:
-    """Raise InputError if learning rates are to fall after the last step."""
-    step, length = config.train.cooldown_from, config.train.recipe_iterations
-    if step is not None and step >= length:
-        raise InputError(f"train.cooldown_from: expected a step below train.recipe_iterations={length}, the length for "
-                         f"which steps are given, got {step}")  # fmt: skip
-
-
-def _check_rate(key: str, rate: LearningRate) -> None:
-    """Raise InputError if a learning rate is negative, or if a log-linear decay starts or ends at zero."""
-    if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
-        raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
-                         f"got start {rate.start}, end {rate.end}")  # fmt: skip
-
-
-def _check_coarse(coarse: list[list[int]]) -> None:
-    """Raise InputError unless `coarse` is a valid list of (downscaling factor, last step) pairs.
-
-    An example is [[4, 3000], [2, 15000]]: factors decrease and steps increase.
-    """
-    are_pairs = all(len(pair) == 2 for pair in coarse)
-    factors, steps = ([pair[at] for pair in coarse] if are_pairs else [] for at in (0, 1))
-    fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
-    rise = all(a < b for a, b in itertools.pairwise([0, *steps]))
-    if not are_pairs or not fall or not rise:
-        raise InputError(f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "
-                         f"much smaller), factors falling and steps rising, such as [[4,3000],[2,15000]], "
-                         f"got {coarse}")  # fmt: skip
 
 
 def check_folder(folder: Path) -> None:

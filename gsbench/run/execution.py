@@ -29,7 +29,7 @@ from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.process.memory import is_out_of_memory
 from gsbench.run import fitting, measuring, progress
-from gsbench.run.checks import check_config, check_folder, check_scene, check_values, evaluated_views, lpips_weights
+from gsbench.run.checks import check_folder, check_machine, check_scene, evaluated_views
 from gsbench.run.identity import RunSpec
 from gsbench.run.log import RunLog, check_tracker
 from gsbench.run.progress import Progress
@@ -39,13 +39,11 @@ from gsbench.run.selection import (
     best_length,
     best_of,
     check_candidates,
-    check_compare,
-    is_auto,
     plain,
     reporter,
     resolve,
-    with_candidate,
 )
+from gsbench.run.settings import check_settings, is_auto, lpips_weights, with_candidate
 from gsbench.run.setup import build, check_start, load_scene, trained_start
 from gsbench.run.stop import Stopped
 from gsbench.scenes import Scene
@@ -85,10 +83,8 @@ class Execution:
             InputError: the settings, the device or the data are invalid.
         """
         config = self.resolved.config
-        check_compare(self.spec.config)
-        check_config(config)
-        if is_auto(self.spec.config):
-            check_values(with_candidate(self.spec.config, "static"))
+        check_settings(self.spec.config)
+        check_machine(config)
         self.model = build(config)
         start = trained_start(config)
         self.scene = scene = load_scene(config)

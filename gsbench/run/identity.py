@@ -18,6 +18,7 @@ from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.reading import read_file
 from gsbench.run.grammar import quoted_value
+from gsbench.run.settings import label_of
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
@@ -77,12 +78,6 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
 
 def _deleted(key: str) -> InputError:
     return InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
-
-
-def label_of(config: Config) -> str:
-    """Return the model's name, with _agr or _noagr if its use of AGR (a network) differs from the published method."""
-    as_published = config.agr == config.model.published_with_agr
-    return config.model.name + ("" if as_published else "_agr" if config.agr else "_noagr")
 
 
 def hash_of(ply: str) -> str:

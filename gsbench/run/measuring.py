@@ -16,7 +16,7 @@ from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.render import GraphedFrames
-from gsbench.run.checks import lpips_weights
+from gsbench.run.settings import lpips_weights
 from gsbench.scenes import View
 from gsbench.stability.float32_error import psnr_float32
 from gsbench.train.hooks.best import Best

@@ -16,9 +16,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import Config, ModelConfig
+from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.gates import messages
 from gsbench.gates.screen import import_compiler, screen_time
@@ -26,8 +25,9 @@ from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate, LengthChoice, ModelComparison, TimeScreen
 from gsbench.measure.speed import Effort
 from gsbench.run import fitting, progress
-from gsbench.run.checks import check_scene, check_values
-from gsbench.run.identity import RunSpec, label_of
+from gsbench.run.checks import check_scene
+from gsbench.run.identity import RunSpec
+from gsbench.run.settings import HOW_TO, candidates, is_auto, with_candidate
 from gsbench.run.setup import build, build_with_placeholders
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -38,8 +38,6 @@ from gsbench.train.loop import Trainer
 from gsbench.train.optim import check_rates
 
 FOLDER = "candidates"  # in the run's folder; each candidate has a folder there for its checkpoint
-AUTO = "auto"
-HOW_TO = "effects.md#comparing-models-on-val"
 
 
 def plain(spec: RunSpec, config: Config) -> dict[str, Any]:
@@ -181,59 +179,6 @@ def best(results: Sequence[Result]) -> Result:
     return top
 
 
-def is_auto(config: Config) -> bool:
-    """Return whether the settings have model=auto, so that a test of the scene must still choose the model."""
-    return config.model.name == AUTO
-
-
-def with_candidate(config: Config, name: str) -> Config:
-    """Return the settings of model=auto with its candidate "moving" or "static" as the model."""
-    return _with_model(config, config.model.candidates.get(name), f"model.candidates.{name}")
-
-
-def candidates(config: Config) -> dict[str, Config]:
-    """Return the settings of each model to compare, by its label; the first is the one that model=auto trains alone.
-
-    Raises:
-        InputError: a candidate is no model config, or two of them have one label.
-    """
-    more = [_with_model(config, model, f"model.compared.{key}") for key, model in config.model.compared.items()]
-    by_label: dict[str, Config] = {}
-    for each in (with_candidate(config, "moving"), *more, with_candidate(config, "static")):
-        candidate = replace(each, model=replace(each.model, agr=each.agr))  # agr=false: 7dgs is 7dgs_noagr
-        label = label_of(candidate)
-        if by_label.setdefault(label, candidate) != candidate:
-            raise InputError(f"model.compared: expected models of different names, two are {label!r:.80}")
-    return by_label
-
-
-def _with_model(config: Config, model: Any, key: str) -> Config:
-    """Return settings with another model, from the config key `key`, with AGR only if the model's settings have it.
-
-    Raises:
-        InputError: `model` is not a model config.
-    """
-    try:
-        typed = OmegaConf.merge(OmegaConf.structured(ModelConfig), model or {})
-        chosen: ModelConfig = OmegaConf.to_object(typed)  # type: ignore[assignment]
-    except (OmegaConfBaseException, ValueError, TypeError) as error:
-        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
-    return replace(config, model=replace(chosen, gate=config.model.gate), agr=config.agr and chosen.agr)
-
-
-def check_compare(config: Config) -> None:
-    """Raise InputError if the settings ask to compare models on val and cannot have this."""
-    if not config.effects.compare:
-        return
-    if not is_auto(config):
-        raise InputError(f"effects.compare=true: expected model=auto, whose candidates it compares, got "
-                         f"model={config.model.name}: leave effects.compare out, or use model=auto",
-                         docs=HOW_TO)  # fmt: skip
-    if config.scene.eval_split == "val":
-        raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
-                         "views by which the model is chosen would be too high; name a model instead")  # fmt: skip
-
-
 def check_candidates(config: Config, scene: Scene) -> None:
     """Raise InputError if a scene with times has no val views, or a candidate bad settings or no way to train on it."""
     if not scene.val:
@@ -241,7 +186,6 @@ def check_candidates(config: Config, scene: Scene) -> None:
                          f"scene.val_every=8 takes every eighth training view", docs=HOW_TO)  # fmt: skip
     for name, settings in candidates(config).items():
         try:
-            check_values(settings)
             check_scene(build(settings), scene, settings)
             check_rates(build_with_placeholders(settings, scene.extent).groups(), settings.model)
         except InputError as error:

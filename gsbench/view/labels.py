@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
-from gsbench.run.identity import label_of
 from gsbench.run.load import LoadedRun
+from gsbench.run.settings import label_of
 
 FONTS = Path(matplotlib.get_data_path(), "fonts", "ttf")
 DARK = 0.35  # what the paper of a label leaves of the image behind it

@@ -17,8 +17,9 @@ from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, Candidate, Record, TimeScreen
 from gsbench.report.sections.curves import events
 from gsbench.run import checks, load, log, selection
-from gsbench.run.identity import RunSpec, label_of
-from gsbench.run.selection import FOLDER, candidates, check_candidates, check_compare, length_name, lengths, resolve
+from gsbench.run.identity import RunSpec
+from gsbench.run.selection import FOLDER, check_candidates, length_name, lengths, resolve
+from gsbench.run.settings import candidates, check_settings, label_of
 from gsbench.run.setup import build
 from gsbench.scenes import View
 from gsbench.train import checkpoint
@@ -220,6 +221,11 @@ def test_a_candidate_that_fails_loses(
     [
         ("7dgs", "effects.compare=true", "expected model=auto"),
         ("auto", "effects.compare=true scene.eval_split=val", "got scene.eval_split=val"),
+        (
+            "auto",
+            "effects.compare=true model.compared.moving_4dgs.lr.means.start=-1",
+            r"4dgs: model\.lr\.means\.start: exp",
+        ),
         ("3dgs", "train.lengths=2 effects.compare=true", "train.lengths: expected effects.compare=false"),
         ("3dgs", "train.lengths=2 train.patience=0.2", "train.patience: expected train.lengths=null"),
         ("3dgs", "train.lengths=2 scene.eval_split=val", "train.lengths: expected results on test"),
@@ -236,8 +242,7 @@ def test_settings_that_cannot_choose_are_refused(model: str, words: str, message
     square, config = moving_square(), compose(model, 15, *words.split())
 
     def check() -> None:
-        checks.check_values(config)
-        check_compare(config)
+        check_settings(config)
         checks.check_scene(build(compose("3dgs", 10)), scene, config)
 
     scene = replace(square, val=[] if config.scene.name == "no_val" else square.train[:1])
@@ -310,7 +315,6 @@ def test_resume_false_starts_every_candidate_over(
     [
         ("seed=0", None),
         ("scene.name=no_val", r"scene\.val_every=8 takes"),
-        ("model.compared.moving_4dgs.lr.means.start=-1", r"candidate 4dgs: model\.lr\.means\.start: expected"),
         ("~model.compared.moving_4dgs.lr.scales", r"candidate 4dgs: model\.lr: .* 'scales' has none"),
         ("train.penalties.strain.weight=1", "candidate 6dgs: "),
     ],

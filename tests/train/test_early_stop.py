@@ -10,7 +10,8 @@ from tiny_training import compose, moving_square, train, trainer
 
 from gsbench.errors import InputError
 from gsbench.gates.hook import Gating
-from gsbench.run.checks import check_scene, check_values
+from gsbench.run.checks import check_scene
+from gsbench.run.settings import check_values
 from gsbench.train.hooks.early_stop import EarlyStop
 from gsbench.train.loop import Trainer
 

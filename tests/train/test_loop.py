@@ -13,7 +13,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.adam import adam_all
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
-from gsbench.run.checks import check_values
+from gsbench.run.settings import check_values
 from gsbench.train.hooks import Hook, hook_types
 from gsbench.train.hooks.best import Best
 from gsbench.train.loop import Trainer

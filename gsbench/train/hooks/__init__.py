@@ -84,7 +84,7 @@ class Hook:
 
     @classmethod
     def check(cls, config: Config) -> None:
-        """Raise InputError if a setting is invalid, before any file is read."""
+        """Raise InputError if a setting is invalid, before torch is imported: only hooks of this folder are asked."""
 
     @classmethod
     def check_model(cls, model: GaussianModel, config: Config) -> None:
@@ -167,10 +167,10 @@ def check_choice_on_val(key: str, what: str, scene: Scene, config: Config) -> No
                          f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
 
 
-def hook_types() -> list[type[Hook]]:
-    """Return the classes of all hooks, in the order in which they act."""
+def hook_types(elsewhere: Sequence[str] = ELSEWHERE) -> list[type[Hook]]:
+    """Return the classes of all hooks, in the order in which they act; those of this folder if `elsewhere` is ()."""
     names = sorted(f"{__name__}.{module.name}" for module in pkgutil.iter_modules(__path__))
-    return [hook for name in (*names, *ELSEWHERE) for hook in _hooks_in(name)]
+    return [hook for name in (*names, *elsewhere) for hook in _hooks_in(name)]
 
 
 def _hooks_in(module: str) -> Iterator[type[Hook]]:
