@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gsbench.as_json import as_json
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.process.ending import end_with
 from gsbench.report import live, output, paper_tables, reproduction, select
@@ -114,14 +114,14 @@ def _paper_tables(results: Results, options: argparse.Namespace) -> None:
 
 def _against(results: Results, options: argparse.Namespace) -> bool:
     """Print and write the comparison with another folder, and return whether PSNR differs."""
-    other = load(options.against)
-    _print_faults(other)
-    compared = reproduction.compare(results, other, (str(options.results), str(options.against)))
-    if not _is_json(options, lambda: reproduction.content(compared, results.runs, other.runs)):
-        section, shown = reproduction.section(compared), output.tables(results)
-        *_, written = output.write(results, options.results, shown, more=[section])
-        print(text.terminal([*shown, section]))
-        print("\n".join(reproduction.lines(compared, results.runs, written)))
+    reference = load(options.against)
+    _print_faults(reference)
+    compared = reproduction.compare(results, reference)
+    if not _is_json(options, lambda: reproduction.content(compared, results, reference)):
+        sections, shown = reproduction.sections(compared, str(options.against)), output.tables(results)
+        *_, written = output.write(results, options.results, shown, more=sections)
+        print(text.terminal([*shown, *sections]))
+        print(f"Report: {printable(written)}")
     return compared.verdict == reproduction.DIFFERS
 
 

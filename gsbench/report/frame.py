@@ -187,9 +187,14 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     main = min(shared.index, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
     gated = (runs.gate != "") & (runs.gate.nunique() > 1)
     series = runs.model.where(~gated, runs.model + ", " + runs.gate)
-    label = (runs.model + " " + runs.variant).str.rstrip() if runs.variant.nunique() > 1 else runs.model
+    label = names_of(runs) if runs.variant.nunique() > 1 else runs.model
     compared = runs.variant.map(common) == common(main)
     return runs.assign(main=runs.variant == main, compared=compared, series=series, label=label)
+
+
+def names_of(runs: pd.DataFrame) -> pd.Series:
+    """Return the names of configurations: the model with its variant, such as "7dgs iterations=500"."""
+    return (runs.model + " " + runs.variant).str.rstrip()
 
 
 def covered(runs: pd.DataFrame, by: str = "label") -> list[str]:

@@ -107,7 +107,7 @@ def against(study: str, seeds: Sequence[int], others: Sequence[int]) -> Numbers:
     """The comparison (`--against`) of some seeds of a study with others."""
     results = frame.load(PUBLISHED / study)
     sides = [results.of(results.runs.seed.isin(which)) for which in (seeds, others)]
-    compared = reproduction.compare(sides[0], sides[1], ("ours", "theirs"))
+    compared = reproduction.compare(*sides)
     values = {"verdict": VERDICTS[compared.verdict]}
     for row in compared.table.to_dict("records"):
         model = f"{row['model']} {row['variant']}".rstrip()

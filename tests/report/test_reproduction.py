@@ -18,15 +18,12 @@ from gsbench.report.reproduction import (
     AGREES,
     DIFFERS,
     LIMITS,
-    LONGEST,
     UNDECIDED,
     Reproduction,
     compare,
-    compared,
-    duration,
-    lines,
-    section,
-    trained,
+    reasons,
+    sections,
+    summary,
 )
 
 
@@ -40,7 +37,7 @@ def as_tables(records: list[Record]) -> Results:
 
 
 def reproduced(ours: list[Record], theirs: list[Record]) -> Reproduction:
-    return compare(as_tables(ours), as_tables(theirs), ("here", "published"))
+    return compare(as_tables(ours), as_tables(theirs))
 
 
 def moved(record: Record, psnr: float) -> Record:
@@ -68,14 +65,30 @@ def reason(of: Reproduction, quantity: str, model: str = "3dgs", scene: str = "s
     return text
 
 
+def counted(of: Reproduction, quantity: str = "psnr_db") -> dict[str, object]:
+    """The row of a quantity in the summary."""
+    return summary(of).set_index("quantity").loc[quantity].to_dict()
+
+
+def why(of: Reproduction) -> dict[str, int]:
+    """How many models on scenes are not compared or undecided in PSNR, by the reason."""
+    rows = reasons(of).set_index("reason")
+    return rows["models on scenes"][rows.quantities.str.contains("PSNR|all")].to_dict()
+
+
+def equal_seeds(of: Reproduction) -> tuple[int, int]:
+    """How many runs are bit-equal with the reference run of their seed, and how many have one."""
+    return int(of.seeds.bit_equal.sum()), len(of.seeds)
+
+
 def test_the_same_numbers_agree():
     """Catches a comparison that cannot even tell that nothing differs."""
     of = reproduced(runs(seeds=1), runs())
     assert of.verdict == AGREES
-    assert compared(of) == [
-        "Bit-equal with the run of the same seed in published: 10 of 10 runs",
-        "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB",
-    ]
+    counts = {"agrees": 10, "differs": 0, "undecided": 0, "bit-equal": 10, "percent": 0.0}
+    assert counted(of).items() >= counts.items()
+    assert equal_seeds(of) == (10, 10)
+    assert why(of) == {}
     assert verdicts(of, "gaussians") == verdicts(of, "model_mb") == {AGREES}
 
 
@@ -95,10 +108,10 @@ def test_bits_agree_whatever_the_spread_of_seeds():
     assert of.seeds.bit_equal.all()
     more = reproduced(spread_out(3), spread_out(2))  # seed 2 is in one folder only
     assert more.verdict == AGREES
-    assert compared(more)[0].endswith("20 of 20 runs")
+    assert equal_seeds(more) == (20, 20)
     ours = [moved(r, 0.001) if r.seed == 1 else r for r in spread_out(2)]
     other = reproduced(ours, spread_out(3))
-    assert compared(other)[0].endswith("10 of 20 runs")
+    assert equal_seeds(other) == (10, 20)
     assert other.verdict == UNDECIDED
 
 
@@ -122,7 +135,7 @@ def test_a_single_run_agrees_where_another_seed_would_lie():
     )
     assert near.verdict == AGREES
     assert UNDECIDED in verdicts(far, "psnr_db")
-    assert "more seeds are needed" in compared(far)[-1]
+    assert "the interval is too wide: more seeds are needed" in why(far)
     assert beyond.verdict == DIFFERS
     pairs = [moved(r, 0.7 + noisy[r.seed]) for r in runs(seeds=2)]
     assert reproduced(pairs, theirs).verdict == UNDECIDED  # two runs have a mean, whose interval is too wide
@@ -141,9 +154,9 @@ def test_one_model_that_differs_is_found(psnr):
     of = reproduced(ours, runs())
     assert of.verdict == DIFFERS
     assert of.of("psnr_db", DIFFERS)[["model", "scene"]].to_numpy().tolist() == [["7dgs", "suzanne"]]
-    assert compared(of)[0].endswith("9 of 10 runs")
-    assert compared(of)[1].startswith("PSNR differs in 1 of 10 models on scenes, agrees in 9; largest difference ")
-    assert compared(of)[1].endswith(" dB, 7dgs on suzanne")
+    assert equal_seeds(of) == (9, 10)
+    counts = {"agrees": 9, "differs": 1, "percent": pytest.approx(of.of("psnr_db", DIFFERS).difference.iloc[0])}
+    assert counted(of).items() >= (counts | {"on": "7dgs on suzanne"}).items()
 
 
 @pytest.mark.parametrize("quantity", ["gaussians", "model_mb", "train_s", "frame_ms"])
@@ -161,8 +174,8 @@ def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
     of = reproduced(ours, [spread(r, 0.9, 1.02, 0.98) for r in runs()])
     assert verdicts(of, quantity) == {AGREES}
     row = of.of(quantity).iloc[0]
-    assert 0.1 < row.difference / row.theirs < 0.2
-    assert (row.high - row.difference) / row.theirs == pytest.approx(0.16, abs=0.02)
+    assert 0.1 < row.difference / row.reference < 0.2
+    assert (row.high - row.difference) / row.reference == pytest.approx(0.16, abs=0.02)
 
 
 def test_one_run_on_each_side_cannot_be_told():
@@ -170,7 +183,7 @@ def test_one_run_on_each_side_cannot_be_told():
     ours = [moved(r, 0.3) for r in runs(seeds=1)]
     of = reproduced(ours, runs(seeds=1))
     assert of.verdict == UNDECIDED
-    assert "no spread over seeds is known (in 10)" in compared(of)[-1]
+    assert why(of)["one run of each model on both sides: no spread over seeds is known"] == 10
     assert reproduced(runs(seeds=1), runs(seeds=1)).verdict == AGREES
 
 
@@ -185,33 +198,32 @@ def test_a_noisy_model_is_held_against_its_own_spread():
 
 
 @pytest.mark.parametrize(
-    ("changes", "why"),
+    ("changes", "reason"),
     [
         ({"config": {"train": {"iterations": 500}}}, "another training: train.iterations 500 instead of 1000"),
         ({"data_hash": "77"}, "other data"),
     ],
 )
-def test_other_trainings_and_data_are_not_compared(changes, why):
+def test_other_trainings_and_data_are_not_compared(changes, reason):
     """Catches a verdict on numbers that measure something else."""
     of = reproduced([measured_by(r, **changes) for r in runs()], runs())
     assert of.verdict == UNDECIDED
     assert all(verdicts(of, quantity) == {UNDECIDED} for quantity in LIMITS.index)
-    assert compared(of)[-1] == f"Undecided: {why} (in 10)"
+    assert why(of) == {reason: 10}
 
 
 def test_another_length_is_said_to_be_one():
     """Catches a shorter training that is "not in both", and one that is not told beside runs that are compared."""
     short = frontier(seeds=1, lengths=(250, 500))
-    why = "Cannot be compared: train.iterations 250 instead of 1000 (in 10, others in 10)"
-    assert compared(reproduced(short, runs())) == [why]
-    assert compared(reproduced([*short, *runs(seeds=1)], runs()))[2:] == [why]
-    assert reproduced(runs(models=("3dgs",)), runs(models=("7dgs",))).otherwise == {}
+    lengths = {f"another training: train.iterations {n} instead of 1000": 10 for n in (250, 500)}
+    assert why(reproduced(short, runs())) == lengths | {"only the reference folder has it": 10}
+    assert why(reproduced([*short, *runs(seeds=1)], runs())) == lengths
 
 
 def test_measured_otherwise_is_not_compared():
     """Catches PSNR of renders through 8 bits beside that of floats."""
     ours = [dataclasses.replace(r, protocol=r.protocol | {"quantise": True}) for r in runs()]
-    assert "measured otherwise: quantise False there, True" in compared(reproduced(ours, runs()))[-1]
+    assert why(reproduced(ours, runs())) == {"measured otherwise: quantise True instead of False": 10}
 
 
 def test_seconds_are_compared_on_one_machine_alone():
@@ -220,24 +232,28 @@ def test_seconds_are_compared_on_one_machine_alone():
     of = reproduced([measured_by(r, hardware=here) for r in runs()], runs())
     assert of.verdict == AGREES
     assert verdicts(of, "train_s") == verdicts(of, "frame_ms") == {UNDECIDED}
-    named = "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads here"
+    named = "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads instead of"
     assert named in reason(of, "train_s")
     busy = reproduced([costing(r, load=r.cost.load + 1) for r in runs()], runs())
-    assert "the machine had other work: load 4.0 here, 3.0 there" in reason(busy, "train_s")
+    assert "the machine had other work: load 4.0 instead of 3.0" in reason(busy, "train_s")
     slow = reproduced([costing(r, train_s=2 * r.cost.train_s) for r in runs()], runs())
     assert verdicts(slow, "train_s") == {DIFFERS}
-    assert compared(slow)[-1] == "Seconds differ in 10"
+    assert counted(slow, "train_s")["differs"] == 10
     assert slow.verdict == AGREES  # in PSNR
 
 
 def test_what_is_not_in_both_is_named():
     """Catches a model that is missing here and is not missed, and folders that have nothing in common."""
     of = reproduced([r for r in runs() if r.model != "4dgs"], [r for r in runs() if r.model != "6dgs"])
-    assert of.only_theirs == ["4dgs on moving-matte", "4dgs on suzanne"]
-    assert of.only_ours == ["6dgs on moving-matte", "6dgs on suzanne"]
+    assert of.unmatched[["model", "scene", "reason"]].to_numpy().tolist() == [
+        [model, scene, f"only the {side} folder has it"]
+        for scene in ("moving-matte", "suzanne")
+        for model, side in (("4dgs", "reference"), ("6dgs", "new"))
+    ]
     none = reproduced(runs(models=("3dgs",)), runs(models=("7dgs",)))
     assert none.verdict == UNDECIDED
-    assert compared(none) == ["Cannot be compared: no model and scene is also in published"]
+    assert len(none.table) == 0
+    assert [section.key for section in sections(none, "published")] == ["against", "undecided", "verdict"]
 
 
 def test_a_run_that_did_not_finish_is_said():
@@ -245,35 +261,14 @@ def test_a_run_that_did_not_finish_is_said():
     ours = [dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs()]
     of = reproduced(ours, runs())
     assert of.verdict == UNDECIDED
-    assert compared(of)[0].endswith("24 of 24 runs")
-    assert compared(of)[1] == "PSNR agrees in 8 of 10 models on scenes; largest difference 0.00 dB"
-    assert compared(of)[2] == "Undecided: no run finished here (in 2)"
-
-
-@pytest.mark.parametrize(
-    ("records", "said"),
-    [
-        (runs(), "30 runs: 5 models on 2 scenes, seeds 0, 1, 2, 1,000 iterations, "),
-        (runs()[1:], "29 runs of 30 combinations: 5 models on 2 scenes, seeds 0, 1, 2, 1,000 iterations, "),
-        (runs(seeds=4, models=("7dgs",), scenes=("suzanne",)), "4 runs: 1 model on 1 scene, 4 seeds, 1,000 iterations"),
-        (frontier(("3dgs",), seeds=1, lengths=(250, 1000)), "4 runs: 1 model on 2 scenes, seed 0, 250 to 1,000 iter"),
-        ([dataclasses.replace(r, **LOST) if r.model == "7dgs" else r for r in runs(seeds=1)],
-         "10 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, 2 failed, "),
-        ([measured_by(r, config={}) for r in runs(seeds=1)], "10 runs: 5 models on 2 scenes, seed 0, "),
-        ([*runs(seeds=1), *(dataclasses.replace(r, experiment="b") for r in runs(seeds=1, models=("3dgs",)))],
-         "12 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, "),
-    ],
-)  # fmt: skip
-def test_what_was_trained(records, said):
-    """Catches a number that is not that of the runs, and seconds of runs that did not finish."""
-    seconds = sum(r.cost.train_s for r in records if r.cost)
-    assert trained(as_tables(records).runs).startswith(said)
-    assert trained(as_tables(records).runs).endswith(f", {duration(seconds)} of training in all")
+    assert equal_seeds(of) == (24, 24)
+    assert (counted(of)["agrees"], counted(of)["undecided"]) == (8, 2)
+    assert why(of) == {"no new run finished": 2}
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_the_last_lines_are_six_and_short(seed):
-    """Catches a seventh line, a long one, and numbers that do not add up, of any two folders."""
+def test_the_numbers_of_any_two_folders_add_up(seed):
+    """Catches a crash, a row that is lost, and one that is counted twice."""
     random = np.random.default_rng(seed)
     pool = [
         dataclasses.replace(r, **({"model": "a" * 90 + r.model} if seed % 3 == 0 else {}))
@@ -288,15 +283,13 @@ def test_the_last_lines_are_six_and_short(seed):
 
     ours, theirs = folder(), folder()
     of = reproduced(ours, theirs)
-    last = lines(of, as_tables(ours).runs, Path("results/mini/report.html"))
-    assert 3 <= len(last) <= 6
-    assert all(len(line) <= LONGEST and "\n" not in line for line in last)
-    assert last[0].startswith(f"{len({r.path for r in ours})} run")
     shared = {r.path for r in ours} & {r.path for r in theirs}
     assert len(of.seeds) <= len(shared)
-    assert sum(len(of.of("psnr_db", verdict)) for verdict in (AGREES, DIFFERS, UNDECIDED)) == len(of.of("psnr_db"))
-    assert len(section(of).table) == len(of.of("psnr_db"))
-    assert sum(map(len, of.otherwise.values())) <= len(of.only_ours)
+    rows = len(of.of("psnr_db"))
+    assert (summary(of)[[AGREES, DIFFERS, UNDECIDED]].sum(axis=1) == rows).all()
+    assert len(sections(of, "published")[0].table) == rows
+    groups = {(r.model, r.variant, r.scene) for r in (*ours, *theirs)}
+    assert rows + len(of.unmatched) == len(groups)
 
 
 def write(records: list[Record], folder: Path) -> Path:
@@ -311,16 +304,12 @@ def test_the_command(tmp_path, capsys):
     before = {path: path.read_bytes() for path in theirs.rglob("*") if path.is_file()}
     assert main([str(ours), "--against", str(theirs), "--json", str(tmp_path / "a.json")]) == 0
     out = capsys.readouterr().out
-    seconds = sum(r.cost.train_s for r in runs(seeds=1))
-    last = out.splitlines()[-4:]
-    assert last[0] == f"10 runs: 5 models on 2 scenes, seed 0, 1,000 iterations, {duration(seconds)} of training in all"
-    assert last[1].endswith(": 10 of 10 runs")
-    assert last[2] == "PSNR agrees in 10 of 10 models on scenes; largest difference 0.00 dB"
-    assert last[3] == f"Report: {ours / 'report.html'}"
+    assert out.splitlines()[-1] == f"Report: {ours / 'report.html'}"
+    assert f"PSNR agrees, against {theirs}" in out
     written = json.loads((tmp_path / "a.json").read_text())
-    assert (written["verdict"], written["lines"][1]) == (AGREES, last[2])
-    assert [len(written["runs"][side]) for side in ("ours", "theirs")] == [10, 30]
-    assert all(run in written["runs"]["theirs"] for run in written["runs"]["ours"])
+    assert (written["verdict"], written["summary"][0]["agrees"]) == (AGREES, 10)
+    assert [len(written["runs"][side]) for side in ("new", "reference")] == [10, 30]
+    assert all(run in written["runs"]["reference"] for run in written["runs"]["new"])
     row = next(r for r in written["rows"] if (r["model"], r["scene"], r["quantity"]) == ("7dgs", "suzanne", "psnr_db"))
     assert (row["bit_equal"], row["difference"], row["low"]) == (True, 0.0, None)
     page = (ours / "report.html").read_text()
