@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from many_records import frontier, on_demand
+from records import frontier, on_demand
 
 from gsbench.measure import record as files
 from gsbench.measure.machine import Hardware

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from report.make_golden import make
+from report.records import make
 from tiny_run import overrides, run_here
 
 from gsbench.measure.curve import Point
