@@ -7,7 +7,7 @@ import torch
 from benchmarks.scene import camera, gaussians, model
 from gsbench.kernels.adam import adam
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import Viewport, backward_by_splat
+from gsbench.kernels.raster import RasterInputs, Viewport, backward_by_splat
 from gsbench.models import CameraTime
 from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
@@ -29,7 +29,9 @@ def main() -> None:
                 (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
         for room in (100, 100_000):  # too few pairs, too many
             with torch.no_grad():
-                draw_within(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D), VIEWPORT, room)
+                draw_within(
+                    RasterInputs(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D)), VIEWPORT, room
+                )
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
         batch = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))

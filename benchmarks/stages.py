@@ -11,7 +11,7 @@ from benchmarks.timing import Row
 from benchmarks.training import adam_of, one_view, training_step
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, HIDDEN, TRANSMITTANCE_MIN
 from gsbench.kernels.operation import Operation
-from gsbench.kernels.raster import Splats, Viewport, bin_tiles, flag_values
+from gsbench.kernels.raster import RasterInputs, Splats, Viewport, bin_tiles, flag_values
 from gsbench.kernels.tape import Tape
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import rasterize_slice
@@ -154,7 +154,9 @@ def binning(name: str, calls: dict[str, Call]) -> Iterator[Row]:
     means, factors, opacities, viewmats, Ks, _ = project.tensors
     values = means, factors, opacities, blend.tensors[3], viewmats, Ks, blend.tensors[4]
     splats, viewport, flags = Splats(*project.outputs), Viewport(*project.numbers), torch.zeros(1, dtype=torch.int64)
-    yield Row("stages", f"{name} check values", lambda: flag_values(*values), floor=("bytes", _bytes(values)))
+    yield Row(
+        "stages", f"{name} check values", lambda: flag_values(RasterInputs(*values)), floor=("bytes", _bytes(values))
+    )
     read = _bytes([splats.means2d, splats.depths, splats.half_sizes])
     yield Row("stages", f"{name} bin", lambda: bin_tiles(splats, viewport, flags),
               floor=("bytes", read + _bytes(blend.tensors[5:7])))  # fmt: skip
@@ -187,7 +189,7 @@ def blended_alphas(project: Call) -> float:
     """Count pairs of a pixel and a Gaussian that is blended into it: alpha of at least 1/255, before the pixel ends."""
     means, factors, opacities, viewmats, Ks, _ = project.tensors
     viewport = Viewport(*project.numbers)
-    splats = reference.project(means, factors, opacities, viewmats[0], Ks[0], *viewport)
+    splats = reference.project(means, factors, opacities, viewmats[0], Ks[0], viewport)
     tiles, ids = reference.bin_tiles(splats, viewport.width, viewport.height)
     across, total = -(-viewport.width // reference.TILE), 0
     offsets = torch.arange(reference.TILE) + 0.5

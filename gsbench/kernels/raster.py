@@ -32,6 +32,19 @@ class Viewport(NamedTuple):
     antialias: bool
 
 
+class RasterInputs(NamedTuple):
+    """The tensors that `rasterize` takes, of one dtype on one device; `gsbench.raster.rasterize` explains them."""
+
+    means: Tensor  # [N, 3]
+    factors: Tensor  # [N, 3, 3] F of the covariances F F^T
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, D] for all cameras, or [C, N, D]
+    viewmats: Tensor  # [C, 4, 4]
+    Ks: Tensor  # [C, 3, 3]
+    background: Tensor  # [D]
+    beta_exponents: Tensor | None = None  # [N] of Beta profiles; None: Gaussians
+
+
 class Splats(NamedTuple):
     """Gaussians projected to the image planes of C cameras."""
 
@@ -39,7 +52,7 @@ class Splats(NamedTuple):
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
     depths: Tensor  # [C, N]
     half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; 0: not drawn; without a gradient
-    shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
+    beta_exponents: Tensor | None = None  # [N] of Beta profiles; None: Gaussians
 
 
 class Bins(NamedTuple):
@@ -75,16 +88,14 @@ _project = Operation(
 )
 
 
-def project(
-    means: Tensor, factors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor, viewport: Viewport,
-    shapes: Tensor | None = None,
-) -> Splats:  # fmt: skip
+def project(inputs: RasterInputs, viewport: Viewport) -> Splats:
     """Project 3D Gaussians to the image planes of all cameras (EWA splatting, eq. 29).
 
-    The result is differentiable with respect to all arguments except Ks and shapes, on which only the sizes depend. The
-    arguments are those of `gsbench.raster.rasterize`.
+    The result is differentiable with respect to all inputs except Ks and exponents, on which only the sizes depend.
     """
-    return Splats(*_project(means, factors, opacities, viewmats, Ks, shapes, *viewport))._replace(shapes=shapes)
+    means, factors, opacities, _, viewmats, Ks, _, beta_exponents = inputs
+    splats = Splats(*_project(means, factors, opacities, viewmats, Ks, beta_exponents, *viewport))
+    return splats._replace(beta_exponents=beta_exponents)
 
 
 def _of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
@@ -127,8 +138,8 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 
     Colours are [N, D] if all cameras see the same ones, otherwise [C, N, D]. The background is [D].
     """
-    means2d, roots, _, half_sizes, shapes = splats
-    image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, shapes, *viewport[:2])
+    means2d, roots, _, half_sizes, beta_exponents = splats
+    image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, beta_exponents, *viewport[:2])
     return image, alpha
 
 
@@ -145,18 +156,15 @@ def backward_by_splat() -> Iterator[None]:
         _blend.backward_kernel = before
 
 
-def flag_values(*values: Tensor, shapes: Tensor | None = None) -> Tensor:
-    """Return a tensor [1] int64 that is not zero if any value is not finite or out of range.
-
-    The values are means, factors, opacities, colours, viewmats, Ks, background and shapes, as in `rasterize`.
-    """
-    means, _, _, colors, viewmats, *_ = values
+def flag_values(inputs: RasterInputs) -> Tensor:
+    """Return a tensor [1] int64 that is not zero if any value is not finite or out of range."""
+    means, colors = inputs.means, inputs.colors
     flags = torch.zeros(1, dtype=torch.int64, device=means.device)
-    rows = in_rows([*values, *([] if shapes is None else [shapes])])
-    names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background", "shapes")
-    slots = {"N": len(means), "C": len(viewmats), "all_colors": colors.numel(), "D": colors.shape[-1], "shapes": 0,
-             "out.flags": address(flags)}  # fmt: skip
-    slots |= dict(zip(names, map(address, rows), strict=False))  # shapes may be left out
+    sizes = {"N": len(means), "C": len(inputs.viewmats), "all_colors": colors.numel(), "D": colors.shape[-1]}
+    names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background", "shapes")  # of the kernel
+    present = {name: x for name, x in zip(names, inputs, strict=True) if x is not None}
+    rows = in_rows(list(present.values()))
+    slots = sizes | {"shapes": 0, "out.flags": address(flags)} | dict(zip(present, map(address, rows), strict=True))
     library_of(means.device.type).call("flag_values", slots, means)
     return flags
 
@@ -204,9 +212,8 @@ def _countable(pairs: int) -> int:
 
 def _splat_slots(splats: Splats, viewport: Viewport) -> dict[str, Any]:
     C, N = splats.depths.shape
-    return {"N": N, "C": C, "width": viewport.width, "height": viewport.height} | {
-        key: address(x) for key, x in splats._asdict().items()
-    }
+    addresses = dict(zip(("means2d", "roots", "depths", "half_sizes", "shapes"), map(address, splats), strict=True))
+    return {"N": N, "C": C, "width": viewport.width, "height": viewport.height} | addresses
 
 
 def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:

@@ -275,16 +275,16 @@ class GaussianModel(nn.Module, ABC):
 
     def colored(self, geometry: Geometry, raw: Raw, query: CameraTime) -> Gaussians3D:
         """Compute the colours of 3D Gaussians, and return them together with means, factors and opacities."""
-        means, factors, opacities, shapes = geometry
-        return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), shapes)
+        means, factors, opacities, beta_exponents = geometry
+        return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), beta_exponents)
 
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
 
         A subclass that has a kernel for this overrides the method.
         """
-        means, factors, opacity_factor, shapes = self.condition(raw, query)
-        return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, shapes)
+        means, factors, opacity_factor, beta_exponents = self.condition(raw, query)
+        return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, beta_exponents)
 
     def slice_by(self, operation: Operation, raw: Raw, query: CameraTime, **numbers: Any) -> Geometry:
         """Compute the 3D Gaussians for a camera and a time by a kernel.

@@ -16,7 +16,7 @@ from gsbench.models.appearance import MOST_PACKED, ColorOrder, coefficients_with
 from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
-from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_shapes
+from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_exponents
 
 OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
 _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
@@ -93,7 +93,7 @@ class GatedModel(GaussianModel):
         first, rest = self.condition(changing, query), self.static(others)
         opacities = torch.sigmoid(raw["opacities"]) * torch.cat([first.opacity_factor, rest.opacity_factor])
         means, factors = torch.cat([first.means, rest.means]), torch.cat([first.factors, rest.factors])
-        return Geometry(means, factors, opacities, joined_shapes(first.shapes, rest.shapes))
+        return Geometry(means, factors, opacities, joined_exponents(first.beta_exponents, rest.beta_exponents))
 
     def pack(self) -> dict[str, Tensor]:
         """Return the tensors for a checkpoint, without unused entries such as the motion of static Gaussians."""

@@ -17,7 +17,7 @@ class Gaussians3D(NamedTuple):
     factors: Tensor  # [N, 3, 3]
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
-    shapes: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
+    beta_exponents: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
 
 
 class Conditioned(NamedTuple):
@@ -26,7 +26,7 @@ class Conditioned(NamedTuple):
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     opacity_factor: Tensor  # [N] f_temp f_dir in [0, 1]
-    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+    beta_exponents: Tensor | None = None  # [N], as in `Gaussians3D`
 
 
 class Geometry(NamedTuple):
@@ -35,7 +35,7 @@ class Geometry(NamedTuple):
     means: Tensor  # [N, 3]
     factors: Tensor  # [N, 3, 3]
     opacities: Tensor  # [N]
-    shapes: Tensor | None = None  # [N], as in `Gaussians3D`
+    beta_exponents: Tensor | None = None  # [N], as in `Gaussians3D`
 
 
 def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
@@ -43,16 +43,16 @@ def tensors_of(parts: Iterable[Tensor | None]) -> list[Tensor]:
     return [part for part in parts if part is not None]
 
 
-def reach(shapes: Tensor) -> Tensor:
+def reach(beta_exponents: Tensor) -> Tensor:
     """Return at how many standard deviations of the Gaussian that looks like it a Beta profile ends, sqrt(2 b), [N].
 
     A profile (1 - r^2)^b ends at r = 1, and is close to the Gaussian exp(-b r^2), whose standard deviation is
     1 / sqrt(2 b).
     """
-    return sqrt(2 * shapes)
+    return sqrt(2 * beta_exponents)
 
 
-def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+def joined_exponents(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
 
     Raises:
@@ -61,6 +61,6 @@ def joined_shapes(first: Tensor | None, second: Tensor | None) -> Tensor | None:
     if first is None and second is None:
         return None
     if first is None or second is None:
-        raise InputError("shapes: expected every row of a slice to have one or none to have one, got some of them: "
+        raise InputError("beta_exponents: expected every row of a slice to have one or none to have one, got some: "
                          "let `condition` and `static` of the model agree")  # fmt: skip
     return torch.cat([first, second])

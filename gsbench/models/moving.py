@@ -302,11 +302,11 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Return moved means, covariance factors, opacity factors and the exponents of the profiles."""
-        return super().condition(raw, query)._replace(shapes=profiles(raw))
+        return super().condition(raw, query)._replace(beta_exponents=profiles(raw))
 
     def static(self, raw: Raw) -> Conditioned:
         """Return the Gaussians at their means, with their profiles."""
-        return super().static(raw)._replace(shapes=profiles(raw))
+        return super().static(raw)._replace(beta_exponents=profiles(raw))
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
         """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import Backend, resolve
-from gsbench.kernels.raster import Viewport
+from gsbench.kernels.raster import RasterInputs, Viewport
 from gsbench.models.base import GaussianModel
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.gaussian_batch import Gaussians3D
@@ -23,7 +23,7 @@ def rasterize_slice(
     """Rasterize the 3D Gaussians of a model (with colours) for one camera, as `gsbench.raster.rasterize`."""
     view = camera.viewmat[None], camera.K[None], camera.width, camera.height
     return rasterize(*gaussians[:4], *view, background=background, backend=backend, antialias=antialias,
-                     shapes=gaussians.shapes)  # fmt: skip
+                     beta_exponents=gaussians.beta_exponents)  # fmt: skip
 
 
 def render(
@@ -99,9 +99,10 @@ class GraphedFrames:
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            means, factors, opacities, colors, shapes = self.model.slice(CameraTime.of(recorded, moment))
-            return draw_within(means, factors, opacities, colors[None], recorded.viewmat[None], recorded.K[None],
-                               self.background, view, room, shapes)  # fmt: skip
+            means, factors, opacities, colors, beta_exponents = self.model.slice(CameraTime.of(recorded, moment))
+            camera_tensors = recorded.viewmat[None], recorded.K[None], self.background
+            inputs = RasterInputs(means, factors, opacities, colors[None], *camera_tensors, beta_exponents)
+            return draw_within(inputs, view, room)
 
         with torch.cuda.device_of(recorded.K):
             play, (image, needed) = capture(frame)

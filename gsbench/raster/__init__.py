@@ -4,10 +4,10 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import CPU, CUDA, Backend, resolve
-from gsbench.kernels.raster import Viewport
+from gsbench.kernels.raster import RasterInputs, Viewport
+from gsbench.kernels.tensors import check_tensor
 from gsbench.raster import native, reference
-from gsbench.raster.checks import check_arguments
-from gsbench.raster.output import RasterInfo, RasterOutput
+from gsbench.raster.interface import RasterInfo, RasterOutput, check_arguments
 
 __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
 
@@ -31,7 +31,7 @@ def rasterize(
     eps2d: float = EPS2D,
     backend: str | Backend = "auto",
     antialias: bool = False,
-    shapes: Tensor | None = None,  # [N]
+    beta_exponents: Tensor | None = None,  # [N]
 ) -> RasterOutput:
     """Render N Gaussians to C images by the rules of 3DGS (Kerbl et al. 2023, section 4 and appendix C).
 
@@ -39,9 +39,9 @@ def rasterize(
 
     Gaussians are blended front to back by camera depth; of equal depths the lower index comes first. The alpha of a
     Gaussian in a pixel is `min(0.999, opacity * exp(-r2 / 2))`. Here r2 = d^T S^-1 d, with the offset d from the centre
-    and the projected covariance S (with `eps2d`), in pixels. With `shapes` alpha is `min(0.999, opacity * (1 - r2)^b)`
-    where r2 < 1, and zero elsewhere; 1 - r2 is held above 1e-6. Alphas below 1/255 are skipped. A pixel stops before
-    the Gaussian that would reduce its transmittance below 1e-4.
+    and the projected covariance S (with `eps2d`), in pixels. With exponents b of Beta profiles alpha is
+    `min(0.999, opacity * (1 - r2)^b)` where r2 < 1, and zero elsewhere; 1 - r2 is held above 1e-6. Alphas below 1/255
+    are skipped. A pixel stops before the Gaussian that would reduce its transmittance below 1e-4.
 
     Args:
         means: the means, [N, 3], world units.
@@ -58,7 +58,7 @@ def rasterize(
         eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
         backend: `reference` (torch), `cpu` or `cuda` (kernels), or `auto` (the fastest installed one).
         antialias: whether to scale opacities for the area that `eps2d` adds, as the 2D filter of Mip-Splatting does.
-        shapes: the exponents b > 0 of the Beta profiles (Universal Beta Splatting), [N]; None: Gaussians.
+        beta_exponents: the exponents b > 0 of the Beta profiles (Universal Beta Splatting), [N]; None: Gaussians.
 
     Returns:
         The images [C, H, W, D], their alpha [C, H, W, 1], and `RasterInfo` for density control.
@@ -83,17 +83,16 @@ def rasterize(
     if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
         raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
                          f"and {antialias!r:.40}")  # fmt: skip
-    check_arguments(
-        means, factors, opacities, colors, viewmats, Ks, width, height, background, near, far, eps2d, shapes
-    )
     if background is None:
-        background = colors.new_zeros(colors.shape[-1])
-    chosen = resolve(backend, means.device.type) if isinstance(backend, str) else backend
-    inputs = means, factors, opacities, colors, viewmats, Ks, background
+        check_tensor(colors, "colors")
+        background = colors.new_zeros(colors.shape[-1:])
+    inputs = RasterInputs(means, factors, opacities, colors, viewmats, Ks, background, beta_exponents)
     viewport = Viewport(width, height, near, far, eps2d, antialias)
+    check_arguments(inputs, viewport)
+    chosen = resolve(backend, means.device.type) if isinstance(backend, str) else backend
     if chosen.serves(means):
-        return native.draw(*inputs, viewport, shapes)
+        return native.draw(inputs, viewport)
     if backend != "auto" and chosen in (CPU, CUDA):
         raise InputError(f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
                          f"{means.dtype} on {means.device}; backend 'reference' takes any")  # fmt: skip
-    return reference.draw(*inputs, viewport, shapes)
+    return reference.draw(inputs, viewport)

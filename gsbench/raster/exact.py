@@ -13,9 +13,9 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.library import Library, library_of
 from gsbench.kernels.operation import address
-from gsbench.kernels.raster import Splats, Viewport, bin_tiles, project
+from gsbench.kernels.raster import RasterInputs, Splats, Viewport, bin_tiles, project
 from gsbench.raster import EPS2D, FAR, NEAR
-from gsbench.raster.checks import check_arguments, check_values
+from gsbench.raster.interface import check_arguments, check_values
 
 U = 2.0**-24  # the unit roundoff of float32
 RECORD = 16  # doubles of a Gaussian that is projected in float64 and float32
@@ -51,33 +51,20 @@ class ExactImage(NamedTuple):
 
 @torch.no_grad()
 def exact_image(
-    exact: Gaussians,
-    single: Gaussians,
-    viewmat: Tensor,  # [4, 4]
+    exact: Gaussians,  # in float64
+    single: Gaussians,  # the same, computed in float32
+    viewmat: Tensor,  # [4, 4] float32, taken as exact, as all further tensors
     K: Tensor,  # [3, 3]
     width: int,
     height: int,
     *,
-    background: Tensor | None = None,  # [D]
+    background: Tensor | None = None,  # [D]; None: black
     near: float = NEAR,
     far: float = FAR,
     eps2d: float = EPS2D,
     antialias: bool = False,
 ) -> ExactImage:
-    """Render Gaussians in float64, and bound the error of `rasterize` on the same Gaussians in float32.
-
-    Args:
-        exact: the Gaussians in float64, as in `gsbench.raster.rasterize`.
-        single: the same Gaussians computed in float32.
-        viewmat: world to camera, [4, 4] float32, as all further tensors; taken as exact.
-        K: intrinsics, [3, 3].
-        width: the width of the image, pixels.
-        height: the height of the image, pixels.
-        background: the background colour, [D]; None: black.
-        near: Gaussians whose mean is nearer than this depth are culled.
-        far: Gaussians whose mean is farther than this depth are culled.
-        eps2d: the number that is added to the diagonal of the projected covariances, pixels^2.
-        antialias: whether to scale opacities for the area that `eps2d` adds.
+    """Render Gaussians in float64, and bound the error of `gsbench.raster.rasterize` on the same ones in float32.
 
     Raises:
         InputError: an argument is not what `rasterize` takes, the two sets of Gaussians differ in shape, or the CPU
@@ -85,16 +72,16 @@ def exact_image(
     """
     library = library_of("cpu")
     viewport = Viewport(width, height, near, far, eps2d, antialias)
-    colors = exact[3]
-    background = viewmat.new_zeros(colors.shape[-1]) if background is None else background
-    for gaussians, dtype in ((exact, torch.float64), (single, torch.float32)):
-        _check(gaussians, dtype, viewmat, K, background, viewport)
-    N, D = colors.shape
-    if len(single[0]) != N:
-        raise InputError(f"expected as many Gaussians in float32 as in float64, got {len(single[0])} and {N}")
-    means, factors, opacities, single_colors, shapes = single
-    rounded = project(means, factors, opacities, viewmat[None], K[None], viewport, shapes)
-    records, boxes = _exact_splats(library, exact, rounded, viewmat, K, viewport)
+    background = viewmat.new_zeros(exact[3].shape[-1]) if background is None else background
+    views = viewmat[None], K[None], background
+    doubles, rounded = (
+        _checked(gaussians, views, dtype, viewport)
+        for gaussians, dtype in ((exact, torch.float64), (single, torch.float32))
+    )
+    N, D = doubles.colors.shape
+    if len(rounded.means) != N:
+        raise InputError(f"expected as many Gaussians in float32 as in float64, got {len(rounded.means)} and {N}")
+    records, boxes = _exact_splats(library, doubles, project(rounded, viewport), viewmat, K, viewport)
     bins, _ = bin_tiles(boxes, viewport, torch.zeros(1, dtype=torch.int64))
     out = ExactImage(
         torch.empty(height, width, D, dtype=torch.float64),
@@ -102,41 +89,43 @@ def exact_image(
         torch.empty(height, width, dtype=torch.int32),
         torch.empty(height, width, dtype=torch.uint8),
     )
-    kept = {"records": records, "colors": colors.contiguous(), "single_colors": single_colors.contiguous(),
+    kept = {"records": records, "colors": doubles.colors.contiguous(), "single_colors": rounded.colors.contiguous(),
             "background": background.contiguous(), "offsets": bins.offsets, "ids": bins.ids}  # fmt: skip
     kept |= {f"out.{name}": x for name, x in out._asdict().items()}
-    numbers = {"D": D, "beta": shapes is not None, "width": width, "height": height}
+    numbers = {"D": D, "beta": rounded.beta_exponents is not None, "width": width, "height": height}
     library.call("exact_image", {name: x.data_ptr() for name, x in kept.items()} | numbers, viewmat)
     return out
 
 
-def _check(
-    gaussians: Gaussians, dtype: torch.dtype, viewmat: Tensor, K: Tensor, background: Tensor, viewport: Viewport
-) -> None:
-    means, factors, opacities, colors, shapes = gaussians
+def _checked(
+    gaussians: Gaussians, views: tuple[Tensor, Tensor, Tensor], dtype: torch.dtype, viewport: Viewport
+) -> RasterInputs:
+    """Return Gaussians, viewmats, Ks and background as inputs of the rasterizer; raise InputError if they are wrong."""
+    means, factors, opacities, colors, beta_exponents = gaussians
     if means.dtype != dtype or means.device.type != "cpu":
         raise InputError(f"expected Gaussians of {dtype} on the CPU, got {means.dtype} on {means.device}")
-    views = viewmat[None].to(dtype), K[None].to(dtype)
-    check_arguments(means, factors, opacities, colors, *views, viewport.width, viewport.height, background.to(dtype),
-                    viewport.near, viewport.far, viewport.eps2d, shapes)  # fmt: skip
-    check_values(means, factors, opacities, colors, *views, background.to(dtype), shapes)
+    viewmats, Ks, background = (x.to(dtype) for x in views)
+    inputs = RasterInputs(means, factors, opacities, colors, viewmats, Ks, background, beta_exponents)
+    check_arguments(inputs, viewport)
+    check_values(inputs)
+    return inputs
 
 
 def _exact_splats(
-    library: Library, exact: Gaussians, rounded: Splats, viewmat: Tensor, K: Tensor, viewport: Viewport
+    library: Library, exact: RasterInputs, rounded: Splats, viewmat: Tensor, K: Tensor, viewport: Viewport
 ) -> tuple[Tensor, Splats]:
     """Project in float64: return an `ExactRecord` of kernels.h for each Gaussian, and boxes [1, N, 2].
 
     The boxes contain those of float64 and of float32; their depths are exact ones, rounded to float32.
     """
-    means, factors, opacities, _, shapes = exact
-    records = torch.empty(len(means), RECORD, dtype=torch.float64)
+    records = torch.empty(len(exact.means), RECORD, dtype=torch.float64)
     boxes = rounded._replace(**{name: torch.empty_like(getattr(rounded, name)) for name in BOXES})
-    kept = {"means": means, "factors": factors, "opacities": opacities, "shapes": shapes, "viewmats": viewmat, "Ks": K,
-            "means2d": rounded.means2d, "roots": rounded.roots, "depths": rounded.depths,
-            "half_sizes": rounded.half_sizes, "single_shapes": rounded.shapes}  # fmt: skip
+    kept = {"means": exact.means, "factors": exact.factors, "opacities": exact.opacities,
+            "shapes": exact.beta_exponents, "viewmats": viewmat, "Ks": K, "means2d": rounded.means2d,
+            "roots": rounded.roots, "depths": rounded.depths, "half_sizes": rounded.half_sizes,
+            "single_shapes": rounded.beta_exponents}  # fmt: skip
     kept = {name: None if x is None else x.contiguous() for name, x in kept.items()}
     kept |= {"out.records": records} | {f"out.{name}": getattr(boxes, name) for name in BOXES}
-    slots = {name: address(x) for name, x in kept.items()} | {"N": len(means)} | viewport._asdict()
+    slots = {name: address(x) for name, x in kept.items()} | {"N": len(exact.means)} | viewport._asdict()
     library.call("exact_splats", slots, viewmat)
     return records, boxes

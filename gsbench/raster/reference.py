@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, RIM_MIN, TRANSMITTANCE_MIN
-from gsbench.kernels.raster import LOWER, Viewport
+from gsbench.kernels.raster import LOWER, RasterInputs, Viewport
 from gsbench.process.memory import require
-from gsbench.raster.checks import check_values
-from gsbench.raster.output import RasterInfo, RasterOutput
+from gsbench.raster.interface import RasterInfo, RasterOutput, check_values
 
 TILE = 8  # pixels; in small tiles fewer pixels are evaluated for Gaussians that do not reach them
 NUMBERS = 300  # numbers in memory for each Gaussian and camera, measured without gradients
@@ -28,24 +27,24 @@ class CameraSplats(NamedTuple):
     opacities: Tensor  # [N]
     depths: Tensor  # [N]
     half_sizes: Tensor  # [N, 2] pixels: alpha < ALPHA_MIN outside of means2d +- half_sizes; 0: culled
-    shapes: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
+    beta_exponents: Tensor | None = None  # [N] exponents of Beta profiles; None: Gaussians
 
 
-def draw(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    background: Tensor, viewport: Viewport, shapes: Tensor | None = None,
-) -> RasterOutput:  # fmt: skip
-    """Render images for all cameras, one after the other; see `gsbench.raster.rasterize` for the arguments.
+def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
+    """Render images for all cameras, one after the other; see `gsbench.raster.rasterize`.
 
     Raises:
         InputError: a value is out of range, or the CPU memory does not suffice.
     """
-    _check_room(means, viewmats)
-    check_values(means, factors, opacities, colors, viewmats, Ks, background, shapes)
+    means, factors, opacities, colors, viewmats, Ks, background, beta_exponents = inputs
+    if means.device.type == "cpu":
+        C, N = len(viewmats), len(means)
+        require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
+    check_values(inputs)
     if colors.dim() == 2:
         colors = colors.expand(len(viewmats), *colors.shape)
     splats = [
-        project(means, factors, opacities, viewmat, K, *viewport, shapes)
+        project(means, factors, opacities, viewmat, K, viewport, beta_exponents)
         for viewmat, K in zip(viewmats, Ks, strict=True)
     ]
     means2d = torch.stack([s.means2d for s in splats])  # all images are computed from it, so it gets a gradient
@@ -65,28 +64,17 @@ def draw(
     return RasterOutput(torch.stack(images), torch.stack(alphas), info)
 
 
-def _check_room(means: Tensor, viewmats: Tensor) -> None:
-    """Raise InputError if the CPU memory does not suffice for the Gaussians, means [N, 3], of all cameras [C, 4, 4]."""
-    if means.device.type == "cpu":
-        C, N = len(viewmats), len(means)
-        require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
-
-
 def project(
     means: Tensor,  # [N, 3]
     factors: Tensor,  # [N, 3, 3]
     opacities: Tensor,  # [N]
     viewmat: Tensor,  # [4, 4]
     K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    near: float,
-    far: float,
-    eps2d: float,
-    antialias: bool,
-    shapes: Tensor | None = None,  # [N]
+    viewport: Viewport,
+    beta_exponents: Tensor | None = None,  # [N]
 ) -> CameraSplats:
     """Project Gaussians to an image by the affine approximation at each mean (EWA splatting, eq. 29)."""
+    width, height, near, far, eps2d, antialias = viewport
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     means_c = means @ rotation.T + translation
     drawn = (means_c[:, 2] > near) & (means_c[:, 2] < far)
@@ -128,12 +116,12 @@ def project(
     # bounding box of this ellipse has the half sizes r sqrt(cov_xx), r sqrt(cov_yy). A hundredth of a pixel is added
     # for rounding.
     most = (255 * opacities.detach()).clamp(min=1).log()
-    reach = 2 * most if shapes is None else -torch.expm1(-most / shapes.detach())
+    reach = 2 * most if beta_exponents is None else -torch.expm1(-most / beta_exponents.detach())
     half_sizes = (reach[:, None] * torch.stack([xx + eps, yy], -1).detach()).sqrt() * size[:, None] + 0.01
     inside = ((means2d + half_sizes > 0) & (means2d - half_sizes < means2d.new_tensor([width, height]))).all(-1)
     drawn = drawn & (opacities >= ALPHA_MIN) & inside
     half_sizes = torch.where(drawn[:, None], half_sizes, 0.0)
-    return CameraSplats(means2d, conics, opacities, means_c[:, 2], half_sizes, shapes)
+    return CameraSplats(means2d, conics, opacities, means_c[:, 2], half_sizes, beta_exponents)
 
 
 @torch.no_grad()
@@ -182,8 +170,8 @@ def blend(
     D = colors.shape[-1]
     # A table with a row for each Gaussian and a row of zeros for padding, so that one gather reads all parameters.
     table = torch.cat([splats.means2d, splats.conics, splats.opacities[:, None], colors], -1)
-    if splats.shapes is not None:
-        table = torch.cat([table, splats.shapes[:, None]], -1)
+    if splats.beta_exponents is not None:
+        table = torch.cat([table, splats.beta_exponents[:, None]], -1)
     table = torch.cat([table, table.new_zeros(1, table.shape[1])])
 
     lengths = torch.bincount(tiles, minlength=across * down)
@@ -222,8 +210,8 @@ def _blend_tiles(
     dy = (top[:, None, None] + offsets) - rows[..., 1:2]
     a, b, c, opacity = rows[..., 2:6, None].unbind(-2)
     r2 = ((b * dy)[..., :, None] + (a * dx)[..., None, :]).square() + (c * dy).square()[..., :, None]
-    shape = rows[..., 6 + D :, None]  # [T, K, 0 or 1, 1]
-    profile = _beta(r2, shape) if shape.shape[-2] else torch.exp(-0.5 * r2)
+    exponent = rows[..., 6 + D :, None]  # [T, K, 0 or 1, 1]
+    profile = _beta(r2, exponent) if exponent.shape[-2] else torch.exp(-0.5 * r2)
     alpha = (opacity[..., None] * profile).clamp(max=ALPHA_MAX).flatten(-2)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
     after = torch.cumprod(1 - alpha, 1)  # transmittance behind each Gaussian
@@ -233,7 +221,7 @@ def _blend_tiles(
     return weight.transpose(1, 2) @ color
 
 
-def _beta(r2: Tensor, shape: Tensor) -> Tensor:
+def _beta(r2: Tensor, exponent: Tensor) -> Tensor:
     """Return the Beta profile (1 - r^2)^b inside of r = 1, and zero outside, where it has no gradient.
 
     In the value and in the gradient, 1 - r^2 is held above RIM_MIN.
@@ -243,4 +231,4 @@ def _beta(r2: Tensor, shape: Tensor) -> Tensor:
     rest = 1 - r2
     held = rest + (RIM_MIN - rest).clamp(min=0).detach()  # detached: the gradient is that of the held value
     log_rest = torch.where(r2 < 0.5, torch.log1p(-r2), held.log())  # log1p keeps digits that large exponents need
-    return torch.where(inside, torch.exp(shape * log_rest), 0.0)
+    return torch.where(inside, torch.exp(exponent * log_rest), 0.0)

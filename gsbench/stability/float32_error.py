@@ -213,10 +213,10 @@ def reasons(
 ) -> list[list[str]]:
     """Return of some Gaussians whether each is flat, far, huge or opaque in a view."""
     means, factors, opacities = (part[rows] for part in gaussians[:3])
-    shapes = None if gaussians.shapes is None else gaussians.shapes[rows]
+    exponents = None if gaussians.beta_exponents is None else gaussians.beta_exponents[rows]
     exact = float64_camera(camera)
     viewport = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, False)
-    splats = project(means, factors, opacities, exact.viewmat, exact.K, *viewport, shapes)
+    splats = project(means, factors, opacities, exact.viewmat, exact.K, viewport, exponents)
     axes = torch.linalg.svdvals(factors)
     moved = U * (means.norm(dim=-1) + exact.center.norm()) * exact.K[0, 0] / splats.depths
     named = {

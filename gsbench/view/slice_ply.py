@@ -86,8 +86,8 @@ def trained_of(model: GaussianModel, query: CameraTime, *, keep_harmonics: bool 
     with torch.no_grad():
         gaussians = model.slice(query)
         means, factors, opacities, colors = (part.detach().cpu() for part in gaussians[:4])
-        if gaussians.shapes is not None:
-            factors = factors / reach(gaussians.shapes).cpu()[:, None, None]
+        if gaussians.beta_exponents is not None:
+            factors = factors / reach(gaussians.beta_exponents).cpu()[:, None, None]
         drawn = opacities >= ALPHA_MIN  # an alpha is at most the opacity, and the rasterizer skips lower ones
         if not drawn.any():
             when = "" if query.time is None else f" at time {float(query.time):g}"
@@ -98,7 +98,7 @@ def trained_of(model: GaussianModel, query: CameraTime, *, keep_harmonics: bool 
     log_scales, quats = decompose(factors[drawn])
     logits = torch.logit(opacities[drawn].double().clamp(max=LARGEST_OPACITY)).float()
     return TrainedGaussians(
-        means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:], from_profiles=gaussians.shapes is not None
+        means[drawn], log_scales, quats, logits, sh[:, 0], sh[:, 1:], from_profiles=gaussians.beta_exponents is not None
     )
 
 

@@ -11,7 +11,7 @@ from benchmarks.scene import camera as benchmark_camera
 from benchmarks.scene import model
 from gsbench.errors import InputError
 from gsbench.kernels.backends import CUDA, REFERENCE
-from gsbench.kernels.raster import Viewport
+from gsbench.kernels.raster import RasterInputs, Viewport
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.render import GraphedFrames, render
 from gsbench.raster import EPS2D, FAR, NEAR
@@ -83,7 +83,7 @@ def test_replays_of_beta_profiles(device: str, monkeypatch: pytest.MonkeyPatch) 
     fitted, replayed, launched = both(device, "3dgs")
     gaussians, at = launched(camera(device), 0.4), fitted.slice
     exponents = torch.linspace(0.1, 6.0, 300, device=device)
-    monkeypatch.setattr(fitted, "slice", lambda query: at(query)._replace(shapes=exponents))
+    monkeypatch.setattr(fitted, "slice", lambda query: at(query)._replace(beta_exponents=exponents))
     for distance in (4.0, 4.5):
         view = camera(device, distance)
         torch.testing.assert_close(replayed(view, 0.4), launched(view, 0.4), rtol=0, atol=1e-4)
@@ -119,8 +119,8 @@ def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
     with torch.no_grad():
         means, factors, opacities, colors, _ = fitted.slice(CameraTime.at(at.center, 0.4))
         image, needed = draw_within(
-            means[:N], factors[:N], opacities[:N], colors[None, :N], at.viewmat[None], at.K[None],
-            torch.tensor(BACKGROUND, device=device),
+            RasterInputs(means[:N], factors[:N], opacities[:N], colors[None, :N], at.viewmat[None], at.K[None],
+                         torch.tensor(BACKGROUND, device=device)),
             Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False), room,
         )  # fmt: skip
     assert needed.tolist()[-1] == 0

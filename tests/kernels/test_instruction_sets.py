@@ -34,7 +34,9 @@ def calls() -> dict[str, Callable[[], object]]:
     return {
         **{f"slice and colours of {name}": partial(slice_both_ways, of) for name, of in sliced.items()},
         "raster": lambda: rasterize(*splats, viewmats, Ks, 200, 200).image.sum().backward(),
-        "raster of Beta profiles": lambda: rasterize(*splats, viewmats, Ks, 200, 200, shapes=b).image.sum().backward(),
+        "raster of Beta profiles": lambda: (
+            rasterize(*splats, viewmats, Ks, 200, 200, beta_exponents=b).image.sum().backward()
+        ),
         "loss": lambda: l1_ssim(image, target, 0.2).backward(),
     }  # fmt: skip
 

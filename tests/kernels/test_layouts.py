@@ -22,13 +22,13 @@ LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("name", ["means", "factors", "opacities", "colors", "background", "shapes"])
+@pytest.mark.parametrize("name", ["means", "factors", "opacities", "colors", "background", "beta_exponents"])
 def test_gradient_of_a_leaf_of_any_layout(name: str, layout: str) -> None:
     """Catches memory read as it does not lie, a gradient that is added up in the memory that the rows of a leaf share,
     or one that is written in another order."""
     arguments = case("tall", torch.float32) | {"background": torch.tensor([0.1, 0.5, 0.9])}
-    if name == "shapes":
-        arguments["shapes"] = torch.linspace(0.5, 4.0, len(arguments["means"]))
+    if name == "beta_exponents":
+        arguments["beta_exponents"] = torch.linspace(0.5, 4.0, len(arguments["means"]))
     leaf = LAYOUTS[layout](arguments[name])
     images, gradients = [], []
     for backend, x in (("cpu", leaf.detach()), ("reference", leaf.detach().double().contiguous())):

@@ -16,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.kernels import raster
 from gsbench.raster import RasterOutput, rasterize
 
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "beta_exponents")
 Arguments = dict[str, Any]
 
 
@@ -162,9 +162,9 @@ def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
     N = 100_003
     arrays = [torch.full((N, 3), 0.5), torch.full((N, 3, 3), 0.5), torch.full((N,), 0.5), torch.full((N, 3), 0.5)]
     rest = torch.eye(4)[None], torch.eye(3)[None], torch.zeros(3)
-    assert int(raster.flag_values(*arrays, *rest)) == 0
+    assert int(raster.flag_values(raster.RasterInputs(*arrays, *rest))) == 0
     arrays[1].view(-1)[position] = bad
-    assert int(raster.flag_values(*arrays, *rest)) == 1 << 1
+    assert int(raster.flag_values(raster.RasterInputs(*arrays, *rest))) == 1 << 1
 
 
 @pytest.mark.parametrize(
@@ -172,9 +172,11 @@ def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
     [("means", torch.nan, "means: expected finite"), ("factors", torch.inf, "factors: expected finite"),
      ("opacities", 1.5, "opacities: expected values in"), ("colors", -torch.inf, "colors: expected finite"),
      ("viewmats", torch.nan, "viewmats: expected finite"), ("Ks", 0.0, "Ks: expected positive"),
-     ("background", torch.nan, "background: expected finite"), ("shapes", 0.0, "shapes: expected exponents above 0"),
-     ("shapes", -1.0, "shapes: expected exponents above 0"), ("shapes", torch.inf, "shapes: expected finite"),
-     ("shapes", torch.nan, "shapes: expected finite")],
+     ("background", torch.nan, "background: expected finite"),
+     ("beta_exponents", 0.0, "beta_exponents: expected exponents above 0"),
+     ("beta_exponents", -1.0, "beta_exponents: expected exponents above 0"),
+     ("beta_exponents", torch.inf, "beta_exponents: expected finite"),
+     ("beta_exponents", torch.nan, "beta_exponents: expected finite")],
 )  # fmt: skip
 def test_bad_values_are_named(name: str, value: float, message: str, place: Place) -> None:
     """Catches a value that shows late, as a picture of NaN: on a GPU the check does not wait for the device."""
@@ -193,7 +195,7 @@ def test_beta_vector(place: Place) -> None:
 def test_a_large_exponent_is_a_gaussian() -> None:
     """Catches digits of 1 - r^2 that are lost near 1, which an exponent of 10^5 multiplies: alphas were off by 1e-3."""
     arguments = with_background("random") | {"eps2d": 0.0}
-    large = arguments | {"factors": arguments["factors"] * (2e5**0.5), "shapes": torch.full((60,), 1e5)}
+    large = arguments | {"factors": arguments["factors"] * (2e5**0.5), "beta_exponents": torch.full((60,), 1e5)}
     gaussian, beta = (rasterize(**a, backend="cpu").image for a in (arguments, large))
     where = torch.stack([render(**cast(a, torch.float64)).slack > 1e-3 for a in (arguments, large)]).all(0)
     assert where.double().mean() > 0.8
@@ -209,10 +211,11 @@ def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
     gradients = []
     for backend in ("cpu", "reference"):
         factor = torch.diag(torch.tensor([1.0, 1, 0]))[None].requires_grad_()
-        shapes = torch.tensor([0.2], requires_grad=True)
+        exponents = torch.tensor([0.2], requires_grad=True)
         out = rasterize(torch.tensor([[0.0, 0, 1]]), factor, torch.ones(1), torch.ones(1, 1),
-                        torch.eye(4).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0, shapes=shapes, backend=backend)  # fmt: skip
-        slopes = [torch.autograd.grad(x, (factor, shapes), retain_graph=True) for x in out.alpha.flatten()]
+                        torch.eye(4).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0, beta_exponents=exponents,
+                        backend=backend)  # fmt: skip
+        slopes = [torch.autograd.grad(x, (factor, exponents), retain_graph=True) for x in out.alpha.flatten()]
         gradients.append((out.alpha.detach().flatten(), *map(torch.stack, zip(*slopes, strict=True))))
     for got, want in zip(*gradients, strict=True):
         assert want[2].abs().max() > 0
@@ -244,10 +247,12 @@ def test_operations_keep_torch_s_rules(name: str) -> None:
     inputs = [a[k].requires_grad_() for k in ("means", "factors", "opacities", "viewmats")]
     viewport = raster.Viewport(a["width"], a["height"], 0.01, 1e10, 0.3, False)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    shapes = a.get("shapes")
+    shapes = a.get("beta_exponents")
     exponents = torch.empty(0) if shapes is None else shapes.requires_grad_()
     torch.library.opcheck(torch.ops.gsbench.project, ([*inputs, a["Ks"], exponents], *viewport), test_utils=checks)
-    splats = raster.Splats(*(x.detach() for x in raster.project(*inputs, a["Ks"], viewport, shapes)[:4]))
+    means, factors, opacities, viewmats = inputs
+    whole = raster.RasterInputs(means, factors, opacities, a["colors"], viewmats, a["Ks"], a["background"], shapes)
+    splats = raster.Splats(*(x.detach() for x in raster.project(whole, viewport)[:4]))
     bins, _ = raster.bin_tiles(splats, viewport, torch.zeros(1, dtype=torch.int64))
     colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
     blended = [splats.means2d.requires_grad_(), splats.roots.requires_grad_(), splats.half_sizes, colors]

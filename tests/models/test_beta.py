@@ -106,8 +106,8 @@ def test_gradients_of_a_slice(name: str) -> None:
 
     def slice_of(*values: Tensor) -> tuple[Tensor, ...]:
         found = model.condition(raw | dict(zip(names, values, strict=True)), QUERY)
-        assert found.shapes is not None
-        return found.means, found.factors @ found.factors.mT, found.opacity_factor, found.shapes
+        assert found.beta_exponents is not None
+        return found.means, found.factors @ found.factors.mT, found.opacity_factor, found.beta_exponents
 
     assert torch.autograd.gradcheck(slice_of, [raw[key].requires_grad_() for key in names], atol=1e-6)
 
@@ -121,8 +121,8 @@ def test_they_start_as_their_authors_start(name: str) -> None:
     dynamic = "time" in model.observes
     assert model.splats["betas"].unique(dim=0).tolist() == [[0.0, *[-3.0 if dynamic else 0.0] * 3, *[0.0] * dynamic]]
     first = model.slice(CameraTime.at(CAMERA.float(), 0.3))
-    assert first.shapes is not None
-    assert first.shapes.unique().tolist() == [4.0]
+    assert first.beta_exponents is not None
+    assert first.beta_exponents.unique().tolist() == [4.0]
     sizes = torch.linalg.matrix_norm(first.factors, ord=2)
     torch.testing.assert_close(model.scales(), sizes / math.sqrt(8), rtol=1e-3, atol=0)
 
@@ -148,7 +148,7 @@ def test_dbs_is_gated_and_ubs_is_not(name: str) -> None:
     model, raw = lively(name)
     assert isinstance(model, GatedModel)
     assert not isinstance(build("ubs"), GatedModel)
-    assert torch.equal(model.static(raw).shapes, model.condition(raw, QUERY).shapes)
+    assert torch.equal(model.static(raw).beta_exponents, model.condition(raw, QUERY).beta_exponents)
 
 
 def test_outside_its_interval_a_gaussian_of_dbs_is_culled() -> None:

@@ -112,7 +112,7 @@ def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
     model.select(torch.arange(count))
     seen = model.slice(QUERY)
     assert len(model) == count
-    shapes = [] if seen.shapes is None else [(count,)]
+    shapes = [] if seen.beta_exponents is None else [(count,)]
     assert [tuple(x.shape) for x in tensors_of(seen)] == [(count, 3), (count, 3, 3), (count,), (count, 3), *shapes]
     assert all(x.isfinite().all() for x in tensors_of(seen))
     assert ((seen.opacities >= 0) & (seen.opacities <= 1)).all()
@@ -220,7 +220,7 @@ def test_a_slice_is_exported(name: str, agr: bool, tmp_path: Path) -> None:
     drawn = seen.opacities >= 1 / 255
     torch.testing.assert_close(read.means, seen.means[drawn].detach())
     torch.testing.assert_close(torch.sigmoid(read.logits), seen.opacities[drawn].detach())
-    factors = seen.factors if seen.shapes is None else seen.factors / reach(seen.shapes)[:, None, None]
+    factors = seen.factors if seen.beta_exponents is None else seen.factors / reach(seen.beta_exponents)[:, None, None]
     volumes = torch.linalg.det(factors[drawn].detach()).abs()
     torch.testing.assert_close(read.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
     if has_harmonics(model):

@@ -14,7 +14,7 @@ from gsbench.models import CameraTime
 from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
-from gsbench.models.gaussian_batch import Conditioned, joined_shapes, tensors_of
+from gsbench.models.gaussian_batch import Conditioned, joined_exponents, tensors_of
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import rasterize_slice, render
 from gsbench.scenes.scene import Camera, Points
@@ -62,8 +62,10 @@ def test_a_model_s_shapes_reach_the_image() -> None:
     """Catches shapes that are dropped on the way, so that a Beta kernel is drawn as a Gaussian without a word."""
     model = made(Shaped)
     seen = model.slice(HERE)
-    torch.testing.assert_close(seen.shapes, torch.arange(float(N)).exp())
-    drawn = [rasterize_slice(x, SEEN, torch.zeros(3), REFERENCE).image[0] for x in (seen, seen._replace(shapes=None))]
+    torch.testing.assert_close(seen.beta_exponents, torch.arange(float(N)).exp())
+    drawn = [
+        rasterize_slice(x, SEEN, torch.zeros(3), REFERENCE).image[0] for x in (seen, seen._replace(beta_exponents=None))
+    ]
     image = render(model, SEEN, None, torch.zeros(3))
     torch.testing.assert_close(image, drawn[0], rtol=0, atol=1e-4)
     assert (image - drawn[1]).abs().max() > 0.1
@@ -92,16 +94,16 @@ def test_rows_of_two_kinds_keep_their_shapes() -> None:
 
 def test_shapes_of_some_rows_are_refused() -> None:
     """Catches a model that forgets the shapes of its static rows, all of whose shapes would then be dropped."""
-    assert joined_shapes(None, None) is None
+    assert joined_exponents(None, None) is None
     with pytest.raises(InputError, match="let `condition` and `static` of the model agree"):
-        joined_shapes(torch.ones(2), None)
+        joined_exponents(torch.ones(2), None)
 
 
 def test_a_slice_without_shapes_is_as_before() -> None:
     """Catches an empty tensor of shapes where there are none: an image would be refused."""
     for backend in ({}, {"backend": REFERENCE}):
         model = made(Gaussians3DModel, **backend)
-        assert model.slice(HERE).shapes is None
+        assert model.slice(HERE).beta_exponents is None
         assert render(model, SEEN, None, torch.zeros(3)).any()
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 PRODUCTS = 1 << 21  # (Gaussian, pixel) pairs in one chunk, to limit memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
 RIM = 1e-3  # a pixel with |1 - r^2| below this is at the rim of a Beta profile
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "shapes")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "beta_exponents")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class _Splats(NamedTuple):
     covs: Tensor  # [M, 2, 2] pixels^2
     opacities: Tensor  # [M]
     colors: Tensor  # [M, D]
-    shapes: Tensor | None  # [M] exponents of Beta profiles; None: Gaussians
+    beta_exponents: Tensor | None  # [M] exponents of Beta profiles; None: Gaussians
 
 
 def render(
@@ -75,7 +75,8 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
     for c in range(len(viewmats)):
         for at, pixels in _pixels(width, height, len(inputs["means"])):
             splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], _colors_of(inputs["colors"], c),
-                              viewmats[c], Ks[c], width, height, shapes=inputs.get("shapes"), **rest)  # fmt: skip
+                              viewmats[c], Ks[c], width, height,
+                              beta_exponents=inputs.get("beta_exponents"), **rest)  # fmt: skip
             image, alpha, _, _ = _blend(splats, pixels, background)
             loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
             if loss.requires_grad:
@@ -96,7 +97,7 @@ def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
 def _project(
     means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmat: Tensor, K: Tensor,
     width: int, height: int, offsets: Tensor | None = None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
-    antialias: bool = False, shapes: Tensor | None = None,
+    antialias: bool = False, beta_exponents: Tensor | None = None,
 ) -> _Splats:  # fmt: skip
     R = viewmat[:3, :3]
     camera = means @ R.T + viewmat[:3, 3]
@@ -117,7 +118,8 @@ def _project(
     if antialias:
         opacities = opacities * (torch.linalg.det(covs).clamp(min=0) / torch.linalg.det(blurred)).sqrt()
     centers = centers if offsets is None else centers + offsets[order]
-    return _Splats(order, centers, blurred, opacities, colors[order], None if shapes is None else shapes[order])
+    exponents = None if beta_exponents is None else beta_exponents[order]
+    return _Splats(order, centers, blurred, opacities, colors[order], exponents)
 
 
 def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -129,7 +131,7 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
-    falloff = torch.exp(-power) if splats.shapes is None else _beta(2 * power, splats.shapes[:, None])
+    falloff = torch.exp(-power) if splats.beta_exponents is None else _beta(2 * power, splats.beta_exponents[:, None])
     a = (splats.opacities[:, None] * falloff).clamp(max=0.999)
     touched = a >= 1 / 255
     after = torch.where(touched, 1 - a, 1.0).cumprod(0)
@@ -139,16 +141,16 @@ def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor,
     image = weight.T @ splats.colors + (1 - alpha) * background
     going = before >= 1e-4  # the first Gaussian that would take the transmittance below this ends the pixel
     distance = torch.where(going, (255 * a - 1).abs(), torch.inf)
-    if splats.shapes is not None:  # a Beta profile may end, or change too fast for float32, at its rim
-        visible = 255 * splats.opacities[:, None] * RIM ** splats.shapes[:, None] > 1
+    if splats.beta_exponents is not None:  # a Beta profile may end, or change too fast for float32, at its rim
+        visible = 255 * splats.opacities[:, None] * RIM ** splats.beta_exponents[:, None] > 1
         distance = torch.where(going & visible, torch.minimum(distance, (1 - 2 * power).abs()), distance)
     distance = torch.where(going & touched, torch.minimum(distance, (after / 1e-4 - 1).abs()), distance)
     slack = distance.amin(0) if len(distance) else torch.full((len(pixels),), torch.inf).double()
     return image, alpha, touched & going, slack.detach()
 
 
-def _beta(r2: Tensor, shapes: Tensor) -> Tensor:
+def _beta(r2: Tensor, exponents: Tensor) -> Tensor:
     """Return (1 - r^2)^b where r < 1, else 0. In the value and in the gradient, 1 - r^2 is held above 1e-6."""
     left = torch.where(r2 < 1, 1 - r2, 1.0)
     held = left + (1e-6 - left).clamp(min=0).detach()
-    return torch.where(r2 < 1, held**shapes, 0.0)
+    return torch.where(r2 < 1, held**exponents, 0.0)

@@ -146,14 +146,16 @@ def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
 @case("projection")
 def beta_exponent_below_one(g: Generator, severity: float) -> list[Arguments]:
     """Use Beta profiles with exponents down to 10^-3: alpha drops to zero at the rim, where its slope is infinite."""
-    return [ordinary(g, 1.0) | {"shapes": torch.tensor([10 ** (-power * severity)])} for power in (0.3, 1.0, 3.0)]
+    return [
+        ordinary(g, 1.0) | {"beta_exponents": torch.tensor([10 ** (-power * severity)])} for power in (0.3, 1.0, 3.0)
+    ]
 
 
 @case("projection")
 def beta_of_large_exponents(g: Generator, severity: float) -> list[Arguments]:
     """Use exponents of 10^2 to 10^6, which multiply what rounding takes from 1 - r^2 where a Gaussian is seen."""
     exponents = [10 ** (power * severity) for power in (2, 4, 6)]
-    return [ordinary(g, 0.3 * exponent**0.5) | {"shapes": torch.tensor([exponent])} for exponent in exponents]
+    return [ordinary(g, 0.3 * exponent**0.5) | {"beta_exponents": torch.tensor([exponent])} for exponent in exponents]
 
 
 @case("projection", **AT_A_LIMIT)
@@ -164,14 +166,14 @@ def beta_at_the_rim(g: Generator, severity: float) -> list[Arguments]:
     """
     variance = 9 / (0.5 + 0.5 * severity)  # pixels^2; at severity 1 the rim is three pixels away
     inputs = on_a_pixel((variance - EPS2D) ** 0.5)
-    return [inputs | {"shapes": torch.tensor([shape])} for shape in (0.45, 1.0, 1e3)]
+    return [inputs | {"beta_exponents": torch.tensor([shape])} for shape in (0.45, 1.0, 1e3)]
 
 
 @case("projection", **AT_A_LIMIT)
 def beta_opacity_at_its_limit(g: Generator, severity: float) -> list[Arguments]:
     """Use opacities within rounding error of 1/255, where the size of a Beta profile is a root of almost zero."""
     opacities = [1 / 255 * (1 + change * severity) for change in (-(2**-23), 0.0, 2**-22, 1e-3)]
-    return [on_a_pixel(10.0) | {"opacities": torch.tensor([opacity]), "shapes": torch.tensor([shape])}
+    return [on_a_pixel(10.0) | {"opacities": torch.tensor([opacity]), "beta_exponents": torch.tensor([shape])}
             for opacity in opacities for shape in (1e-3, 0.5, 50.0)]  # fmt: skip
 
 
@@ -188,7 +190,7 @@ def ordinary_crowd(g: Generator, severity: float) -> list[Arguments]:
 def beta_crowd(g: Generator, severity: float) -> list[Arguments]:
     """Blend Beta profiles of exponents from 0.1 to 10 together: discs with a rim before and behind small peaks."""
     exponents = 10 ** (severity * (2 * torch.rand(200, generator=g) - 1))
-    return [crowd(g, 200, 0.4) | {"shapes": exponents}]
+    return [crowd(g, 200, 0.4) | {"beta_exponents": exponents}]
 
 
 @case("blending")

@@ -83,7 +83,7 @@ def alone(arguments: Arguments) -> ImageTruth:
     alphas = oracle.evaluate(partial(function, pixels=pixels), x)
     free = torch.tensor([float(v) for v in alphas], dtype=torch.float64).view(shape)
     decided = ((free / ALPHA_MIN - 1).abs() > UNDECIDED)[..., 0]
-    if "shapes" in arguments:  # float32 may decide either way at the rim of a Beta profile too
+    if "beta_exponents" in arguments:  # float32 may decide either way at the rim of a Beta profile too
         squares = oracle.evaluate(partial(oracle.distances, pixels=pixels, **view), x)
         rim = torch.tensor([float(abs(1 - r2)) for r2 in squares], dtype=torch.float64).view(decided.shape)
         decided = decided & (rim > brute.RIM)

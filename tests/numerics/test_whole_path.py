@@ -43,7 +43,7 @@ def whole_path(model: GaussianModel, raw: dict[str, Tensor], observed: Observed,
     viewmat[:3, 3] = -observed.center
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]])
     image = rasterize(
-        means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend, shapes=shapes
+        means, factors, opacities, shown, viewmat[None], K[None], WIDTH, HEIGHT, backend=backend, beta_exponents=shapes
     ).image[0]
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     loss = photometric(image, target, 0.2, BACKENDS[backend])

@@ -243,20 +243,20 @@ def wide_filter(g: torch.Generator) -> Arguments:
 @_case
 def beta(g: torch.Generator) -> Arguments:
     """Beta profiles, from flat discs with a rim to small peaks."""
-    return gaussians(g, 60, size=0.5) | camera(33, 17) | {"shapes": 0.2 * 30 ** _rand(g, 60)}
+    return gaussians(g, 60, size=0.5) | camera(33, 17) | {"beta_exponents": 0.2 * 30 ** _rand(g, 60)}
 
 
 @_case
 def beta_at_the_rim(g: torch.Generator) -> Arguments:
     """Exponents so small that alpha drops to zero at the rim."""
-    return gaussians(g, 30, size=0.5) | camera(24, 16) | {"shapes": 0.01 + 0.3 * _rand(g, 30)}
+    return gaussians(g, 30, size=0.5) | camera(24, 16) | {"beta_exponents": 0.01 + 0.3 * _rand(g, 30)}
 
 
 @_case
 def beta_faint(g: torch.Generator) -> Arguments:
     """Opacities just below and just above 1/255: culled ones, and ones that end close to their means."""
     opacities = torch.tensor([0.99 / 255, 1.1 / 255, 2 / 255], dtype=torch.float64).repeat(10)
-    scene = gaussians(g, 30, size=2.0) | camera(16, 16) | {"shapes": 0.3 * 30 ** _rand(g, 30)}
+    scene = gaussians(g, 30, size=2.0) | camera(16, 16) | {"beta_exponents": 0.3 * 30 ** _rand(g, 30)}
     return scene | {"opacities": opacities}
 
 
@@ -264,31 +264,35 @@ def beta_faint(g: torch.Generator) -> Arguments:
 def beta_of_huge_exponents(g: torch.Generator) -> Arguments:
     """Exponents of 10^2 to 10^6 on Gaussians so large that a few pixels are seen of them: as good as Gaussians."""
     exponents = 10 ** (2 + 4 * _rand(g, 30))
-    scene = gaussians(g, 30) | camera(24, 16) | {"shapes": exponents}
+    scene = gaussians(g, 30) | camera(24, 16) | {"beta_exponents": exponents}
     return scene | {"factors": scene["factors"] * exponents[:, None, None].sqrt()}
 
 
 @_case
 def beta_antialiased(g: torch.Generator) -> Arguments:
-    scene = gaussians(g, 60, size=0.4) | camera(24, 16) | {"antialias": True, "shapes": 0.2 + 4 * _rand(g, 60)}
+    scene = gaussians(g, 60, size=0.4) | camera(24, 16) | {"antialias": True, "beta_exponents": 0.2 + 4 * _rand(g, 60)}
     return scene | {"factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
 
 
 @_case
 def beta_of_three_cameras(g: torch.Generator) -> Arguments:
     """One exponent for all cameras, but colours for each."""
-    return three_cameras(g) | {"shapes": 0.2 + 4 * _rand(g, 30)}
+    return three_cameras(g) | {"beta_exponents": 0.2 + 4 * _rand(g, 30)}
 
 
 @_case
 def beta_of_five_channels(g: torch.Generator) -> Arguments:
-    return five_channels(g) | {"shapes": 0.2 + 4 * _rand(g, 20)}
+    return five_channels(g) | {"beta_exponents": 0.2 + 4 * _rand(g, 20)}
 
 
 @_case
 def beta_saturated(g: torch.Generator) -> Arguments:
     """Opacity 1: alpha stops at 0.999 near the means, and there is no gradient there."""
-    return gaussians(g, 10, size=2.0) | camera(16, 16) | {"opacities": torch.ones(10), "shapes": 0.1 + _rand(g, 10)}
+    return (
+        gaussians(g, 10, size=2.0)
+        | camera(16, 16)
+        | {"opacities": torch.ones(10), "beta_exponents": 0.1 + _rand(g, 10)}
+    )
 
 
 def assert_beta_vector(backend: str, dtype: torch.dtype, tolerance: float) -> None:
@@ -300,7 +304,7 @@ def assert_beta_vector(backend: str, dtype: torch.dtype, tolerance: float) -> No
         drawn = rasterize(
             torch.tensor([[0.0, 0, 1]], dtype=dtype, requires_grad=True), factor[None],
             torch.tensor([0.7], dtype=dtype), torch.ones(1, 1, dtype=dtype), torch.eye(4, dtype=dtype)[None],
-            intrinsics(1, 1, 5.5, 2.5)[None].to(dtype), 8, 8, eps2d=0.0, backend=backend, shapes=shape[None],
+            intrinsics(1, 1, 5.5, 2.5)[None].to(dtype), 8, 8, eps2d=0.0, backend=backend, beta_exponents=shape[None],
         )  # fmt: skip
     alpha, means2d = drawn.alpha[0, 4, 2, 0], drawn.info.means2d  # the mean minus the centre of this pixel is (3, -2)
     slopes = torch.autograd.grad(alpha, (A, B, means2d, shape))

@@ -24,7 +24,7 @@ def scene(seed: int) -> dict[str, Any]:
     kinds = torch.randint(8, (N,), generator=g) if _pick(g, 2) else torch.full((N,), _pick(g, 8))
     _harden(arguments, kinds, g)
     if _pick(g, 2):
-        arguments["shapes"] = 10 ** (3 * (2 * _rand(g, N) - 1) * _rand(g, N))
+        arguments["beta_exponents"] = 10 ** (3 * (2 * _rand(g, N) - 1) * _rand(g, N))
     if _pick(g, 2):
         arguments["viewmats"] = _turned(g)[None]
     if _pick(g, 2):

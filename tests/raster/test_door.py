@@ -113,13 +113,13 @@ def test_kinds_of_tensors(backend: str) -> None:
         ({"Ks": torch.eye(3).double().repeat(2, 1, 1)}, "Ks: expected shape [1, 3, 3], got [2, 3, 3]"),
         ({"colors": doubles(40, 0), "background": None}, "colors"),
         ({"viewmats": doubles(0, 4, 4), "Ks": doubles(0, 3, 3)}, "viewmats"),
-        ({"shapes": 2.0}, "shapes: expected a tensor, got float"),
-        ({"shapes": SHAPES[:1]}, "shapes: expected shape [40], got [1]"),
-        ({"shapes": SHAPES[:, None]}, "shapes: expected shape [40], got [40, 1]"),
-        ({"shapes": SHAPES.float()}, "shapes: expected torch.float64 as means are, got torch.float32"),
-        ({"shapes": SHAPES.int()}, "shapes: expected float32 or float64, got int32"),
-        ({"shapes": SHAPES.to("meta")}, "shapes: expected a tensor with values"),
-        *[({"shapes": torch.where(torch.arange(40) == 7, bad, SHAPES)}, f"shapes: expected {message}")
+        ({"beta_exponents": 2.0}, "beta_exponents: expected a tensor, got float"),
+        ({"beta_exponents": SHAPES[:1]}, "beta_exponents: expected shape [40], got [1]"),
+        ({"beta_exponents": SHAPES[:, None]}, "beta_exponents: expected shape [40], got [40, 1]"),
+        ({"beta_exponents": SHAPES.float()}, "beta_exponents: expected torch.float64 as means are, got torch.float32"),
+        ({"beta_exponents": SHAPES.int()}, "beta_exponents: expected float32 or float64, got int32"),
+        ({"beta_exponents": SHAPES.to("meta")}, "beta_exponents: expected a tensor with values"),
+        *[({"beta_exponents": torch.where(torch.arange(40) == 7, bad, SHAPES)}, f"beta_exponents: expected {message}")
           for bad, message in ((0.0, "exponents above 0, got 0.0"), (-1.0, "exponents above 0, got -1.0"),
                                (NAN, "finite"), (INF, "finite"))],
     ],
@@ -134,7 +134,7 @@ def test_values(changes: dict[str, Any], message: str) -> None:
 def test_no_shapes_are_gaussians(backend: str) -> None:
     """Catches an image that changes by a bit where shapes are None."""
     arguments = scene(torch.float32) | {"backend": backend}
-    assert torch.equal(rasterize(**arguments).image, rasterize(**arguments, shapes=None).image)
+    assert torch.equal(rasterize(**arguments).image, rasterize(**arguments, beta_exponents=None).image)
 
 
 def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch) -> None:

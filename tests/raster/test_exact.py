@@ -18,7 +18,7 @@ from gsbench.models import CameraTime
 from gsbench.raster import rasterize
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, Gaussians, exact_image
 
-NAMES = ("means", "factors", "opacities", "colors", "shapes")
+NAMES = ("means", "factors", "opacities", "colors", "beta_exponents")
 NOISES = (0.0, 6e-8, 1e-3)  # of Gaussians in float32: none, a rounding, and what no model has
 LOOSEST = 100  # largest ratio of the bound to the error in the median pixel
 
@@ -38,12 +38,12 @@ def images(arguments: dict[str, Any], noise: float = 0.0, seed: int = 0) -> tupl
              for x in single]  # fmt: skip
     exact[2] = exact[2].clamp(0, 1)
     cameras = viewmats, Ks, width, height
-    image = rasterize(*single[:4], *cameras, shapes=single[4], backend="cpu", **rest).image[0]
+    image = rasterize(*single[:4], *cameras, beta_exponents=single[4], backend="cpu", **rest).image[0]
     bounded = exact_image(tuple(exact), single, viewmats[0], Ks[0], width, height, **rest)
     if rest.get("background") is not None:
         rest["background"] = rest["background"].double()
     cameras = viewmats.double(), Ks.double(), width, height
-    true = rasterize(*exact[:4], *cameras, shapes=exact[4], backend="reference", **rest).image[0]
+    true = rasterize(*exact[:4], *cameras, beta_exponents=exact[4], backend="reference", **rest).image[0]
     return image, bounded, true
 
 
@@ -105,7 +105,7 @@ def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
         query = CameraTime.at(-viewmat[:3, 3], 0.4)
         single = gaussians.slice(query)
         exact = copy.deepcopy(gaussians).double().slice(CameraTime.at(query.center.double(), 0.4))
-        image = rasterize(*single[:4], viewmat[None], K[None], 32, 32, shapes=single.shapes).image[0]
+        image = rasterize(*single[:4], viewmat[None], K[None], 32, 32, beta_exponents=single.beta_exponents).image[0]
         bounded = exact_image(exact, single, viewmat, K, 32, 32)
     error = (image.double() - bounded.image).abs().amax(-1)
     assert (error <= bounded.bound).all()

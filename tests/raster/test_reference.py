@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsbench.raster import RasterOutput, rasterize, reference
 
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "shapes")
+DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "beta_exponents")
 PROPERTY = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**31)
 exponents = st.none() | st.floats(-3, 6).map(lambda power: 10**power)  # of Beta profiles; None: Gaussians
@@ -29,7 +29,7 @@ def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
 
 
 def scene(seed: int, exponent: float | None, N: int = 12) -> dict[str, Any]:
-    shapes = {} if exponent is None else {"shapes": torch.full((N,), exponent, dtype=torch.float64)}
+    shapes = {} if exponent is None else {"beta_exponents": torch.full((N,), exponent, dtype=torch.float64)}
     return gaussians(torch.Generator().manual_seed(seed), N, size=0.3) | camera(16, 12) | shapes
 
 
@@ -80,7 +80,7 @@ def smooth(name: str) -> dict[str, Any]:
     """Six Gaussians of a case, whose picture has no decision so close that a finite difference would flip it."""
     arguments = case(name)
     few = torch.linspace(0, len(arguments["means"]) - 1, 6).long()
-    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities", "shapes") if k in arguments}
+    arguments |= {k: arguments[k][few] for k in ("means", "factors", "opacities", "beta_exponents") if k in arguments}
     arguments["colors"] = arguments["colors"][..., few, :]
     D = arguments["colors"].shape[-1]
     arguments.setdefault("background", torch.linspace(0.2, 0.9, D, dtype=torch.float64))
@@ -195,7 +195,7 @@ def test_order_of_gaussians_does_not_matter(seed: int, exponent: float | None) -
     """Catches a sort by index. To 1e-12 and not to the bit: a matrix product may round by the place of a row."""
     a = scene(seed, exponent)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(seed))
-    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors", "shapes") if k in a}
+    b = a | {k: a[k][order] for k in ("means", "factors", "opacities", "colors", "beta_exponents") if k in a}
     torch.testing.assert_close(draw(b).image, draw(a).image, rtol=0, atol=1e-12)
     assert torch.equal(draw(b).info.radii, draw(a).info.radii[:, order])
 

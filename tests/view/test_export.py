@@ -73,7 +73,7 @@ def test_a_ply_says_how_it_differs_from_the_model(
 
     def with_profiles(self: GaussianModel, query: CameraTime) -> Gaussians3D:
         gaussians = PLAIN_SLICE(self, query)
-        return gaussians._replace(shapes=torch.full_like(gaussians.opacities, 2.0))
+        return gaussians._replace(beta_exponents=torch.full_like(gaussians.opacities, 2.0))
 
     assert exports(folder, *option, *ALONG)
     assert len(capsys.readouterr().out.splitlines()) == 1
