@@ -32,7 +32,6 @@ VAGUE_NAMES: dict[str, int] = {
     "gsbench/models": 8,
     "gsbench/raster": 1,
     "gsbench/report": 7,
-    "tests/models": 46,
     "tests/report": 30,
 }
 

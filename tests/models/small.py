@@ -1,13 +1,18 @@
 """Small models for the tests: every registered one and its variants, fresh or in the midst of a training."""
 
+import inspect
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsbench.kernels.headers import ALPHA_MIN
-from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models import CameraTime, GaussianModel, build, registry
+from gsbench.models.base import SHRINK, Raw
+from gsbench.models.effect_sets import EffectSets
+from gsbench.models.gated import has_gates
+from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
 from gsbench.scenes.scene import Points
+from gsbench.schedule import ActiveComponents
 
 N = 24
 EXTENT = 2.0
@@ -19,17 +24,40 @@ MODELS: dict[str, dict[str, Any]] = {
     "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
     "7dgs_nodir": {"lambda_t": 0.5},
 }
-TRIANGULAR = ("6dgs", "7dgs", "7dgs_nodir")
+CHOLESKY = ("6dgs", "7dgs", "7dgs_nodir")
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, options) for name, options in MODELS.items()},
     **{f"{name}_agr": (name, options | {"agr": True}) for name, options in MODELS.items()},
     "4dgs_constant_colors": ("4dgs", {"time_degree": 0}),
-    **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in TRIANGULAR},
+    **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in CHOLESKY},
     **{
         f"{name}_{form}": (name, MODELS[name] | {"off_diagonal": form})
-        for name in TRIANGULAR
+        for name in CHOLESKY
         for form in ("raw", "row_scaled")
     },
+}
+
+
+def options_of(name: str) -> dict[str, inspect.Parameter]:
+    """The options of a model's class and of its bases."""
+    classes = [cls for cls in reversed(registry.find(name).__mro__) if issubclass(cls, GaussianModel)]
+    parameters = [inspect.signature(cls.__init__, eval_str=True).parameters.values() for cls in classes]
+    return {p.name: p for of_class in parameters for p in of_class if p.kind is p.KEYWORD_ONLY}
+
+
+def halves(name: str) -> dict[str, float]:
+    """Every option that is a number, such as lambda, at 0.5: a default of 1 hides that it is forgotten."""
+    return {key: 0.5 for key, p in options_of(name).items() if p.annotation is float}
+
+
+# Every registered model is tested without being listed: EVERY has the variants above, and the others by their names.
+assert registry.is_registered("3dgs")  # all are
+NAMES = sorted(registry._REGISTRY)
+EVERY = VARIANTS | {
+    name + end: (name, halves(name) | ({"agr": True} if end else {}))
+    for name in NAMES
+    for end in ("", "_agr")
+    if name not in MODELS
 }
 
 
@@ -58,8 +86,8 @@ def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
 
 def fresh(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
     """A model as it starts, in float32."""
-    name, own = VARIANTS[variant]
-    return started(build(name, **own | options), count, seed)
+    name, of_variant = EVERY[variant]
+    return started(build(name, **of_variant | options), count, seed)
 
 
 def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
@@ -67,20 +95,38 @@ def lively(variant: str, count: int = N, seed: int = 0, **options: Any) -> Gauss
     return moved(fresh(variant, count, seed, **options), seed)
 
 
-def assert_culled_outside_its_intervals(model: GaussianModel, times: Tensor, exact: bool) -> None:
-    """A Gaussian has too low an opacity outside its visible interval and, if `exact`, only there."""
-    intervals = model.visible_intervals()
-    assert intervals is not None
-    first, last = intervals.unbind(1)
-    hidden = 0
-    for time in times:
-        opacities = model.slice(CameraTime.at(CAMERA, time)).opacities
-        outside = (time < first) | (time > last)
-        assert (opacities[outside] < ALPHA_MIN * (1 + 1e-9)).all()
-        hidden += int(outside.sum())
-        if exact:
-            assert (opacities[~outside] > ALPHA_MIN * (1 - 1e-9)).all()
-    assert 0 < hidden < len(times) * len(model)
+def active(variant: str, count: int = N, seed: int = 0, **options: Any) -> GaussianModel:
+    """A model in the midst of a training, with everything switched on, in float64."""
+    model = lively(variant, count, seed, **options)
+    model.set_active(ActiveComponents(model.sh_degree, model.agr, True))
+    return model
+
+
+def with_effect_sets(model: GaussianModel, refined: int, conditioned: int) -> GaussianModel:
+    """The model, of whose rows some are static, and have colours from one constant to more than there is."""
+    if has_gates(model):
+        orders = torch.randint(0, 16, (len(model),), generator=seeded(3), dtype=torch.int32)
+        frozen = torch.zeros(len(model), dtype=torch.uint8)
+        model.effect_sets = EffectSets(refined if model.agr else 0, conditioned, orders, frozen)
+    return model
+
+
+class Balls(GaussianModel):
+    """Balls, as docs/adding_a_model.md has them, without gates."""
+
+    geometry = ("radii",)
+
+    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
+        return {"radii": distances.log()[:, None]}
+
+    def condition(self, raw: Raw, query: CameraTime | None) -> Conditioned:
+        return Conditioned(raw["means"], raw["radii"].exp()[:, :, None] * torch.eye(3), torch.ones(len(raw["means"])))
+
+    def spatial_scales(self) -> Tensor:
+        return self.splats["radii"].exp()
+
+    def split(self, raw: Raw, generator: torch.Generator) -> Raw:
+        return {"means": raw["means"], "radii": raw["radii"] / SHRINK}
 
 
 def raw(model: GaussianModel) -> dict[str, Tensor]:
@@ -88,7 +134,17 @@ def raw(model: GaussianModel) -> dict[str, Tensor]:
     return {name: parameter.detach().clone() for name, parameter in model.splats.items()}
 
 
+def covariances(gaussians: Conditioned | Geometry | Gaussians3D) -> Tensor:
+    """The covariances of 3D Gaussians, [N, 3, 3]: equal Gaussians may have other factors."""
+    return (gaussians.factors @ gaussians.factors.mT).detach()
+
+
 def joint(model: GaussianModel) -> Tensor:
-    """Covariance of each Gaussian of a triangular model, rows and columns ordered (p, d, t)."""
+    """Covariance of each Gaussian of a Cholesky model, rows and columns ordered (p, d, t)."""
     factor = model.factors(raw(model))
     return factor @ factor.mT
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    """Whether two states have the same bits."""
+    return a.keys() == b.keys() and all(torch.equal(x, b[key]) and x.dtype == b[key].dtype for key, x in a.items())

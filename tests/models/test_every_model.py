@@ -1,74 +1,73 @@
-"""What holds for every registered model: options, slices, gradients, checkpoints, gates and the export of a slice.
+"""What holds for every model: options, start, slices, gradients, AGR, checkpoints, gates and the export of a slice.
 
 Models are found in the registry and their options in their constructors: a new one is tested without being listed.
 """
 
 import copy
-import inspect
 import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from small import CAMERA, moved, seeded, started
-from torch import Tensor
+from small import (
+    CAMERA,
+    EVERY,
+    EXTENT,
+    MODELS,
+    NAMES,
+    N,
+    active,
+    covariances,
+    fresh,
+    halves,
+    lively,
+    moved,
+    options_of,
+    raw,
+    same,
+    seeded,
+    started,
+    with_effect_sets,
+)
+from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.models import CameraTime, GaussianModel, build, registry
-from gsbench.models.effect_sets import EffectSets
+from gsbench.models import CameraTime, build, registry
+from gsbench.models.appearance import sh_colors, sh_time_colors
+from gsbench.models.beta import BetaModel
+from gsbench.models.camera_time import unit
 from gsbench.models.gated import as_gated, has_gates
 from gsbench.models.gaussian_batch import reach, tensors_of
 from gsbench.models.simplifications import simplifications_of
 from gsbench.scenes.gaussian_ply import ply_of, read_trained
+from gsbench.scenes.points import SH_C0, nearest_distances
+from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
 from gsbench.train.regularisers import MeanOpacity, MeanSize, Penalty
 from gsbench.view.slice_ply import has_harmonics, trained_of
 
-N = 12
-GIVEN: dict[Any, Any] = {float: 0.5, int: 1, bool: True}  # for an option without a default, by its type
 WRONG: dict[Any, tuple[Any, ...]] = {
     float: ("1", True, math.nan, math.inf, -1.0),
     int: ("1", 1.0, True, -1, 10**30),
     bool: ("no", 1),
     str: ("nonsense", 1),
 }
-assert registry.is_registered("3dgs")  # all are
-NAMES = sorted(registry._REGISTRY)
-EVERY = pytest.mark.parametrize(("name", "agr"), [(name, agr) for name in NAMES for agr in (False, True)])
-QUERY = CameraTime.at(CAMERA, 0.45)
-
-
-def options_of(name: str) -> dict[str, inspect.Parameter]:
-    """The options of a model's class and of its bases."""
-    classes = [cls for cls in reversed(registry.find(name).__mro__) if issubclass(cls, GaussianModel)]
-    return {p.name: p for cls in classes for p in inspect.signature(cls.__init__, eval_str=True).parameters.values()
-            if p.kind is p.KEYWORD_ONLY}  # fmt: skip
+REGISTERED = pytest.mark.parametrize("name", NAMES)
+VARIANT = pytest.mark.parametrize("variant", EVERY)
+REFINED = pytest.mark.parametrize("variant", [variant for variant in EVERY if variant.endswith("_agr")])
+QUERY, LATER = CameraTime.at(CAMERA, 0.45), CameraTime.at(-CAMERA, 0.7)
 
 
 def needed(name: str) -> dict[str, Any]:
     """Values of the options that have no default."""
-    return {key: GIVEN[p.annotation] for key, p in options_of(name).items() if p.default is p.empty}
+    return {key: 0.5 for key, p in options_of(name).items() if p.default is p.empty}
 
 
-def awkward(name: str) -> dict[str, Any]:
-    """Values of all options that are numbers, such as lambda, at 0.5: a default of 1 hides that it is forgotten."""
-    return needed(name) | {key: 0.5 for key, p in options_of(name).items() if p.annotation is float}
+# ---- options
 
 
-def made(name: str, agr: bool, count: int = N, seed: int = 0) -> GaussianModel:
-    """A model in the midst of a training, with everything switched on, in float64."""
-    model = moved(started(build(name, agr=agr, **awkward(name)), count, seed), seed)
-    model.set_active(ActiveComponents(3, agr, True))
-    return model
-
-
-def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    """Whether two states have the same bits."""
-    return a.keys() == b.keys() and all(torch.equal(x, b[key]) and x.dtype == b[key].dtype for key, x in a.items())
-
-
-@pytest.mark.parametrize("name", NAMES)
+@REGISTERED
 def test_wrong_options_are_refused(name: str) -> None:
     """Catches an option that is misspelt, missing or of another type and met only in mid-training."""
     good = needed(name)
@@ -85,67 +84,225 @@ def test_wrong_options_are_refused(name: str) -> None:
             assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("7gds", {}, "Did you mean '7dgs'?"),
+        ("7dgs", {"factor_oder": "paper"}, "Did you mean 'factor_order'?"),
+        ("7dgs", {"factor_order": "papr"}, "Did you mean 'paper'?"),
+        ("7dgs", {"scheme": "shur"}, "Did you mean 'schur'?"),
+        ("4dgs", {"scheme": "shur"}, "Did you mean 'schur'?"),
+        ("6dgs", {"lambda_t": 0.5}, "has no option 'lambda_t'"),
+        ("3dgs", {"sh_degree": 4}, "sh_degree: expected 0, 1, 2 or 3, got 4"),
+        ("4dgs", {"lambda_t": 0.0}, "lambda_t"),
+        ("ndgs", {"lambda_d": 0.2}, r"joint_gate: expected lambda_d equal to lambda_t, got 0.2 and 0.5"),
+        ("dgs", {"coupling": "texts"}, "coupling 'texts'"),
+        ("freetime", {"duration": 0.0}, "duration"),
+        ("ubs", {"modulation": "white"}, "modulation 'white'"),
+    ],
+)
+def test_a_refusal_says_what_is_meant(name: str, options: dict[str, Any], message: str) -> None:
+    """Catches an option that is misspelt, out of range or of another model, without a word about what is meant."""
+    with pytest.raises(InputError) as error:
+        build(name, **(halves(name) if name in NAMES else {}) | options)
+    assert message in str(error.value)
+
+
+@REGISTERED
 def test_every_number_among_the_options_matters(name: str) -> None:
     """Catches an option that is checked and then forgotten: neither the start nor a slice depends on it."""
 
     def numbers(options: dict[str, Any]) -> list[Tensor]:
         model = started(build(name, **options))
-        start = [x.detach().clone() for x in model.splats.values()]
-        return [*start, *tensors_of(moved(model).slice(QUERY))]
+        return [*raw(model).values(), *tensors_of(moved(model).slice(QUERY))]
 
-    options, static = awkward(name), "time" not in registry.find(name).observes
-    known = numbers(options)
-    for key in options:
+    static, before = "time" not in registry.find(name).observes, numbers(halves(name))
+    for key in halves(name):
         if static and "time" in key:  # of a model that derives from one with time
             continue
         both = name == "ndgs" and key in ("lambda_d", "lambda_t")  # which a joint gate needs equal
         changed = {"lambda_d": 0.25, "lambda_t": 0.25} if both else {key: 0.25}
-        assert any(not torch.equal(x, y) for x, y in zip(known, numbers(options | changed), strict=True)), key
+        after = numbers(halves(name) | changed)
+        assert any(not torch.equal(x, y) for x, y in zip(before, after, strict=True)), key
 
 
-@EVERY
+# ---- the start
+
+
+@REGISTERED
+def test_before_it_has_gaussians(name: str) -> None:
+    """Catches an error of Python for the length of a model that was only built, and for its start at no points."""
+    model = build(name, **needed(name))
+    assert len(model) == 0
+    with pytest.raises(InputError, match="points: expected more than 3"):
+        started(model, 0)
+
+
+@VARIANT
+def test_start(variant: str) -> None:
+    """Catches a start other than METHODS': spheres at the neighbours' distance, opacity 0.1 (of Beta profiles 0.5), the
+    points' colours; and a draw from torch's global generator."""
+    torch.manual_seed(1)
+    model, g = fresh(variant), seeded(0)
+    torch.manual_seed(2)
+    again, other = fresh(variant), fresh(variant, seed=5)
+    assert all(torch.equal(x, y) for x, y in zip(model.parameters(), again.parameters(), strict=True))
+    assert not torch.equal(model.splats["means"], other.splats["means"])
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    points = Points(torch.rand(N, 3, generator=g) * 2 - 1, torch.rand(N, 3, generator=g))
+    assert len(model) == N
+    assert model.extent == EXTENT
+    torch.testing.assert_close(model.splats["means"].data, points.means)
+    opacity = 0.5 if isinstance(model, BetaModel) else 0.1
+    torch.testing.assert_close(torch.sigmoid(model.splats["opacities"]).data, torch.full((N,), opacity))
+    size, sliced = nearest_distances(points.means), model.slice(CameraTime.at(CAMERA.float(), 0.4))
+    torch.testing.assert_close(covariances(sliced), size.square()[:, None, None] * torch.eye(3), rtol=1e-4, atol=1e-6)
+    deviation = size if sliced.beta_exponents is None else size / math.sqrt(8)  # profiles start with exponents of 4
+    torch.testing.assert_close(model.scales(), deviation, rtol=1e-4, atol=0)
+    if "precision" not in model.splats:  # whose couplings start as small random numbers
+        noise = 1e-3 if "lower" in model.splats else 1e-6  # UBS starts with random entries below the diagonal
+        torch.testing.assert_close(sliced.means.data, points.means, rtol=0, atol=noise)
+    drawn = sliced.opacities > 1 / 255
+    torch.testing.assert_close(sliced.colors.data[drawn], points.colors[drawn])
+
+
+# ---- a slice
+
+
+@VARIANT
 @pytest.mark.parametrize("count", [0, 1, N])
-def test_a_slice_has_its_shapes(name: str, agr: bool, count: int) -> None:
-    """Catches a model that needs a Gaussian, broadcasts a single one, or says otherwise by its kernels."""
-    model = made(name, agr)
+def test_a_slice_has_its_shapes(variant: str, count: int) -> None:
+    """Catches a model that needs a Gaussian, broadcasts a single one, or says otherwise by its kernels, in the
+    harmonics' schedule too; and NaN, opacities above 1 or negative colours beyond the clip."""
+    model = active(variant)
     model.select(torch.arange(count))
-    seen = model.slice(QUERY)
     assert len(model) == count
-    shapes = [] if seen.beta_exponents is None else [(count,)]
-    assert [tuple(x.shape) for x in tensors_of(seen)] == [(count, 3), (count, 3, 3), (count,), (count, 3), *shapes]
-    assert all(x.isfinite().all() for x in tensors_of(seen))
-    assert ((seen.opacities >= 0) & (seen.opacities <= 1)).all()
-    assert (seen.colors >= 0).all()
-    by_kernels = copy.deepcopy(model).float().slice(CameraTime.at(CAMERA.float(), 0.45))
-    drawn = (seen.opacities > 1 / 200)[:, None]  # kernels do not colour what cannot be seen
-    for x, y in ((by_kernels.means, seen.means), (by_kernels.opacities, seen.opacities)):
-        torch.testing.assert_close(x.double(), y, rtol=1e-3, atol=1e-4)
-    covariances = [x.factors.double() @ x.factors.double().mT for x in (by_kernels, seen)]  # factors may be turned
-    torch.testing.assert_close(*covariances, rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(by_kernels.colors.double() * drawn, seen.colors * drawn, rtol=1e-3, atol=1e-4)
+    single = copy.deepcopy(model).float()
+    for degree, time in ((3, 0.45), (0, 0.2), (1, 0.7), (3, -1.0), (3, 2.0)):
+        for either in (model, single):
+            either.set_active(ActiveComponents(degree, model.agr, True))
+        query = CameraTime.at(CAMERA, time)
+        sliced = model.slice(query)
+        shapes = [(count, 3), (count, 3, 3), (count,), (count, 3)] + [(count,)] * (sliced.beta_exponents is not None)
+        assert [tuple(x.shape) for x in tensors_of(sliced)] == shapes
+        assert all(x.isfinite().all() for x in tensors_of(sliced))
+        assert ((sliced.opacities >= 0) & (sliced.opacities <= 1)).all()
+        assert (sliced.colors >= 0).all()
+        if not 0 <= time <= 1:
+            continue
+        by_kernels = single.slice(CameraTime.at(CAMERA.float(), time))
+        drawn = (sliced.opacities > 1 / 200)[:, None]  # kernels do not colour what cannot be seen
+        for x, y in ((by_kernels.means, sliced.means), (by_kernels.opacities, sliced.opacities),
+                     (covariances(by_kernels), covariances(sliced)),
+                     (by_kernels.colors * drawn, sliced.colors * drawn)):  # fmt: skip
+            torch.testing.assert_close(x.double(), y, rtol=1e-3, atol=1e-4)
 
 
-@EVERY
-def test_gradients_reach_every_group(name: str, agr: bool) -> None:
-    """Catches a parameter that the optimizer has a rate for, and that learns nothing or turns NaN."""
-    model = made(name, agr)
-    sum(x.square().sum() for x in tensors_of(model.slice(QUERY))).backward()
-    for group, parameters in model.groups().items():
-        for x in parameters:
-            assert x.grad is not None, group
-            assert x.grad.isfinite().all(), group
-            assert x.grad.any(), group
+@VARIANT
+def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
+    """Catches a query in other coordinates than the mean: at t = mu_t, d = mu_d nothing moves, nothing fades."""
+    model = lively(variant)
+    model.set_active(ActiveComponents(3, False, False))
+    values = raw(model)
+    if "directions" in values:
+        model.splats["directions"].data = unit(values["directions"])
+    times = values.get("times", torch.full((N, 1), 0.5))[:, 0]
+    if getattr(model, "bounded_times", False) or variant.startswith("dgs"):
+        times = torch.sigmoid(times)
+    directions = unit(values.get("directions", torch.tensor([0, 0.6, 0.8]).double().expand(N, 3)))
+    for i in range(4):
+        mean = values["means"][i]
+        sliced = model.slice(CameraTime.at(mean - 3 * directions[i], times[i].item()))
+        torch.testing.assert_close(sliced.means[i], mean)
+        torch.testing.assert_close(sliced.opacities[i], torch.sigmoid(values["opacities"][i]))
+
+
+@VARIANT
+def test_colors_are_seen_from_the_camera(variant: str) -> None:
+    """Catches a colour looked up in the direction to the camera, or to where the Gaussian is not at that time."""
+    model = lively(variant)
+    sliced, values = model.slice(QUERY), model.refined(QUERY)
+    directions = nn.functional.normalize(sliced.means - CAMERA, dim=-1)
+    coefficients = torch.cat([values["sh0"].flatten(1, -2), values["shN"]], 1)
+    if variant.startswith("4dgs"):
+        offset = 0.45 - values["times"][:, 0]
+        expected = sh_time_colors(coefficients.unflatten(1, (-1, 16)), directions, 3, offset)
+    else:
+        expected = sh_colors(coefficients, directions, 3)
+    torch.testing.assert_close(sliced.colors, expected)
+
+
+def test_sh_degree_grows_with_the_phase() -> None:
+    """Catches colours that use coefficients of a degree not yet on."""
+    model = lively("3dgs")
+    model.set_active(ActiveComponents(0, False, False))
+    flat = model.slice(QUERY).colors
+    torch.testing.assert_close(flat, (SH_C0 * model.splats["sh0"][:, 0] + 0.5).clamp(min=0))
+    model.set_active(ActiveComponents(1, False, False))
+    assert not torch.allclose(model.slice(QUERY).colors, flat)
+
+
+@VARIANT
+def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
+    """Catches a static scene given to a model of time, and a static model that demands one."""
+    model, timeless = fresh(variant), CameraTime.at(CAMERA.float(), None)
+    if "time" in model.observes or model.agr:
+        with pytest.raises(InputError, match="expected a time"):
+            model.slice(timeless)
+    else:
+        assert model.slice(timeless).means.shape == (N, 3)
+
+
+# ---- gradients
+
+
+@VARIANT
+def test_gradients_reach_every_group(variant: str) -> None:
+    """Catches a parameter that the optimizer has a rate for, and that learns nothing or turns NaN; a camera on a mean,
+    where the direction is 0/0, is taken for no direction."""
+    model = active(variant)
+    assert all(x.isfinite().all() for x in tensors_of(model.slice(CameraTime.at(model.splats["means"].data[0], 0.5))))
+    for center in (model.splats["means"].data[0].clone(), CAMERA):
+        model.zero_grad(set_to_none=True)
+        sum(x.square().sum() for x in tensors_of(model.slice(CameraTime.at(center, 0.45)))).backward()
+        for group, parameters in model.groups().items():
+            for x in parameters:
+                assert x.grad is not None, group
+                assert x.grad.isfinite().all(), group
+                assert x.grad.any(), group
     grouped = [id(p) for parameters in model.groups().values() for p in parameters]
     assert sorted(grouped) == sorted(id(p) for p in model.parameters())  # each once
 
 
-@pytest.mark.parametrize("name", NAMES)
+@VARIANT
+def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
+    """Catches a wrong or lost derivative on the way from any raw parameter to the slice (central differences), where a
+    row is refined and conditioned, only conditioned, or static."""
+    degree = 3 if variant == "3dgs" else 1  # every coefficient is one more central difference
+    model = active(variant, 4, sh_degree=degree)
+    model.select(torch.arange(3))
+    with_effect_sets(model, 1, 2)
+    if held := "precision" in model.splats:  # no gradient flows through the direction of dGS and dBS
+        model.set_active(ActiveComponents(degree, False, True))
+    splats, names = raw(model), sorted(set(model.splats) - ({"means"} if held else set()))
+    values = [splats[name].requires_grad_() for name in names]
+    del model.splats
+
+    def sliced(*values: Tensor) -> tuple[Tensor, ...]:
+        model.splats = splats | dict(zip(names, values, strict=True))
+        gaussians = model.slice(QUERY)
+        return tuple(tensors_of(gaussians._replace(factors=gaussians.factors @ gaussians.factors.mT)))
+
+    assert (sliced(*values)[2] > 0).any()
+    assert torch.autograd.gradcheck(sliced, values, atol=1e-6)
+
+
+@REGISTERED
 @pytest.mark.parametrize("kind", [MeanOpacity, MeanSize])
 def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Penalty]) -> None:
     """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes: it is printed and acts on
     nothing."""
-    model = made(name, False)
+    model = active(name)
     penalty = kind(model, 0, 1)
     penalty(QUERY, 0).backward()
     learns = {key for key, x in model.splats.items() if x.grad is not None and x.grad.any()}
@@ -162,113 +319,112 @@ def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Pena
         torch.testing.assert_close((ends[0] - ends[1]) / 2, (x.grad * step).sum(), rtol=1e-6, atol=1e-15)
 
 
-@EVERY
-def test_a_checkpoint_is_the_model(name: str, agr: bool) -> None:
-    """Catches state that is not saved: a model of another size that loads it is the same to the bit."""
-    model, other = made(name, agr), made(name, agr, count=5, seed=3)
+# ---- AGR and active components
+
+
+@REFINED
+def test_agr_moves_what_it_should(variant: str) -> None:
+    """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity; and a refinement whose
+    switching on in mid-training is a jump."""
+    model = lively(variant)
+    before, after = raw(model), model.refined(QUERY)
+    names = [*model.centers, *model.geometry]
+    assert model.refinement is not None
+    expected = model.refinement([before[k] for k in names], torch.tensor(0.45, dtype=torch.float64))
+    torch.testing.assert_close([after[k] for k in names], expected)
+    assert not any(torch.equal(after[k], before[k]) for k in names)
+    for untouched in set(before) - set(names):
+        assert torch.equal(after[untouched], before[untouched])
+    for p in (model.refinement.weight_out, model.refinement.bias_out):
+        p.data.zero_()
+    on = tensors_of(model.slice(QUERY))
+    model.set_active(ActiveComponents(3, False, False))
+    assert all(torch.equal(a, b) for a, b in zip(on, tensors_of(model.slice(QUERY)), strict=True))
+
+
+@REFINED
+def test_what_is_off_does_not_learn(variant: str) -> None:
+    """Catches a switch that does not reach the networks or the lambdas, or lambdas that can turn negative."""
+    model, (_, options) = lively(variant), EVERY[variant]
+    for key in model.log_lambda:
+        assert model.lambda_of(key).item() == pytest.approx(options.get(f"lambda_{key[0]}", 1.0))
+    for refine, tune in [(False, False), (True, False), (False, True), (True, True)]:
+        model.set_active(ActiveComponents(3, refine, tune))
+        model.zero_grad(set_to_none=True)
+        sum(x.square().sum() for x in tensors_of(model.slice(QUERY))).backward()
+        learnt = model.refinement.weight_out.grad
+        assert (learnt is not None and learnt.any(1).all().item()) == refine
+        assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_lambda.parameters())
+    for p in model.log_lambda.parameters():
+        p.data -= 50
+    assert all(model.lambda_of(key) > 0 for key in model.log_lambda)
+
+
+# ---- checkpoints, gates, export
+
+
+@VARIANT
+@pytest.mark.parametrize("split", [False, True])
+def test_a_checkpoint_is_the_model(variant: str, split: bool) -> None:
+    """Catches state that is not saved: a model of another size that loads it is the same to the bit, and the same
+    parameters to the optimizer. States of something else, or damaged ones, are refused and change nothing."""
+    model, other = active(variant), active(variant, count=5, seed=3)
+    if split:
+        model.fill(with_effect_sets(model, 3, 7).effect_sets) if has_gates(model) else pytest.skip("has no gates")
     objects = dict(other.splats.items())
     other.load_state(model.pack())
     assert same(model.pack(), other.pack())
-    seen, again = tensors_of(model.slice(QUERY)), tensors_of(other.slice(QUERY))
-    assert all(torch.equal(x, y) for x, y in zip(seen, again, strict=True))
+    for x, y in zip(tensors_of(model.slice(QUERY)), tensors_of(other.slice(QUERY)), strict=True):
+        assert torch.equal(x, y)
     assert all(other.splats[key] is parameter for key, parameter in objects.items())
     state, means = model.pack(), model.pack()["splats.means"]
-    others = (means[:-1], means[:, :2], means[0, 0], means.float(), means.to_sparse(), "means")
-    changed = [state | {"splats.means": x} for x in others] + [state | {"splats.extra": means}, {}]
-    for wrong in (*changed, {key: x for key, x in state.items() if key != "splats.means"}):
+    damaged = (means[:-1], means[:, :2], means[0, 0], means.float(), means.to_sparse(), "means")
+    foreign = [lively(name).pack() for name in MODELS if name != EVERY[variant][0]]
+    foreign += [lively(variant, sh_degree=2).pack(), lively(variant, agr=not model.agr).pack()]
+    foreign += [lively(variant, time_degree=1).pack()] if variant.startswith("4dgs") else []
+    foreign += [state | {"splats.means": x} for x in damaged] + [state | {"splats.extra": means}, {}]
+    for wrong in (*foreign, {key: x for key, x in state.items() if key != "splats.means"}):
         with pytest.raises(InputError, match=r"^checkpoint: ") as error:
             other.load_state(wrong)
         assert "\n" not in str(error.value)
-    with pytest.raises(InputError, match=r"^checkpoint: "):
-        other.load_state(made(name, not agr).pack())
     assert same(model.pack(), other.pack())  # nothing of them was loaded
 
 
-@EVERY
-def test_gates_are_asked_for_or_refused(name: str, agr: bool) -> None:
-    """Catches a model that gates take and cannot simplify, and a checkpoint of other rows than were gated."""
-    model = made(name, agr).requires_grad_(False)
+@VARIANT
+def test_gates_are_asked_for_or_refused(variant: str) -> None:
+    """Catches a model that gates take and cannot simplify."""
+    model = active(variant).requires_grad_(False)
     if not has_gates(model):
         with pytest.raises(InputError, match=r"is no GatedModel|inherits its methods for gates"):
             as_gated(model)
         return
-    queries = [QUERY, CameraTime.at(-CAMERA, 0.7)]
-    found = simplifications_of(as_gated(model), queries, [model.slice(query) for query in queries])
-    assert {"removed"} < {one.name for one in found}
-    for one in found:
-        for key, x in (one.raw or {}).items():
+    queries = [QUERY, LATER]
+    simplifications = simplifications_of(as_gated(model), queries, [model.slice(query) for query in queries])
+    assert {"removed"} < {simplification.name for simplification in simplifications}
+    for simplification in simplifications:
+        for key, x in (simplification.raw or {}).items():
             assert x.shape == model.splats[key].shape
-            assert x.isfinite().all(), (one.name, key)
-    orders = torch.arange(N, dtype=torch.int32) % 4
-    model.effect_sets = EffectSets(3 if agr else 0, 7, orders, torch.zeros(N, dtype=torch.uint8))
-    model.fill(model.effect_sets)
-    other = made(name, agr, count=5, seed=3)
-    other.load_state(model.pack())
-    assert same(model.pack(), other.pack())
-    seen, again = tensors_of(model.slice(QUERY)), tensors_of(other.slice(QUERY))
-    assert all(torch.equal(x, y) for x, y in zip(seen, again, strict=True))
-    seen, later = (model.slice(query) for query in queries)
-    assert all(torch.equal(x[7:], y[7:]) for x, y in zip(seen[:3], later[:3], strict=True))  # static rows
+            assert x.isfinite().all(), (simplification.name, key)
 
 
-@EVERY
-def test_a_slice_is_exported(name: str, agr: bool, tmp_path: Path) -> None:
+@VARIANT
+def test_a_slice_is_exported(variant: str, tmp_path: Path) -> None:
     """Catches a PLY that has lost a Gaussian or moved one, and harmonics for a model whose slice has none."""
-    model, query = made(name, agr).float(), CameraTime.at(CAMERA.float(), 0.45)
+    model, query = active(variant).float(), CameraTime.at(CAMERA.float(), 0.45)
     (tmp_path / "slice.ply").write_bytes(ply_of(trained_of(model, query)))
-    read, seen = read_trained(tmp_path / "slice.ply"), model.slice(query)
-    drawn = seen.opacities >= 1 / 255
-    torch.testing.assert_close(read.means, seen.means[drawn].detach())
-    torch.testing.assert_close(torch.sigmoid(read.logits), seen.opacities[drawn].detach())
-    factors = seen.factors if seen.beta_exponents is None else seen.factors / reach(seen.beta_exponents)[:, None, None]
+    trained, sliced = read_trained(tmp_path / "slice.ply"), model.slice(query)
+    drawn = sliced.opacities >= 1 / 255
+    torch.testing.assert_close(trained.means, sliced.means[drawn].detach())
+    torch.testing.assert_close(torch.sigmoid(trained.logits), sliced.opacities[drawn].detach())
+    factors = (
+        sliced.factors
+        if sliced.beta_exponents is None
+        else sliced.factors / reach(sliced.beta_exponents)[:, None, None]
+    )
     volumes = torch.linalg.det(factors[drawn].detach()).abs()
-    torch.testing.assert_close(read.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(trained.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
     if has_harmonics(model):
-        assert len(trained_of(model, query, keep_harmonics=True)) == len(read)
+        assert len(trained_of(model, query, keep_harmonics=True)) == len(trained)
     else:
         with pytest.raises(InputError, match="--direction"):
             trained_of(model, query, keep_harmonics=True)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_before_it_has_gaussians(name: str) -> None:
-    """Catches an error of Python for the length of a model that was only built, and for its start at no points."""
-    model = build(name, **needed(name))
-    assert len(model) == 0
-    with pytest.raises(InputError, match="points: expected more than 3"):
-        started(model, 0)
-
-
-TIMED = [name for name in NAMES if "time" in registry.find(name).observes]
-# The raw parameter and the column that hold the size in time, and a number that makes this size tiny.
-IN_TIME = {"4dgs": ("scales", 3, -20.0), "dbs": ("precision", -1, 20.0), "dgs": ("precision", -1, 20.0),
-           "freetime": ("durations", 0, -20.0), "ubs": ("scales", -1, -20.0)}  # fmt: skip
-LEAST = 0.04
-
-
-@pytest.mark.parametrize("name", TIMED)
-def test_a_model_holds_it(name: str) -> None:
-    """Catches a model that forgets lambda, its unit of time or the exponents, or that lengthens what is long enough."""
-    model = started(build(name, **awkward(name)))
-    raw = {key: value.data for key, value in model.splats.items()}
-    if "times" not in raw:
-        pytest.skip("its Gaussians have no times")
-    bounded = getattr(model, "bounded_times", False) or name == "dgs"
-    raw["times"].fill_(0.0 if bounded else 0.5)  # the sigmoid of 0 is 0.5
-    parameter, column, tiny = IN_TIME.get(name) or ("log_diagonal", model.rows["t"][0], -20.0)  # type: ignore[index]
-    raw[parameter][::2, column] = tiny
-    before = {key: value.clone() for key, value in raw.items()}
-
-    def shares() -> torch.Tensor:
-        """The opacities LEAST after the mean time, divided by those at the mean time."""
-        now, later = (model.slice(CameraTime.at(CAMERA.float(), 0.5 + dt)).opacities for dt in (0.0, LEAST))
-        return (later / now)[now > 1e-3]
-
-    assert (shares() < 0.01).any()
-    with torch.no_grad():
-        model.hold_lifetimes(LEAST)
-    assert 0.5 < shares().min() < 0.65  # exp(-1/2) is 0.61, Beta profiles fall faster
-    for key, value in raw.items():
-        changed = value != before[key]
-        assert key == parameter or not changed.any()
-        assert not changed[1::2].any()

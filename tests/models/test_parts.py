@@ -12,7 +12,16 @@ from scipy.special import sph_harm_y
 from torch import Tensor, nn
 
 from gsbench.errors import InputError
-from gsbench.models.appearance import sh_basis, sh_colors, sh_time_colors
+from gsbench.models.appearance import (
+    MOST_PACKED,
+    ColorOrder,
+    at_most,
+    coefficients_within,
+    order_of,
+    sh_basis,
+    sh_colors,
+    sh_time_colors,
+)
 from gsbench.models.camera_time import unit
 from gsbench.models.factors import OFF_DIAGONALS, CholeskyLayout, rotation, rotation4d
 from gsbench.models.refinement import Refinement, encode_time
@@ -70,7 +79,7 @@ def test_kinds_of_entries(letters: str, expected: dict[str, str]) -> None:
     """Catches an entry of L_pp among the motions, or of L_td among the shapes: each has its unit and its rate."""
     layout, n = CholeskyLayout(letters, "raw"), len(letters)
     names = torch.tensor([10 * i + j for i in range(n) for j in range(i)])[None]
-    assert {kind: " ".join(map(str, found[0].tolist())) for kind, found in layout.split(names).items()} == expected
+    assert {kind: " ".join(map(str, x[0].tolist())) for kind, x in layout.split(names).items()} == expected
 
 
 def test_relative_shape_is_in_units_of_its_row() -> None:
@@ -129,10 +138,10 @@ def test_rotation4d(seed: int) -> None:
 
 def test_rotation4d_is_general() -> None:
     """Catches an identity that turns, and two quaternions that reach only a part of the six rotations of 4D."""
-    one = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
-    torch.testing.assert_close(rotation4d(one, one)[0], torch.eye(4, dtype=torch.float64))
-    generators = [rotation4d(one + 1e-6 * e, one) for e in torch.eye(4).double()[1:, None]]
-    generators += [rotation4d(one, one + 1e-6 * e) for e in torch.eye(4).double()[1:, None]]
+    unturned = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(rotation4d(unturned, unturned)[0], torch.eye(4, dtype=torch.float64))
+    generators = [rotation4d(unturned + 1e-6 * e, unturned) for e in torch.eye(4).double()[1:, None]]
+    generators += [rotation4d(unturned, unturned + 1e-6 * e) for e in torch.eye(4).double()[1:, None]]
     span = torch.stack([(G[0] - torch.eye(4)) / 1e-6 for G in generators]).flatten(1)
     assert torch.linalg.matrix_rank(span, rtol=1e-3) == 6  # all of so(4)
 
@@ -188,10 +197,30 @@ def test_orders_leave_out_what_is_above_them() -> None:
     coefficients, d, offset = normal(6, 12, 3, 16, 3), directions(7, 12), normal(8, 12)
     orders = torch.tensor([degree + 4 * waves for degree in range(4) for waves in range(3)], dtype=torch.int32)
     degrees = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)])
-    own = (degrees <= orders[:, None] % 4)[:, None] & (torch.arange(3) <= orders[:, None] // 4)[..., None]
-    cut = torch.where(own[..., None], coefficients, 0.0)
+    within = (degrees <= orders[:, None] % 4)[:, None] & (torch.arange(3) <= orders[:, None] // 4)[..., None]
+    cut = torch.where(within[..., None], coefficients, 0.0)
     torch.testing.assert_close(sh_time_colors(coefficients, d, 3, offset, orders), sh_time_colors(cut, d, 3, offset))
     torch.testing.assert_close(sh_colors(coefficients[:, 0], d, 3, orders), sh_colors(cut[:, 0], d, 3))
+
+
+PACKED = st.integers(0, MOST_PACKED)
+
+
+@given(PACKED, st.lists(PACKED, min_size=1))
+def test_an_order_is_one_number(packed: int, others: list[int]) -> None:
+    """Catches a packing that loses an order, for ints and for tensors; a limit that compares the numbers themselves,
+    for degree 0 with 2 waves (4) is not above degree 3 (3); and a frequency or degree counted from the wrong end."""
+    order = order_of(packed)
+    assert 0 <= order.degree <= 3
+    assert 1 <= order.waves <= 8
+    assert order.packed == packed
+    assert torch.equal(order_of(torch.tensor([packed])).packed, torch.tensor([packed]))
+    pairs = [(order_of(other), order) for other in others]
+    lowered = [ColorOrder(min(a.degree, b.degree), min(a.waves, b.waves)).packed for a, b in pairs]
+    assert at_most(torch.tensor(others), packed).tolist() == lowered
+    mask = coefficients_within(torch.tensor([packed]), 3, 8)[0]
+    expected = [[wave < order.waves and math.isqrt(k) <= order.degree for k in range(16)] for wave in range(8)]
+    assert mask.tolist() == expected
 
 
 # ---- refinement
@@ -219,8 +248,14 @@ def test_refinement_measures_in_units() -> None:
 
 
 def test_refinement_starts_at_zero_but_learns() -> None:
-    """Catches residuals before any training, and an output layer of zeros that gets no gradient."""
+    """Catches residuals before any training, an output layer of zeros that gets no gradient, and another start than
+    that of torch.nn.Linear: uniform within 1 / sqrt(width)."""
     refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0))
+    bound = 1 / math.sqrt(7 + 2 * refinement.octaves)
+    for weights in (refinement.weight_in, refinement.bias_in):
+        assert 0.9 * bound < weights.abs().max() <= bound
+        assert weights.mean().abs() < 0.1 * bound
+    assert refinement.weight_in.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.05)
     values = list(normal(0, 5, 35).float().split([3, 1, 3, 7, 21], -1))
     moved = refinement(values, torch.tensor(0.3))
     assert all(torch.equal(x, y) for x, y in zip(moved, values, strict=True))
@@ -237,11 +272,11 @@ def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
     f = torch.cat([*values[:3], encode_time(time).expand(6, -1)], -1)
     assert f.shape[-1] == 27
     for i, (value, moved) in enumerate(zip(values, refinement(values, time), strict=True)):
-        rows, own = slice(64 * i, 64 * (i + 1)), slice([0, 3, 4, 7][i], [3, 4, 7, 35][i])
+        rows, outputs = slice(64 * i, 64 * (i + 1)), slice([0, 3, 4, 7][i], [3, 4, 7, 35][i])
         perceptron = nn.Sequential(nn.Linear(27, 64), nn.ReLU(), nn.Linear(64, value.shape[1])).double()
         first, last = perceptron[0], perceptron[2]
         first.weight.data, first.bias.data = refinement.weight_in.data[rows], refinement.bias_in.data[rows]
-        last.weight.data, last.bias.data = refinement.weight_out.data[own], refinement.bias_out.data[own]
+        last.weight.data, last.bias.data = refinement.weight_out.data[outputs], refinement.bias_out.data[outputs]
         torch.testing.assert_close(moved, value + perceptron(f))
 
 

@@ -80,20 +80,20 @@ def test_a_name_that_is_taken(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (None, "model.module='models_of_none': expected a Python module that can be imported: ModuleNotFoundError"),
         ("x = 1\ny = x / 0\n", "models_of_none.py, line 2: ZeroDivisionError"),
         ("def broken(:\n", "SyntaxError"),
     ],
 )
-def test_a_module_that_cannot_be_imported(folder: Path, text: str | None, said: str) -> None:
+def test_a_module_that_cannot_be_imported(folder: Path, text: str | None, message: str) -> None:
     """Catches a stack trace for a typo in the name, and one line that does not say where the user's own code fails."""
     if text is not None:
         (folder / "models_of_none.py").write_text(text)
     with pytest.raises(InputError) as caught:
         find("none", "models_of_none")
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

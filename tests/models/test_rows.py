@@ -1,20 +1,21 @@
-"""Rows of Gaussians: kept, cloned and split by density control, written to and read from a state."""
+"""Rows of Gaussians: how they start in time and direction, and how density control keeps, splits and resets them."""
 
 import math
 from typing import Any
 
 import pytest
 import torch
-from small import CAMERA, EXTENT, MODELS, VARIANTS, fresh, joint, lively, raw, seeded
+from small import CAMERA, EVERY, EXTENT, VARIANTS, covariances, fresh, joint, lively, raw, same, seeded
+from test_equations import conditioned
 from torch import Tensor
 
-from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.base import CHILDREN
+from gsbench.models.factors import KINDS
 from gsbench.schedule import ActiveComponents
 
-TRIANGULAR = [v for v in VARIANTS if v.startswith(("6dgs", "7dgs")) and "row_scaled" not in v]
-IN_TIME = [v for v in TRIANGULAR if v.startswith("7dgs")]
+SPLIT = [v for v in VARIANTS if "row_scaled" not in v]  # which cannot express every child
+CHOLESKY = [v for v in SPLIT if v.startswith(("6dgs", "7dgs"))]
 SHRINK = 1.6  # of the children of a split, in 3DGS' gaussian_model.py
 
 
@@ -35,62 +36,85 @@ def split_all(model: GaussianModel, seed: int = 0) -> Tensor:
 
 def sliced_covariance(model: GaussianModel) -> Tensor:
     """Covariances [N, 3, 3] of a slice; they do not depend on where the model is observed."""
-    factors = model.slice(CameraTime.at(CAMERA, 0.5)).factors.detach()
-    return factors @ factors.mT
+    return covariances(model.slice(CameraTime.at(CAMERA, 0.5)))
 
 
 def gain(model: GaussianModel) -> Tensor:
-    """K = S_pq S_qq^-1 of a triangular model, q = (d, t)."""
+    """K = S_pq S_qq^-1 of a Cholesky model, q = (d, t)."""
     S = joint(model)
     return S[:, :3, 3:] @ torch.linalg.inv(S[:, 3:, 3:])
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_select(variant: str) -> None:
-    """Catches a parameter whose rows are not moved with the others, or that is replaced and lost to the optimizer."""
-    model = quiet(variant)
+# ---- the start
+
+
+@pytest.mark.parametrize("variant", ["4dgs", "7dgs", "7dgs_paper", "7dgs_nodir", "ndgs"])
+def test_start_in_time(variant: str) -> None:
+    """Catches times outside [-0.1, 1.1], or not uniform, a time scale other than sqrt(T/5) or sqrt(T/10), and times of
+    N-DGS that are not clipped as the authors', at infinity, or no logits."""
+    model = fresh(variant, 4000)
+    times = model.splats["times"].data
+    if variant == "ndgs":
+        plain = fresh("7dgs", 4000).splats["times"].data
+        torch.testing.assert_close(torch.sigmoid(times), plain.clamp(1e-6, 1 - 1e-6), rtol=1e-5, atol=1e-6)
+        times = plain
+    assert -0.1 <= times.min() < -0.09
+    assert 1.09 < times.max() <= 1.1
+    assert abs(times.mean() - 0.5) < 0.02
+    S_t = model.factors(raw(model))[:, -1].square().sum(-1)
+    torch.testing.assert_close(S_t, torch.full((4000,), 0.2 if variant == "4dgs" else 0.1))
+
+
+@pytest.mark.parametrize("variant", ["6dgs", "7dgs", "7dgs_paper"])
+def test_start_in_direction(variant: str) -> None:
+    """Catches directions that are not uniform on the sphere and a direction scale other than 1."""
+    model = fresh(variant, 4000)
+    d = model.splats["directions"].data
+    torch.testing.assert_close(d.norm(dim=-1), torch.ones(4000))
+    assert d.mean(0).abs().max() < 0.03
+    torch.testing.assert_close((d.mT @ d) / 4000, torch.eye(3) / 3, rtol=0, atol=0.02)
+    torch.testing.assert_close(model.factors(raw(model))[:, 3:6].square().sum(-1), torch.ones(4000, 3))
+    assert not any(raw(model)[kind].any() for kind in KINDS)
+
+
+# ---- density control
+
+
+@pytest.mark.parametrize("variant", EVERY)
+def test_rows_are_selected_split_and_reset(variant: str) -> None:
+    """Catches a parameter whose rows are not moved with the others, or that is replaced and lost to the optimizer; a
+    split that moves other Gaussians, changes what children inherit, gives twins the same place, or draws
+    from elsewhere; a reset that raises what was lower already."""
+    model, rows = quiet(variant), torch.tensor([0, 1, 2, 3, 3, 4, 4])
     before, objects = raw(model), dict(model.splats.items())
     for p in model.splats.values():
         p.grad = torch.ones_like(p)
-    rows = torch.tensor([5, 2, 2, 0])
     model.select(rows)
-    assert len(model) == 4
-    for name, parameter in model.splats.items():
-        assert torch.equal(parameter, before[name][rows])
-        assert parameter is objects[name]
-        assert parameter.grad is None
-    model.select(torch.zeros(0, dtype=torch.long))
-    assert len(model) == 0
-    assert model.slice(CameraTime.at(CAMERA, 0.5)).means.shape == (0, 3)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_split_touches_only_its_rows(variant: str) -> None:
-    """Catches a split that moves other Gaussians, changes what children inherit, or gives twins the same place."""
-    model = quiet(variant)
-    model.select(torch.tensor([0, 1, 2, 3, 3, 4, 4]))
-    before = raw(model)
+    assert same(raw(model), {name: x[rows] for name, x in before.items()})
+    assert all(x is objects[name] and x.grad is None for name, x in model.splats.items())
     model.split_rows(torch.tensor([3, 4, 5, 6]), seeded(0))
-    after = raw(model)
-    for name, value in after.items():
+    for name, value in raw(model).items():
         assert torch.equal(value[:3], before[name][:3])
+        assert value.isfinite().all()
         if name not in {*model.centers, *model.geometry, "means"}:
-            assert torch.equal(value, before[name])
-    assert not torch.equal(after["means"][3], after["means"][4])
-    assert all(value.isfinite().all() for value in after.values())
+            assert torch.equal(value, before[name][rows])
+    assert not torch.equal(model.splats["means"][3], model.splats["means"][4])
     again = quiet(variant)
-    again.select(torch.tensor([0, 1, 2, 3, 3, 4, 4]))
+    again.select(rows)
     again.split_rows(torch.tensor([3, 4, 5, 6]), seeded(0))
-    assert all(torch.equal(a, b) for a, b in zip(raw(again).values(), after.values(), strict=True))
+    assert same(raw(again), raw(model))
+    opacities = torch.sigmoid(model.splats["opacities"].data)
+    model.reset_opacities(opacities.median().item())
+    torch.testing.assert_close(torch.sigmoid(model.splats["opacities"].data), opacities.clamp(max=opacities.median()))
 
 
-@pytest.mark.parametrize("variant", [v for v in VARIANTS if "row_scaled" not in v])
+@pytest.mark.parametrize("variant", SPLIT)
 def test_children_of_a_split_in_space(variant: str) -> None:
     """Catches children of another size or motion: covariance of the slice / 1.6^2, K and the blocks of q unchanged."""
     model = quiet(variant)
     model.extent = math.inf  # nothing is long enough to be split in time
     before, covariance = raw(model), sliced_covariance(model)
-    slopes, S_qq = (gain(model), joint(model)[:, 3:, 3:]) if variant in TRIANGULAR else (None, None)
+    slopes, S_qq = (gain(model), joint(model)[:, 3:, 3:]) if variant in CHOLESKY else (None, None)
     scales = model.scales()
     parents = split_all(model)
     torch.testing.assert_close(sliced_covariance(model), covariance[parents] / SHRINK**2)
@@ -102,7 +126,7 @@ def test_children_of_a_split_in_space(variant: str) -> None:
             assert torch.equal(model.splats[name], before[name][parents])
 
 
-@pytest.mark.parametrize("variant", [v for v in VARIANTS if "row_scaled" not in v])
+@pytest.mark.parametrize("variant", SPLIT)
 def test_children_lie_where_the_parent_is_dense(variant: str) -> None:
     """Catches offsets of another size or orientation: over many draws, their covariance is that of the parent."""
     model = quiet(variant, count=4)
@@ -119,7 +143,7 @@ def test_children_lie_where_the_parent_is_dense(variant: str) -> None:
     torch.testing.assert_close(offsets.mT @ offsets / 20_000, expected, rtol=0, atol=0.05 * expected.trace().item())
 
 
-@pytest.mark.parametrize("variant", IN_TIME)
+@pytest.mark.parametrize("variant", [v for v in CHOLESKY if v.startswith("7dgs")])
 def test_children_of_a_split_in_time(variant: str) -> None:
     """Catches children off the parent's path or with another slope.
 
@@ -137,8 +161,7 @@ def test_children_of_a_split_in_time(variant: str) -> None:
     torch.testing.assert_close(joint(model)[:, -1, -1], S_t[parents] / SHRINK**2)
     torch.testing.assert_close(gain(model), slopes[parents], rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(sliced_covariance(model), covariance[parents])
-    moved = model.splats["times"].data - before["times"][parents]
-    assert moved.abs().min() > 0
+    assert (model.splats["times"].data - before["times"][parents]).abs().min() > 0
     # The direction of view to a child differs from that to its parent; seen from where it is the same, so is the path.
     offset = model.splats["means"].data - before["means"][parents]
     for t, path in paths.items():
@@ -147,12 +170,31 @@ def test_children_of_a_split_in_time(variant: str) -> None:
             torch.testing.assert_close(child, path[parents[i]], rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.parametrize("case", ["ndgs", "7dgs_nodir, bounded"])
+def test_children_of_bounded_times(case: str) -> None:
+    """Catches a child of a split in time whose time is added to the logit, and one off its parent's path at an end."""
+    model, query = conditioned(case, 40), CameraTime.at(CAMERA, 0.45)
+    model.extent = 1e-6  # every Gaussian moves far
+    model.splats["log_diagonal"].data[:, model.rows["t"]] = 0.0  # and lives long
+    parents = {name: value.repeat_interleave(2, 0) for name, value in raw(model).items()}
+    parents["times"][::4] = 4.0  # near the end, where a later child is clipped
+    children = parents | model.split(parents, seeded(3))
+    before, after = torch.sigmoid(parents["times"]), torch.sigmoid(children["times"])
+    assert ((after - before).abs() > 0.1).float().mean() > 0.3
+    assert ((after > 0) & (after < 1)).all()
+    assert (after > 1 - 2e-6).any()
+    if case != "ndgs":  # whose direction to a child is another one
+        paths = [model.slice_geometry(values, query).means for values in (parents, children)]
+        torch.testing.assert_close(paths[1], paths[0])
+    model.split_in_time = False
+    torch.testing.assert_close(model.split(parents, seeded(3))["times"], parents["times"], rtol=0, atol=0)
+
+
 def test_long_in_time() -> None:
     """Catches thresholds other than |S_pt| > 0.05 extent and sqrt(S_t) > 0.25, and a criterion where there is no t."""
     model = fresh("7dgs")
     assert not model.long_in_time().any()  # nothing moves at first
-    rows = model.rows
-    time = rows["t"][0]
+    time = model.rows["t"][0]
     motion, log_diagonal = model.splats["motion"].data, model.splats["log_diagonal"].data
     for sigma, S_pt, expected in [(0.26, 0.11, True), (0.24, 0.11, False), (0.26, 0.09, False)]:
         log_diagonal[:, time] = math.log(sigma)
@@ -161,32 +203,3 @@ def test_long_in_time() -> None:
     assert EXTENT == 2.0
     for name in ("3dgs", "4dgs", "6dgs"):
         assert not lively(name).long_in_time().any()
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_reset_of_opacities(variant: str) -> None:
-    """Catches a reset that raises what was lower already, or sets another value than asked for."""
-    model = quiet(variant)
-    before = torch.sigmoid(model.splats["opacities"].data)
-    ceiling = before.median().item()
-    model.reset_opacities(ceiling)
-    torch.testing.assert_close(torch.sigmoid(model.splats["opacities"].data), before.clamp(max=ceiling))
-
-
-# ---- states
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_state_of_something_else(variant: str) -> None:
-    """Catches a state of another model or option that loads, and fails or draws nonsense later."""
-    model = fresh(variant)
-    foreign = [fresh(name).state_dict() for name in MODELS if name not in variant]
-    foreign += [fresh(variant, sh_degree=2).state_dict(), fresh(variant, agr=not model.agr).state_dict()]
-    if variant.startswith("4dgs"):
-        foreign.append(fresh(variant, time_degree=1).state_dict())
-    before = raw(model)
-    for wrong in foreign:
-        with pytest.raises(InputError, match="checkpoint") as error:
-            model.load_state(wrong)
-        assert "\n" not in str(error.value)
-    assert all(torch.equal(a, b) for a, b in zip(raw(model).values(), before.values(), strict=True))

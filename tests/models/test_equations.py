@@ -1,0 +1,400 @@
+"""The slice of each model against the equations of its paper, in float64 with explicit inverses or by hand."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from small import CAMERA, CHOLESKY, MODELS, N, covariances, fresh, joint, lively, moved, raw, seeded, started
+
+from gsbench.models import CameraTime, Gaussians3D, build
+from gsbench.models.base import Raw
+from gsbench.models.beta import BetaModel, joint_factor, opacity_factor, softplus_inverse
+from gsbench.models.camera_time import unit
+from gsbench.models.cholesky import CholeskyModel
+from gsbench.models.gaussian_batch import tensors_of
+from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
+from gsbench.models.moving import DirectBetaModel, DirectModel, MovingGaussians3D, precision_factor
+from gsbench.models.slicing import slice_gaussians
+
+TIME = 0.45
+QUERY = CameraTime.at(CAMERA, TIME)
+ORDERS = {"paper": "ptd", "conditioned_first": "dtp"}
+SCHEMES = ("square_root", "schur", "cholesky")
+
+
+def agree(sliced: Gaussians3D, means: np.ndarray, covs: np.ndarray, opacities: np.ndarray, rtol: float = 1e-8) -> None:
+    np.testing.assert_allclose(sliced.means.detach().numpy(), means, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(covariances(sliced).numpy(), covs, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(sliced.opacities.detach().numpy(), opacities, rtol=rtol, atol=rtol / 100)
+
+
+# ---- 6DGS, 7DGS and N-DGS: the model, its options, the 1/2 of f_dir (None: a joint gate)
+
+LAMBDAS = {"lambda_t": 0.4, "lambda_d": 0.4}
+CONDITIONED: dict[str, tuple[str, dict[str, Any], float | None]] = {
+    "6dgs": ("6dgs", MODELS["6dgs"], 1.0),
+    "7dgs": ("7dgs", MODELS["7dgs"], 0.5),
+    "7dgs_nodir": ("7dgs_nodir", MODELS["7dgs_nodir"], None),
+    "6dgs, half": ("6dgs", MODELS["6dgs"] | {"directional_half": True}, 0.5),
+    "7dgs, no half": ("7dgs", MODELS["7dgs"] | {"directional_half": False}, 1.0),
+    "6dgs, unit": ("6dgs", {"lambda_d": 0.4, "unit_directions": True}, 0.5),
+    "7dgs, unit and bounded": ("7dgs", LAMBDAS | {"unit_directions": True, "bounded_times": True}, 0.5),
+    "7dgs_nodir, bounded": ("7dgs_nodir", {"lambda_t": 0.4, "bounded_times": True}, None),
+    "ndgs": ("ndgs", LAMBDAS, None),
+}
+
+
+def conditioned(case: str, count: int = N, **more: Any) -> CholeskyModel:
+    """A model of CONDITIONED in the midst of a training, in float64."""
+    name, options, _ = CONDITIONED[case]
+    model = moved(started(build(name, **options | more), count))
+    assert isinstance(model, CholeskyModel)
+    return model
+
+
+def by_hand(case: str, model: CholeskyModel, order: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means [N, 3], covariances [N, 3, 3] and opacities [N] of a model of CONDITIONED at QUERY."""
+    name, options, half = CONDITIONED[case]
+    values = {name: value.numpy() for name, value in raw(model).items()}
+    lambdas = {key: model.lambda_of(key).item() for key in model.log_lambda}
+    variables = "p" + "t" * ("times" in values) + "d" * ("directions" in values)
+    letters = "".join(x * (1 if x == "t" else 3) for x in order if x in variables)
+    p, t, d = ([i for i, x in enumerate(letters) if x == which] for which in "ptd")
+    below, means, covs, opacities = model.layout.join(raw(model)).numpy(), [], [], []
+    for i, mean in enumerate(values["means"]):
+        L, entries = np.diag(np.exp(values["log_diagonal"][i])), iter(below[i])
+        for row in range(len(L)):  # off-diagonals row by row
+            for column in range(row):
+                L[row, column] = next(entries)
+        if model.layout.form == "relative":
+            L[np.ix_(p, p)] = np.diag(L.diagonal()[p]) @ (np.tril(L[np.ix_(p, p)], -1) + np.eye(3))
+        S, offset_t, offset_d = L @ L.T, np.zeros(0), np.zeros(0)
+        if d:
+            mu_d = values["directions"][i]
+            mu_d = mu_d / np.linalg.norm(mu_d) if name == "ndgs" or "unit_directions" in options else mu_d
+            offset_d = (mean - CAMERA.numpy()) / np.linalg.norm(mean - CAMERA.numpy()) - mu_d
+        if t:
+            mu_t = values["times"][i]
+            offset_t = TIME - (1 / (1 + np.exp(-mu_t)) if name == "ndgs" or "bounded_times" in options else mu_t)
+        q, offset = t + d, np.concatenate([offset_t, offset_d])
+        K = S[np.ix_(p, q)] @ np.linalg.inv(S[np.ix_(q, q)])
+        means.append(mean + K @ offset)
+        covs.append(S[np.ix_(p, p)] - K @ S[np.ix_(q, p)])
+        if name == "ndgs":
+            exponent = lambdas["time"] * offset @ np.linalg.inv(S[np.ix_(q, q)]) @ offset
+        else:
+            exponent = half * lambdas["direction"] * offset_d @ np.linalg.inv(S[np.ix_(d, d)]) @ offset_d if d else 0.0
+            exponent += 0.5 * lambdas["time"] * offset_t[0] ** 2 / S[t[0], t[0]] if t else 0.0
+        opacities.append(math.exp(-exponent) / (1 + math.exp(-values["opacities"][i])))
+    return np.stack(means), np.stack(covs), np.array(opacities)
+
+
+@pytest.mark.parametrize("form", ["relative", "raw"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("case", CONDITIONED)
+def test_cholesky_models(case: str, order: str, scheme: str, form: str) -> None:
+    """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one or a marginal one in
+    the joint gate, a wrong lambda or 1/2, a raw direction or time; the kernels get means as they are sliced."""
+    model = conditioned(case, factor_order=order, scheme=scheme, off_diagonal=form)
+    expected = by_hand(case, model, ORDERS[order])
+    agree(model.slice(QUERY), *expected)
+    if scheme == "square_root":
+        agree(model.float().slice(CameraTime.at(CAMERA.float(), TIME)), *expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", CHOLESKY)
+def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
+    """Catches an order that is another model: the same covariance, written in either, gives the same slice."""
+    paper, first = lively(name, factor_order="paper"), lively(name, seed=3, factor_order="conditioned_first")
+    for key, value in raw(paper).items():
+        first.splats[key].data = value
+    n = joint(paper).shape[-1]
+    factor = paper.factors(raw(paper))[:, [*range(3, n), 0, 1, 2]]  # from (p, d, t) to (d, t, p)
+    for key, value in first.layout.parameters(factor).items():
+        first.splats[key].data = value
+    torch.testing.assert_close(joint(first), joint(paper))
+    a, b = paper.slice(QUERY), first.slice(QUERY)
+    agree(b, a.means.detach().numpy(), covariances(a).numpy(), a.opacities.detach().numpy())
+
+
+@pytest.mark.parametrize("name", CHOLESKY)
+@pytest.mark.parametrize("order", ORDERS)
+def test_far_from_the_query(name: str, order: str) -> None:
+    """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
+    model = fresh(name, factor_order=order)
+    for kind in model.layout.kinds:
+        model.splats[kind].data.normal_(generator=seeded(1))
+    model.splats["log_diagonal"].data.fill_(-30.0)
+    sliced = model.slice(CameraTime.at(CAMERA.float(), TIME))
+    sum(x.sum() for x in tensors_of(sliced)).backward()
+    assert all(x.isfinite().all() for x in tensors_of(sliced))
+    assert all(p.grad.isfinite().all() for p in model.splats.values())
+
+
+def test_what_a_joint_gate_leaves_of_a_frozen_gaussian() -> None:
+    """Catches a gate that is divided into marginal parts: what stays of time, and of both, is by formula; and a second
+    lambda, which would be ignored or trained without a gradient."""
+    model = conditioned("ndgs")
+    assert [math.exp(x) for x in model.log_lambda.values()] == pytest.approx([0.4])
+    assert len(build("ndgs", lambda_t=0.1, lambda_d=0.2, joint_gate=False).log_lambda) == 2
+    values, S = raw(model), joint(model)
+    whole, delta = torch.from_numpy(by_hand("ndgs", model, "dtp")[2]), model.offset(values, QUERY)
+    along = torch.linalg.vecdot(delta[:, :3], torch.linalg.solve(S[:, 3:6, 3:6], delta[:, :3]))
+    of_time, of_direction = torch.exp(-0.4 * delta[:, 3].square() / S[:, 6, 6]), torch.exp(-0.4 * along)
+    frozen = model.frozen(values, [QUERY], torch.ones(1, len(model), dtype=torch.float64))
+    remaining = {"direction": of_time, "time": of_direction, "static": torch.ones_like(of_time)}
+    assert frozen.keys() == remaining.keys()
+    for name, factor in remaining.items():
+        opacities = torch.sigmoid(frozen[name]["opacities"])
+        torch.testing.assert_close(opacities, (whole / factor).clamp(min=1e-6), rtol=1e-5, atol=1e-9)
+    still = model.slice_geometry(values | frozen["direction"], QUERY).opacities  # of one view, the mean is itself
+    torch.testing.assert_close(still[whole > 2e-6], whole[whole > 2e-6], rtol=1e-4, atol=1e-9)
+
+
+# ---- 4DGS
+
+
+def rotor_factor(left: np.ndarray, right: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """R S over (x, y, z, t), R v = l v conj(r) with v = (x, y, z, t) read as the quaternion x + y i + z j + t k."""
+
+    def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.r_[a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
+
+    left, right = left / np.linalg.norm(left), right / np.linalg.norm(right) * [1, -1, -1, -1]
+    return np.stack([product(product(left, e), right) for e in np.eye(4)], -1) * np.exp(scales)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_4dgs(scheme: str) -> None:
+    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is ignored or not 1 by default, and the opacity
+    factor's exponent."""
+    assert build("4dgs").lambda_of("time") == 1
+    model = lively("4dgs", scheme=scheme)
+    model.splats["times"].data[:4] += 3  # too far to be drawn
+    values = {name: value.numpy() for name, value in raw(model).items()}
+    means, covs, opacities = [], [], []
+    for i, mean in enumerate(values["means"]):
+        F = rotor_factor(values["left_quats"][i], values["right_quats"][i], values["scales"][i])
+        S, offset = F @ F.T, (TIME - values["times"][i, 0]) * model.clock.item()
+        f = math.exp(-0.5 * model.lambda_of("time").item() * offset**2 / S[3, 3])
+        means.append(mean + S[:3, 3] / S[3, 3] * offset * (f > 0.05))  # what is not drawn stays at mu_p
+        covs.append(S[:3, :3] - np.outer(S[:3, 3], S[:3, 3]) / S[3, 3])
+        opacities.append((f if f > 0.05 else 0.0) / (1 + math.exp(-values["opacities"][i])))
+    agree(model.slice(QUERY), np.stack(means), np.stack(covs), np.array(opacities))
+    assert 0 < opacities.count(0) < N
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_4dgs_is_the_same_in_metres_and_centimetres(dtype: torch.dtype) -> None:
+    """Catches a rotation of space into time whose angle is a speed in one unit of length only."""
+    model, larger = lively("4dgs").to(dtype), lively("4dgs").to(dtype)
+    larger.clock *= 100
+    for name, times, plus in (("means", 100.0, 0.0), ("scales", 1.0, math.log(100.0))):
+        larger.splats[name].data.mul_(times).add_(plus)
+    a, b = model.slice(CameraTime.at(CAMERA.to(dtype), TIME)), larger.slice(CameraTime.at(100 * CAMERA.to(dtype), TIME))
+    torch.testing.assert_close(100 * a.means, b.means, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(100 * covariances(a), covariances(b) / 100, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(a.opacities, b.opacities, rtol=1e-4, atol=1e-6)
+
+
+def test_4dgs_leaves_out_what_is_far_in_time() -> None:
+    """Catches another threshold than f_temp > 0.05, and a size that is not the largest one in space."""
+    model = fresh("4dgs").double()
+    sigma = math.sqrt(1 / 5) / math.sqrt(MODELS["4dgs"]["lambda_t"])
+    for factor, drawn in [(1 - 1e-4, True), (1 + 1e-4, False)]:
+        model.splats["times"].data.fill_(TIME + factor * sigma * math.sqrt(-2 * math.log(0.05)))
+        assert ((model.slice(QUERY).opacities > 0) == drawn).all()
+    assert TIME_OPACITY_FACTOR_MIN == 0.05
+    model.splats["scales"].data[:] = torch.tensor([0.0, 1.0, -1.0, 5.0])
+    assert model.scales().tolist() == pytest.approx([math.e] * N)
+
+
+def test_4dgs_at_a_time_of_its_own_is_3dgs() -> None:
+    """Catches 4D rotations that do not contain the 3D ones: without any turn into t, the slice is R S in 3D."""
+    model = lively("4dgs")
+    q = model.splats["left_quats"].data
+    # v -> l v conj(r) leaves the t axis (k) alone where r = -k l k: the rotation then acts on x, y, z only.
+    model.splats["right_quats"].data = q * torch.tensor([1.0, -1, -1, 1])
+    F = model.factors(raw(model)).numpy()
+    np.testing.assert_allclose(F[:, 3, :3], 0, atol=1e-12)
+    np.testing.assert_allclose(F[:, :3, 3], 0, atol=1e-12)
+    R = F[:, :3, :3] / np.exp(raw(model)["scales"].numpy())[:, None, :3]
+    assert np.abs(Rotation.from_matrix(R).as_matrix() - R).max() < 1e-9
+    sliced = model.slice(QUERY)
+    np.testing.assert_allclose(covariances(sliced).numpy(), F[:, :3, :3] @ F[:, :3, :3].swapaxes(1, 2), atol=1e-12)
+    torch.testing.assert_close(sliced.means.data, model.splats["means"].data)
+
+
+# ---- dGS, dBS and FreeTimeGS: one Gaussian at the origin, with numbers for which the equations were evaluated by hand
+
+DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+FROM_ORIGIN = CameraTime(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # from there, the origin is in DIRECTION
+VIEW, MOMENT = math.log(0.4), math.log(math.sqrt(10))
+DIRECT = {
+    "means": torch.zeros(1, 3),
+    "scales": torch.tensor([[0.01, 0.02, 0.03]]).log(),
+    "quats": torch.tensor([[1.0, 0, 0, 0]]),
+    "directions": torch.tensor([[0.0, 0, 2]]),
+    "times": torch.zeros(1, 1),
+    "precision": torch.tensor([[VIEW, 0.1, VIEW, 0, 0, VIEW, MOMENT]]),
+    "coupling": torch.full((1, 12), 0.3),
+    "shares": torch.full((1, 2), -1.2),
+}
+
+
+def change(raw: Raw, name: str, **options: Any) -> tuple[list[float], float]:
+    """The shift of the mean and the opacity factor of one Gaussian, which have no gradient by its mean."""
+    model = build(name, **options)
+    assert isinstance(model, DirectModel | DirectBetaModel)
+    values = {key: value.double() for key, value in raw.items()}
+    values["means"].requires_grad_()
+    shift, factor = model.change(values, FROM_ORIGIN)
+    assert not shift.requires_grad
+    assert not factor.requires_grad
+    return shift[0].tolist(), factor.item()
+
+
+def test_the_equations_of_dgs() -> None:
+    """Catches L for its transpose, a half in the exponent, Lam of another column, a mean direction that is not unit, a
+    coupling that is ignored, and a gradient of the mean by way of the direction from the camera."""
+    shift, factor = change(DIRECT, "dgs")
+    assert shift == pytest.approx([0.00279045] * 3, rel=1e-5)
+    assert factor == pytest.approx(0.850101, rel=1e-6)
+    share, V_pq = 1 / (1 + math.exp(1.2)), 0.02 / math.sqrt(12)  # V_pq delta of every axis
+    delta, through = 0.6 - 0.2 + 0.2, 0.096 + 0.024 - 0.032 + 2.0
+    interpolated = V_pq * ((1 - share) * delta + share * through)
+    assert change(DIRECT, "dgs", coupling="interpolated")[0][0] == pytest.approx(interpolated)
+    assert change(DIRECT, "dgs", coupling="none")[0] == [0, 0, 0]
+
+
+def test_the_equations_of_dbs() -> None:
+    """Catches an exponent of another variable, weights b / 4 that are not those of V_qq delta, and exp for softplus."""
+    raw = {key: value for key, value in DIRECT.items() if key not in ("shares", "quats")}
+    raw |= {"scales": softplus_inverse(DIRECT["scales"].double().exp()), "directions": torch.tensor([[0.0, 0, 1]]),
+            "times": torch.full((1, 1), 0.5), "betas": torch.tensor([[7.0, -3, -3, -3, 0]])}  # fmt: skip
+    shift, factor = change(raw, "dbs")
+    assert shift == pytest.approx([0.0115723] * 3, rel=1e-5)
+    assert factor == pytest.approx(0.145891, rel=1e-5)
+
+
+def test_precision_is_positive_and_couples_no_time() -> None:
+    """Catches a transposed or shifted triangle: direction and time stay apart."""
+    L = precision_factor(torch.arange(7.0)[None])[0]
+    expected = [[1, 0, 0, 0], [1, math.exp(2), 0, 0], [3, 4, math.exp(5), 0], [0, 0, 0, math.exp(6)]]
+    torch.testing.assert_close(L, torch.tensor(expected))
+
+
+def test_the_equations_of_freetime() -> None:
+    """Catches a velocity from t = 0, a duration without its square, a gate that moves with the camera."""
+    model = build("freetime")
+    assert isinstance(model, MovingGaussians3D)
+    raw = {"times": [[0.2]], "durations": [[math.log(0.5)]], "velocities": [[1.0, 0, -2]]}
+    query = CameraTime(torch.zeros(3), torch.tensor(0.7))
+    shift, opacity_factor = model.change({key: torch.tensor(value) for key, value in raw.items()}, query)
+    torch.testing.assert_close(shift, torch.tensor([[0.5, 0, -1.0]]))
+    torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
+
+
+@pytest.mark.parametrize("name", ["dgs", "freetime"])
+def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
+    """Catches weights that are forgotten, and an opacity or a mean that is the one of a single view."""
+    model, queries = lively(name, 100), [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]
+    weights = torch.tensor([0.25, 0.75], dtype=torch.float64)[:, None].expand(2, len(model))
+    static = raw(model) | model.frozen(raw(model), queries, weights)["static"]
+    first, second = (model.slice(query) for query in queries)
+    torch.testing.assert_close(static["means"], (0.25 * first.means + 0.75 * second.means).detach())
+    opacities = (0.25 * first.opacities + 0.75 * second.opacities).clamp(1e-6).detach()
+    torch.testing.assert_close(torch.sigmoid(static["opacities"]), opacities)
+
+
+# ---- UBS, and what dBS shares with it
+
+PROFILES = ("ubs", "ubs_static", "dbs", "dbs_static")
+
+
+def profiles(name: str, count: int = 30, **options: Any) -> tuple[BetaModel, Raw]:
+    """A model of Beta profiles in the midst of a training, and its raw parameters."""
+    model = lively(name, count, **options)
+    assert isinstance(model, BetaModel)
+    return model, {key: value.detach() for key, value in model.splats.items()}
+
+
+@pytest.mark.parametrize("name", ["ubs", "ubs_static"])
+@pytest.mark.parametrize("modulation", ["whitened", "raw"])
+def test_exponents_of_four_condition_a_gaussian(name: str, modulation: str) -> None:
+    """Catches a covariance whose rows are in another order than the query, and a mean that B changes where B = I."""
+    model, raw = profiles(name, modulation=modulation)
+    raw["betas"][:, 1:] = 0.5  # b = 6.6, of which B takes at most 4 / 4
+    sliced = model.condition(raw, FROM_ORIGIN)
+    q = [unit(raw["means"] - FROM_ORIGIN.center), torch.full((30, 1), 0.7)][: len(model.observes)]
+    mean = torch.cat([raw["means"], raw["directions"], *([raw["times"]] if "times" in raw else [])], -1)
+    expected = slice_gaussians(mean, joint_factor(raw), torch.cat(q, -1))
+    torch.testing.assert_close(sliced.means, expected.mean)
+    torch.testing.assert_close(covariances(sliced), expected.factor @ expected.factor.mT)
+
+
+def test_both_modulations_agree_where_every_exponent_is_the_same() -> None:
+    """Catches B on the wrong side of the whitening, and a covariance that loses the part I - B."""
+    slices = []
+    for modulation in ("whitened", "raw"):
+        model, raw = profiles("ubs", modulation=modulation)
+        raw["betas"][:, 1:] = -0.7
+        slices.append(model.condition(raw, FROM_ORIGIN))
+    torch.testing.assert_close(slices[0].means, slices[1].means)
+    torch.testing.assert_close(*map(covariances, slices))
+
+
+def test_the_whitened_covariance_is_definite_and_the_raw_one_is_not() -> None:
+    """Catches a mix-up of the two: only the covariance of the authors' code can be indefinite, and is then flat."""
+    flat = {}
+    for modulation in ("whitened", "raw"):
+        model, raw = profiles("ubs", 200, modulation=modulation)
+        raw["lower"] *= 10
+        raw["betas"][:, 1:] = 2 * torch.randn(200, 4, generator=seeded(1)).double() - 1
+        flat[modulation] = int((torch.linalg.det(model.factors(raw)) == 0).sum())
+    assert flat["whitened"] == 0
+    assert flat["raw"] > 10
+
+
+def test_opacity_factors_neither_cancel_nor_vanish() -> None:
+    """Catches 1 - tanh(y^2) = 0 in float32 with a logarithm of -inf, and a floor other than the authors'."""
+    y = torch.tensor([[0.0], [0.5], [3.5], [1e6]], requires_grad=True)
+    factors = opacity_factor(y, torch.full((4, 2), math.log(0.05)))  # exponents 0.2
+    expected = torch.tensor([1.0, (1 - math.tanh(0.25)) ** 0.2, 1.2e-7**0.2, 1.2e-7**0.2])
+    torch.testing.assert_close(factors, expected)
+    factors.sum().backward()
+    assert y.grad is not None
+    assert y.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_profiles_start_as_their_authors_start(name: str) -> None:
+    """Catches directions that are unit vectors, and view exponents of 4 in a model with time."""
+    model = fresh(name, 500)
+    assert -1 <= model.splats["directions"].min() < -0.9
+    dynamic = "time" in model.observes
+    assert model.splats["betas"].unique(dim=0).tolist() == [[0.0, *[-3.0 if dynamic else 0.0] * 3, *[0.0] * dynamic]]
+    exponents = model.slice(CameraTime.at(CAMERA.float(), 0.3)).beta_exponents
+    assert exponents is not None
+    assert exponents.unique().tolist() == [4.0]
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_children_of_profiles_look_1_6_times_smaller(name: str) -> None:
+    """Catches children of another profile, means that are drawn from the support, nearly three times too wide, and a
+    minimum size that is that of the support: what looks like a Gaussian has to be as large as asked."""
+    model, raw = profiles(name, 4)
+    rows = {key: value[:1].repeat(4000, *[1] * (value.dim() - 1)) for key, value in raw.items()}
+    if "lower" in raw:
+        rows["lower"] = rows["lower"] * 0  # so that nothing but the sizes is in the slice
+    children = model.split(rows, seeded(0))
+    F, b = model.factors(rows)[0], 4 * math.exp(float(raw["betas"][0, 0]))
+    drawn = (children["means"] - rows["means"]).T.cov()
+    torch.testing.assert_close(drawn, F @ F.T / (2 * b), rtol=0.15, atol=float((F @ F.T).max()) * 0.01)
+    torch.testing.assert_close(model.factors(rows | children)[0], F / 1.6)
+    model.hold_sizes(torch.full((4,), 0.7, dtype=torch.float64))
+    assert (model.scales() >= 0.699).all()
