@@ -1,5 +1,6 @@
 """The runs of a command line: scenes as an axis, sweeps without a flag, ablations that change what they name."""
 
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from gsbench.errors import InputError
 from gsbench.launch.command import compose_run, hydra_with, parse, runs_of
 from gsbench.launch.plan import identity
 
+JOB = "+exp=mini scene=suzanne +launch=slurm"
 MINI = ("moving-matte", "pendulum", "suzanne")
 ABLATIONS = {  # what each changes of 7DGS as it is; of another model, only its name
     "none": {},
@@ -30,7 +32,7 @@ ABLATIONS = {  # what each changes of 7DGS as it is; of another model, only its 
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def hydra() -> Iterator[None]:
     with hydra_with(None):
         yield
@@ -43,21 +45,17 @@ def hydra() -> Iterator[None]:
         ("scene=all +exp=mini seed=1", [f"+exp=mini seed=1 scene={scene}" for scene in MINI]),
         ("+exp=mini model=4dgs,7dgs -m scene=dust", [f"+exp=mini model={m} scene=dust" for m in ("4dgs", "7dgs")]),
         ("+exp=mini data.scenes=[new,dust]", [f"+exp=mini data.scenes=[new,dust] scene={s}" for s in ("new", "dust")]),
+        ("+exp=mini scene=suzanne", None),
+        ("+exp=mini scene=suzanne +launch=local", None),
         ("+exp=mini scene=dust +launch=slurm", ["+exp=mini scene=dust +launch=slurm"]),
         ("+exp=ablation scene=dust +ablation=none,schur", ["+ablation=none +exp=ablation scene=dust",
                                                            "+ablation=schur +exp=ablation scene=dust"]),
     ],
 )  # fmt: skip
-def test_the_runs_of_a_sweep(words: str, runs: list[str]) -> None:
+def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
     """Catches scenes that one job does one after the other, axes in another order, a run for Slurm that trains on the
-    login node, and axes of an experiment that a command line cannot replace."""
-    assert runs_of(parse(words.split())) == ([run.split() for run in runs], True)
-
-
-@pytest.mark.parametrize("words", ["+exp=mini scene=suzanne", "+exp=mini scene=suzanne +launch=local"])
-def test_a_single_run_is_as_it_was_typed(words: str) -> None:
-    """Catches a plan for a run that is of no sweep."""
-    assert runs_of(parse(words.split())) == ([words.split()], False)
+    login node, axes of an experiment that a command line cannot replace, and a plan for a run that is of no sweep."""
+    assert runs_of(parse(words.split())) == ([run.split() for run in runs or [words]], runs is not None)
 
 
 @pytest.mark.parametrize(
@@ -69,27 +67,21 @@ def test_a_single_run_is_as_it_was_typed(words: str) -> None:
         ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
         ("+exp=mini --multi", "--multi: expected -m"),
+        ("+exp=mini data.scenes=[new] scene=newer", "scene 'newer' is not known"),
+        *((f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d") for word in (
+            "at_once=-2", "minutes=0", "cpus=0", "gpus=-1", "requeues=-1", "signal_seconds=0", "signal_seconds=65536")),
     ],
-)
+)  # fmt: skip
 def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
-    """Catches a sweep of no run that ends well, and options of Hydra that would be dropped in silence."""
+    """Catches a sweep of no run that ends well, options of Hydra that would be dropped in silence, a scene that is no
+    scene, and a job that is submitted and fails, or is never requeued, for a number out of its range."""
     with pytest.raises(InputError, match=message):
-        runs_of(parse(words.split()))
+        [compose_run(run) for run in runs_of(parse(words.split()))[0]]
 
 
-@pytest.mark.parametrize("setting", ["at_once=-2", "minutes=0", "cpus=0", "gpus=-1", "requeues=-1", "signal_seconds=0",
-                                     "signal_seconds=65536"])  # fmt: skip
-def test_a_launch_that_slurm_would_refuse_is_refused_before_it(setting: str) -> None:
-    """Catches a job that is submitted and fails, or is never requeued, for a number out of its range."""
-    with pytest.raises(InputError, match=rf"launch\.{setting.partition('=')[0]}: expected .*\d"):
-        compose_run(["+exp=mini", "scene=suzanne", "+launch=slurm", f"launch.{setting}"])
-
-
-def test_scenes_of_the_user_are_choices_and_typos_are_not() -> None:
-    """Catches a retry or a job that cannot compose a scene without a file, and a scene that is no scene."""
+def test_scenes_of_the_user_are_choices() -> None:
+    """Catches a retry or a job that cannot compose a scene without a file."""
     assert compose_run(["+exp=mini", "data.scenes=[new]", "scene=new"]).config.scene.name == "new"
-    with pytest.raises(InputError, match="scene 'newer' is not known"):
-        compose_run(["+exp=mini", "data.scenes=[new]", "scene=newer"])
 
 
 def test_configs_of_the_user_are_found_in_their_folder(tmp_path: Path) -> None:
@@ -108,26 +100,25 @@ def test_configs_of_the_user_are_found_in_their_folder(tmp_path: Path) -> None:
         compose_run(words)
 
 
-def _settings(word: str) -> dict[str, Any]:
-    with hydra_with(None):
-        config = compose_run(["+exp=ablation", "scene=suzanne", word]).config
+@functools.cache
+def settings(ablation: str) -> dict[str, Any]:
+    """All keys of a run of an ablation, flat."""
+    config = compose_run(["+exp=ablation", "scene=suzanne", f"+ablation={ablation}"]).config
     return dict(flat(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_changes_what_it_names_and_nothing_else(name: str) -> None:
     """Catches an ablation that is the whole model, or one that changes a second thing."""
-    whole, changed = (_settings(f"+ablation={ablation}") for ablation in ("none", name))
-    is_other = "model.name" in ABLATIONS[name]
+    whole, changed, named = settings("none"), settings(name), ABLATIONS[name]
     differs = {key: value for key, value in changed.items() if whole.get(key) != value}
-    assert (differs | ABLATIONS[name] == differs) if is_other else (differs == ABLATIONS[name])
-    assert not is_other or changed["agr"] is True  # AGR stays, so that only the effects differ
+    assert (differs | named == differs) if "model.name" in named else (differs == named)
+    assert "model.name" not in named or changed["agr"] is True  # AGR stays, so that only the effects differ
 
 
 def test_the_ablation_sweeps_over_all_ablations_by_itself() -> None:
     """Catches an ablation that is shipped and not in the sweep, and a plan that forgets the experiment's own axes."""
-    with hydra_with(None):
-        runs, is_sweep = runs_of(parse(["+exp=ablation", "scene=suzanne"]))
+    runs, is_sweep = runs_of(parse(["+exp=ablation", "scene=suzanne"]))
     assert is_sweep
     assert sorted(run[0] for run in runs) == sorted(f"+ablation={name}" for name in ABLATIONS)
     assert {path.stem for path in (CONF / "ablation").glob("*.yaml")} == set(ABLATIONS)

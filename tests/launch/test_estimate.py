@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import crowd
 import pytest
@@ -12,40 +13,37 @@ from gsbench.launch.estimate import lines, span
 from gsbench.launch.status import RunStatus
 
 
-def words(model: str, scene: str, seed: int) -> list[str]:
-    return sorted(crowd.overrides(model, scene, seed))
-
-
-def done(folder: Path, run: tuple[str, str, int], seconds: float, machine: str = "EPYC") -> RunStatus:
-    """A finished run whose record says that it trained for so many seconds."""
-    record = crowd.record(*run)
-    record["cost"]["train_s"] = seconds
-    record["provenance"]["device"] = machine
-    path = folder / "-".join(map(str, run)) / "record.json"
-    path.parent.mkdir()
-    path.write_text(json.dumps(record, default=str))
-    return RunStatus(words(*run), "done", record=str(path))
+def run(folder: Path, model: str, scene: str, seed: int, state: str = "planned", **of: Any) -> RunStatus:
+    """A run of a sweep; a finished one has a record which says that it trained for `seconds` on a `machine`."""
+    path = folder / f"{model}-{scene}-{seed}" / "record.json"
+    if state == "done":
+        record = crowd.record(model, scene, seed)
+        record["cost"]["train_s"], record["provenance"]["device"] = of.pop("seconds"), of.pop("machine", "EPYC")
+        path.parent.mkdir()
+        path.write_text(json.dumps(record, default=str))
+        of["record"] = str(path)
+    return RunStatus(sorted(crowd.overrides(model, scene, seed)), state, **of)
 
 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[RunStatus]:
     """Two seeds and a third on another machine are done; another seed, a scene, a model and a lost run are not."""
     return [
-        done(tmp_path, ("7dgs", "lego", 0), 3600.0),
-        done(tmp_path, ("7dgs", "lego", 1), 7200.0),
-        done(tmp_path, ("7dgs", "lego", 2), 1.0, machine="another"),
-        RunStatus(words("7dgs", "lego", 3), "planned"),
-        RunStatus(words("7dgs", "trex", 0), "failed"),
-        RunStatus(words("4dgs", "lego", 0), "planned"),
-        RunStatus(words("3dgs", "lego", 0), "running", step=10, steps=20, seconds_left=1800.0),
-        RunStatus(words("7dgs", "lego", 4), "lost", step=75, steps=100),
+        run(tmp_path, "7dgs", "lego", 0, "done", seconds=3600.0),
+        run(tmp_path, "7dgs", "lego", 1, "done", seconds=7200.0),
+        run(tmp_path, "7dgs", "lego", 2, "done", seconds=1.0, machine="another"),
+        run(tmp_path, "7dgs", "lego", 3),
+        run(tmp_path, "7dgs", "trex", 0, "failed"),
+        run(tmp_path, "4dgs", "lego", 0),
+        run(tmp_path, "3dgs", "lego", 0, "running", step=10, steps=20, seconds_left=1800.0),
+        run(tmp_path, "7dgs", "lego", 4, "lost", step=75, steps=100),
     ]
 
 
 def test_a_run_takes_what_its_like_took(runs: list[RunStatus]) -> None:
     """Catches another model, machine or scene that counts where a seed does, and a resumed run that counts in full."""
     estimated = estimate.estimate(runs)
-    assert [(run.seconds, run.least, run.most, run.compared, run.differ) for run in estimated.runs] == [
+    assert [(each.seconds, each.least, each.most, each.compared, each.differ) for each in estimated.runs] == [
         (5400.0, 3600.0, 7200.0, 2, "seed"),
         (5400.0, 3600.0, 7200.0, 2, "seed and scene"),
         (None, None, None, 0, None),
@@ -83,7 +81,7 @@ def test_the_command_reads_a_sweep(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["estimate", str(experiment), "--json"]) == 0
     estimated = json.loads(capsys.readouterr().out)
     assert estimated["done"] == 49
-    assert {run["differ"] for run in estimated["runs"]} == {"seed"}
+    assert {each["differ"] for each in estimated["runs"]} == {"seed"}
     assert main(["estimate", str(experiment)]) == 0
     assert "2 of 51 runs are not done" in capsys.readouterr().out
     assert main(["estimate", str(experiment), "--at-once", "0"]) == 2

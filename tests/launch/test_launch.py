@@ -3,14 +3,13 @@
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import crowd
 import pytest
-import torch
 from forked import python_m
-from tiny_run import gsbench, main_here, overrides, write_moving_square
+from interrupted import assert_same_bits, bits
+from tiny_run import gsbench, main_here, overrides
 
 from gsbench.errors import InputError
 from gsbench.launch import plan, status
@@ -20,26 +19,25 @@ from gsbench.launch.command import RunConfig, compose_run, hydra_with
 from gsbench.launch.plan import Ended, Plan, identity
 from gsbench.launch.status import RecordStatus
 from gsbench.launch.sweep import retry
-from gsbench.train import checkpoint
 
 SCENE = ("scene=", "scene.name=")
-
-
-def sweep(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run `python -m gsbench.launch`."""
-    return python_m("gsbench.launch", *arguments)
 
 
 def states(experiment: Path) -> list[str]:
     return sorted(run.state for run in status.status(status.read(experiment)))
 
 
-def test_retry_takes_only_settings_of_the_launch(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("train.iterations=5", r"launch\.memory=16G, got 'train\.iterations=5'"),
+        ("launch.nosuch=1", r"config key 'launch\.nosuch' is not known"),
+    ],
+)
+def test_retry_takes_only_settings_of_the_launch(word: str, message: str, tmp_path: Path) -> None:
     """Catches a retry that may change what its runs are."""
-    with pytest.raises(InputError, match=r"launch\.memory=16G, got 'train\.iterations=5'"):
-        retry(status.read(tmp_path), ["train.iterations=5"])
-    with pytest.raises(InputError, match=r"config key 'launch\.nosuch' is not known"):
-        retry(status.read(tmp_path), ["launch.nosuch=1"])
+    with pytest.raises(InputError, match=message):
+        retry(status.read(tmp_path), [word])
 
 
 def test_retry_passes_over_what_cannot_be_launched(
@@ -70,8 +68,7 @@ def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a retry that says that no run failed, beside a status that lists one."""
-    run = ("7dgs", "lego", 0)
-    folder = tmp_path / "mini" / "lego" / "7dgs" / "seed0"
+    run, folder = ("7dgs", "lego", 0), tmp_path / "mini" / "seed0"
     folder.mkdir(parents=True)
     broken = crowd.record(*run) | {"status": "failed", "reason": "out of memory"}
     (folder / "record.json").write_text(json.dumps(broken, default=str))
@@ -108,41 +105,6 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert [[run.reason for run in outcome.broken] for outcome in outcomes] == [["step 0: nan"], []]
 
 
-def test_retry_does_what_is_missing_and_repeats_nothing(square: Path, tmp_path: Path) -> None:
-    """Catches a retry that loses a run's overrides, trains a finished run again, or hides that nothing is left."""
-    results = tmp_path / "results"
-    words = [word for word in overrides(square, results, "model=3dgs", "seed=0,1") if not word.startswith(SCENE)]
-    assert gsbench("-m", *words).returncode == 0  # scene=all: the scene has no file in conf/
-    experiment = results / "dnerf"
-    kept, lost = sorted(experiment.rglob("record.json"))
-    assert states(experiment) == ["done", "done"]
-    before = kept.stat().st_mtime_ns, lost.read_text()
-    shutil.rmtree(lost.parent)
-    assert states(experiment) == ["done", "failed"]
-    again = sweep("retry", str(experiment))
-    assert again.returncode == 0, again.stderr
-    assert "1 runs again" in again.stderr
-    assert states(experiment) == ["done", "done"]
-    assert kept.stat().st_mtime_ns == before[0]
-    assert json.loads(lost.read_text())["metrics"] == json.loads(before[1])["metrics"]
-    assert "no run was stopped, failed" in sweep("retry", str(experiment)).stderr
-
-
-@pytest.mark.slow
-def test_several_processes_give_the_bits_of_one(square: Path, tmp_path: Path) -> None:
-    """Catches runs that depend on the process they share, or on how many run beside them."""
-    for launch in ("local", "parallel"):
-        words = overrides(square, tmp_path / launch, f"+launch={launch}", "launch.at_once=2", "model=7dgs", "seed=0,1")
-        assert gsbench("-m", *words).returncode == 0
-        assert states(tmp_path / launch / "dnerf") == ["done"] * 2
-    for path in sorted((tmp_path / "local").rglob("checkpoint.pt")):
-        other = tmp_path / "parallel" / path.relative_to(tmp_path / "local")
-        here, beside = (checkpoint.read(file).state["model"] for file in (path, other))
-        assert all(torch.equal(here[name], beside[name]) for name in here)
-        metrics = [json.loads(file.with_name("record.json").read_text())["metrics"] for file in (path, other)]
-        assert metrics[0] == metrics[1]
-
-
 def test_without_slurm_the_error_says_where_to_go(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,19 +135,36 @@ def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -
     assert plan.time_left(tmp_path, 2) == ""
 
 
-@pytest.mark.parametrize("launch", [[], ["+launch=parallel", "launch.at_once=1"]])
-def test_a_sweep_prints_the_time_left(launch: list[str], tmp_path: Path) -> None:
-    """Catches a sweep that says nothing until its end, one that is repeated and expects its kept runs to train, and an
-    outcome that a run of a process of its own writes without its record.
+def test_a_sweep_has_the_bits_of_one_process_and_a_retry_does_what_is_missing(square: Path, tmp_path: Path) -> None:
+    """Catches runs that depend on the process they share, a sweep that says nothing until its end, one that is repeated
+    and expects its kept runs to train, an outcome that a run of a process of its own writes without its record, and a
+    retry that loses a run's overrides, trains a finished run again, or hides that nothing is left.
 
     In a process of its own: `+launch=parallel` forks, and a fork of a process with threads can wait for them forever.
     """
-    words = overrides(write_moving_square(tmp_path / "data"), tmp_path / "results", "model=3dgs", "train.iterations=2")
-    first = gsbench("-m", *words, "seed=0,1", *launch)
-    assert first.returncode == 0, first.stderr
-    assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", first.stderr)) == 1
-    (folder,) = (tmp_path / "results").glob("*/.sweep/*")
-    assert [outcome.reason for outcome in plan.read_ended(folder).values()] == [None, None]
-    again = gsbench("-m", *words, "seed=0,1", *launch)
+    for launch in ("local", "parallel"):
+        experiment = tmp_path / launch / "dnerf"
+        more = ("model=3dgs", "train.iterations=2", "seed=0,1", f"+launch={launch}", "launch.at_once=1")
+        words = [word for word in overrides(square, tmp_path / launch, *more) if not word.startswith(SCENE)]
+        first = gsbench("-m", *words)  # scene=all: the scene has no file in conf/
+        assert first.returncode == 0, first.stderr
+        assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", first.stderr)) == 1
+        (folder,) = experiment.glob(".sweep/*")
+        assert [outcome.reason for outcome in plan.read_ended(folder).values()] == [None, None]
+        assert states(experiment) == ["done", "done"]
+        again = gsbench("-m", *words)
+        assert again.returncode == 0, again.stderr
+        assert "have ended" not in again.stderr
+    kept, lost = sorted(path.parent for path in experiment.rglob("record.json"))
+    for run in (kept, lost):
+        assert_same_bits(bits(run), bits(tmp_path / "local" / run.relative_to(tmp_path / "parallel")))
+    before = kept.joinpath("record.json").stat().st_mtime_ns, bits(lost)
+    shutil.rmtree(lost)
+    assert states(experiment) == ["done", "failed"]
+    again = python_m("gsbench.launch", "retry", str(experiment))
     assert again.returncode == 0, again.stderr
-    assert "have ended" not in again.stderr
+    assert "1 runs again" in again.stderr
+    assert states(experiment) == ["done", "done"]
+    assert kept.joinpath("record.json").stat().st_mtime_ns == before[0]
+    assert_same_bits(bits(lost), before[1])
+    assert "no run was stopped, failed" in python_m("gsbench.launch", "retry", str(experiment)).stderr

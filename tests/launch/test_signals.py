@@ -16,122 +16,71 @@ from gsbench.launch import plan, status
 from gsbench.run import progress
 from gsbench.train import checkpoint
 
-RUNS = 3
-LONG, SHORT = "train.iterations=100000", "train.iterations=1500"
-ENDED = {"stopped", "not started", "done"}
+
+def words(data: Path, results: Path, iterations: int) -> list[str]:
+    """A sweep of three seeds, two at a time."""
+    return ["-m", *overrides(data, results, f"train.iterations={iterations}", "train.densify.stop=1", "model=3dgs",
+                             "seed=0,1,2"), "+launch=parallel", "launch.at_once=2"]  # fmt: skip
 
 
-def words(data: Path, results: Path, iterations: str) -> list[str]:
-    """A sweep of RUNS seeds, two at a time."""
-    return ["-m", *overrides(data, results, iterations, "train.densify.stop=1", "model=3dgs", "seed=0,1,2"),
-            "+launch=parallel", "launch.at_once=2"]  # fmt: skip
-
-
-def workers(results: Path, parent: int) -> list[int]:
+def workers(results: Path) -> list[int]:
     """The processes of the runs that train."""
-    at = [path for path in results.rglob(progress.FILE_NAME) if path.exists()]
-    pids = [progress.read(path).pid for path in at if progress.read(path).steps]
-    assert parent not in pids
-    return pids
-
-
-def wait_for(count: int, results: Path, sweep: Forked) -> list[int]:
-    """Wait until so many runs of a sweep train, and return their processes."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        assert sweep.poll() is None, sweep.err
-        try:
-            if len(pids := workers(results, sweep.pid)) == count:
-                return pids
-        except ValueError:  # a file was replaced or removed just now
-            pass
-        time.sleep(0.02)
-    raise AssertionError(f"{count} runs do not train: {sweep.err}")
+    try:
+        claims = [progress.read(path) for path in results.rglob(progress.FILE_NAME)]
+    except ValueError:  # a file was replaced or removed just now
+        return []
+    return [claim.pid for claim in claims if claim.steps]
 
 
 def states(results: Path) -> list[status.RunStatus]:
     return status.status(status.read(results / "dnerf"))
 
 
+SAVED = ["not started", "stopped", "stopped"]
+
+
 @pytest.mark.parametrize(
-    ("at", "number"), [("parent", signal.SIGTERM), ("worker", signal.SIGHUP), ("all", signal.SIGINT)]
+    ("at", "number", "code", "iterations", "ended"),
+    [
+        ("parent", signal.SIGTERM, 143, 100_000, SAVED),
+        ("worker", signal.SIGHUP, 129, 100_000, SAVED),
+        ("all", signal.SIGINT, 130, 100_000, SAVED),
+        ("parent", signal.SIGKILL, -9, 100_000, SAVED),
+        ("worker", signal.SIGKILL, 1, 3_000, ["done", "done", "lost"]),
+    ],
 )
 def test_a_signal_lets_each_run_save_and_no_other_begins(
-    at: str, number: signal.Signals, square: Path, tmp_path: Path
+    at: str, number: signal.Signals, code: int, iterations: int, ended: list[str], square: Path, tmp_path: Path
 ) -> None:
-    """Catches runs that are killed with their checkpoints, siblings that are lost, and processes left behind."""
-    sweep = Forked(tmp_path, "gsbench", *words(square, tmp_path, LONG))
-    running = wait_for(2, tmp_path, sweep)
+    """Catches runs that are killed with their checkpoints, siblings that are lost, orphans that train for days after
+    their sweep was killed, and a sweep that ends as the kernel kills one of its runs for memory."""
+    sweep, deadline = Forked(tmp_path, "gsbench", *words(square, tmp_path, iterations)), time.monotonic() + 120
+    while len(running := workers(tmp_path)) != 2:
+        assert sweep.poll() is None, sweep.err
+        assert time.monotonic() < deadline, sweep.err
+        time.sleep(0.02)
+    assert sweep.pid not in running
+    assert Path(f"/proc/{running[0]}/oom_score_adj").read_text() == "500\n"
     for pid in {"parent": [sweep.pid], "worker": running[:1], "all": [sweep.pid, *running]}[at]:
         os.kill(pid, number)
-    assert sweep.wait() == 128 + number, sweep.err
-    assert not any(Path(f"/proc/{pid}").exists() for pid in running)
-    assert "Traceback" not in sweep.err
-    assert f"gsbench: stopped by {number.name}" in sweep.err.splitlines()
+    assert sweep.wait() == code, sweep.err
+    while any(progress.born(pid) for pid in running) and number == signal.SIGKILL and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(progress.born(pid) for pid in running)
     runs = states(tmp_path)
-    assert sorted(run.state for run in runs) == ["not started", "stopped", "stopped"]
+    assert sorted(run.state for run in runs) == ended
+    assert "Traceback" not in sweep.err
+    if code > 128:
+        assert f"gsbench: stopped by {number.name}" in sweep.err.splitlines()
+    if code == 1:
+        assert "its process was ended by SIGKILL (memory may have run out): the same command continues" in sweep.err
+        return
     saved = {checkpoint.read(path).state["step"] for path in tmp_path.rglob("checkpoint.pt")}
     assert saved == {run.step for run in runs if run.state == "stopped"}
     assert {int(step) for step in re.findall(r"stopped at step (\d+), saved in", sweep.err)} == saved
     assert {run.reason for run in runs} == {
         None, *(f"stopped at step {step} of 100000: the same command continues" for step in saved)
     }  # fmt: skip
-
-
-def test_a_run_that_is_killed_leaves_the_others_alone(square: Path, tmp_path: Path) -> None:
-    """Catches a sweep that ends as the kernel kills one of its runs for memory, and a run that is lost unsaid."""
-    sweep = Forked(tmp_path, "gsbench", *words(square, tmp_path, "train.iterations=3000"))
-    killed = wait_for(2, tmp_path, sweep)[0]
-    assert Path(f"/proc/{killed}/oom_score_adj").read_text() == "500\n"
-    os.kill(killed, signal.SIGKILL)
-    assert sweep.wait() == 1
-    assert "its process was ended by SIGKILL (memory may have run out): the same command continues" in sweep.err
-    assert sorted(run.state for run in states(tmp_path)) == ["done", "done", "lost"]
-
-
-def test_runs_end_with_their_parent(square: Path, tmp_path: Path) -> None:
-    """Catches orphans that train for days after their sweep was killed, and work that is lost with it."""
-    sweep = Forked(tmp_path, "gsbench", *words(square, tmp_path, LONG))
-    running = wait_for(2, tmp_path, sweep)
-    sweep.send_signal(signal.SIGKILL)
-    sweep.wait()
-    deadline = time.monotonic() + 60
-    while any(progress.born(pid) for pid in running):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    assert sorted(run.state for run in states(tmp_path)) == ["not started", "stopped", "stopped"]
-
-
-def test_a_stopped_run_is_listed_until_it_goes_on(square: Path, tmp_path: Path) -> None:
-    """Catches a single run that is unknown once a signal stopped it, and one that is stopped for ever."""
-    run = overrides(square, tmp_path, "model=3dgs", "train.iterations=40000", "train.densify.stop=1")
-    process = Forked(tmp_path, "gsbench", *run)
-    wait_for_training(tmp_path)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait() == 143, process.err
-    assert [run.state for run in states(tmp_path)] == ["stopped"]
-    process = Forked(tmp_path, "gsbench", *run)
-    wait_for_training(tmp_path)
-    assert [run.state for run in states(tmp_path)] == ["running"]
-    assert not list(tmp_path.rglob(progress.STOPPED))
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    (lost,) = states(tmp_path)
-    assert (lost.state, str(lost.reason).endswith(": the same command continues from its last checkpoint")) == (
-        "lost",
-        True,
-    )
-
-
-def wait_for_training(results: Path) -> None:
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        try:
-            if any(progress.read(path).steps for path in results.rglob(progress.FILE_NAME)):
-                return
-        except ValueError:
-            pass
-        time.sleep(0.02)
 
 
 @pytest.mark.parametrize("launch", ["local", "parallel"])
@@ -148,27 +97,20 @@ def test_a_signal_at_any_time_loses_nothing(seed: int, square: Path, tmp_path: P
     """Catches a moment in which a signal loses a run, a record or a bit: imports, loading, training and measuring."""
     draw = random.Random(seed)
     whole, results = tmp_path / "whole", tmp_path / "results"
-    assert gsbench(*words(square, whole, SHORT)).returncode == 0
-    sweep = Forked(tmp_path, "gsbench", *words(square, results, SHORT))
+    assert gsbench(*words(square, whole, 1500)).returncode == 0
+    sweep = Forked(tmp_path, "gsbench", *words(square, results, 1500))
     time.sleep(draw.uniform(0.1, 4))
-    running = [pid for pid in workers_now(results) if progress.born(pid)]
+    running = [pid for pid in workers(results) if progress.born(pid)]
     target = draw.choice([[sweep.pid], running[:1] or [sweep.pid], [sweep.pid, *running]])
     number = draw.choice([signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
     for pid in target:
         if progress.born(pid):
             os.kill(pid, number)
     sweep.wait()
-    assert {run.state for run in states(results)} <= ENDED, sweep.err
+    assert {run.state for run in states(results)} <= {"stopped", "not started", "done"}, sweep.err
     assert not any(progress.born(pid) for pid in running)
-    again = gsbench(*words(square, results, SHORT))
+    again = gsbench(*words(square, results, 1500))
     assert again.returncode == 0, again.stderr
-    assert [run.state for run in states(results)] == ["done"] * RUNS
+    assert [run.state for run in states(results)] == ["done"] * 3
     for path in whole.rglob("checkpoint.pt"):
         assert_same_bits(bits(path.parent), bits(results / path.parent.relative_to(whole)))
-
-
-def workers_now(results: Path) -> list[int]:
-    try:
-        return workers(results, 0)
-    except (ValueError, FileNotFoundError):
-        return []

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from tiny_run import ROOT, gsbench, overrides, write_moving_square
+from tiny_run import ROOT, gsbench, overrides
 
 from gsbench.errors import InputError
 from gsbench.launch import plan, status
@@ -62,13 +62,12 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_each_run_is_a_job_in_the_image(log: Path, tmp_path: Path) -> None:
+def test_each_run_is_a_job_in_the_image(log: Path, square: Path, tmp_path: Path) -> None:
     """Catches an array whose jobs run outside of the image, results or data that the image does not see, and settings
     that Slurm does not get."""
     image, results = tmp_path / "gsbench.sif", tmp_path / "results"
     image.touch()
-    data = write_moving_square(tmp_path / "data")
-    words = overrides(data, results, "+launch=slurm", f"launch.container={image}", "launch.gpus=1", "seed=0,1",
+    words = overrides(square, results, "+launch=slurm", f"launch.container={image}", "launch.gpus=1", "seed=0,1",
                       "launch.at_once=3", "launch.minutes=7", "+launch.sbatch.account=vision", "launch.memory=1G",
                       "+launch.sbatch.requeue=false", "model=3dgs", "train.iterations=2")  # fmt: skip
     ended = gsbench("-m", *words)
@@ -82,7 +81,7 @@ def test_each_run_is_a_job_in_the_image(log: Path, tmp_path: Path) -> None:
     in_image, other = [path.read_text().splitlines() for path in sorted(log.glob("apptainer.*"))]
     assert in_image[:-1] == other[:-1]
     assert {in_image[-1], other[-1]} == {"0", "1"}
-    assert {str(results), str(data), str(ROOT)} <= set(in_image[in_image.index("--bind") + 1].split(","))
+    assert {str(results), str(square), str(ROOT)} <= set(in_image[in_image.index("--bind") + 1].split(","))
     (folder,) = results.glob("dnerf/.sweep/*")
     assert [*in_image[:3], *in_image[4:-1]] == [
         "exec", "--nv", "--bind", "--pwd", str(ROOT), str(image), "python3", "-P", "-u", "-m", "gsbench.launch", "job",
@@ -90,32 +89,30 @@ def test_each_run_is_a_job_in_the_image(log: Path, tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("requeues", [1, 3])
-def test_a_stopped_run_is_requeued_as_often_as_it_may(requeues: int, log: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_is_requeued_as_often_as_it_may(log: Path, tmp_path: Path) -> None:
     """Catches a run that ends with its first job, as Slurm's signal ends the script, and one that never ends."""
     ready, script = tmp_path / "ready", tmp_path / "job.sh"
     run = f"bash -c 'trap \"exit {STOPPED}\" USR2; touch {ready}; while :; do sleep 0.05; done' --"
-    script.write_text(SCRIPT.format(setup=":", command=run, folder=tmp_path, stopped=STOPPED, requeues=requeues))
-    for number in range(requeues + 1):
+    script.write_text(SCRIPT.format(setup=":", command=run, folder=tmp_path, stopped=STOPPED, requeues=2))
+    for status_of_job in (0, 0, STOPPED):
         ready.unlink(missing_ok=True)
         environment = os.environ | {"SLURM_JOB_ID": "70", "SLURM_ARRAY_TASK_ID": "0"}
         job = subprocess.Popen(["bash", script], env=environment, start_new_session=True)
         while not ready.exists():
             time.sleep(0.01)
         os.killpg(job.pid, signal.SIGUSR2)
-        assert job.wait(30) == (0 if number < requeues else STOPPED)
-    assert (log / "scontrol").read_text() == "requeue 70\n" * requeues
+        assert job.wait(30) == status_of_job
+    assert (log / "scontrol").read_text() == "requeue 70\n" * 2
 
 
-def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, tmp_path: Path) -> None:
+def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path, tmp_path: Path) -> None:
     """Catches USR2 that kills a run with its last minutes, and a job that begins from the first step again."""
     (tmp_path / "fakes" / "srun").write_text(
         "#!/bin/bash\nshift\n"
         f'"$@" & until grep -q \'"step": [1-9]\' {tmp_path}/results/dnerf/*/*/*/progress.json; do sleep 0.02; done\n'
         f"[ -e {log}/scontrol ] || kill -USR2 $!\nwait $!\n"
     )
-    data = write_moving_square(tmp_path / "data")
-    words = overrides(data, tmp_path / "results", "+launch=slurm", "model=3dgs", "train.iterations=30000",
+    words = overrides(square, tmp_path / "results", "+launch=slurm", "model=3dgs", "train.iterations=10000",
                       "train.densify.stop=1")  # fmt: skip
     sweep = gsbench("-m", *words, "train.checkpoint_minutes=60", "train.curve_points=3")
     (path,) = (tmp_path / "results").rglob("0.log")

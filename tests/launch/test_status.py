@@ -1,13 +1,14 @@
 """What became of each run of a sweep: by its plan, the record or progress it left, its process, and Slurm's queue."""
 
-import dataclasses
 import json
 import os
 import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import crowd
 import pytest
@@ -25,32 +26,43 @@ RUN = ("7dgs", "lego", 0)
 WORDS = crowd.overrides(*RUN)
 HERE = {"host": socket.gethostname(), "pid": os.getpid(), "born": born(os.getpid())}
 GONE = {**HERE, "born": 1}  # a later process that was given the number of one that is gone
-FIRST, SECOND = "2026-11-22_00-00-00.000000", "2026-11-22_00-00-01.000000"
+OTHER = {"host": "elsewhere"}
+JOB, IN_JOB = {"job": "7"}, {"job": "7_0", **GONE}
+DIVERGED = {"status": "diverged", "reason": "step 7: loss is nan", "metrics": None, "cost": None}
+SILENT = Queue({}, "squeue is not on this machine")
 
 
-def planned(experiment: Path, name: str = FIRST, **of: object) -> Path:
+def planned(experiment: Path, name: str = "2026-11-22_00-00-00.000000", **of: Any) -> Path:
     """Write the plan of one run, launched by this process unless told otherwise, and return its folder."""
-    one_run = Plan("local", [[*WORDS, "results=somewhere"]])
     folder = experiment / plan.FOLDER / name
-    plan.write(dataclasses.replace(one_run, **of), folder)  # type: ignore[arg-type]
+    plan.write(replace(Plan("local", [[*WORDS, "results=somewhere"]]), **of), folder)
     return folder
 
 
-def run_folder(experiment: Path) -> Path:
+def traced(
+    experiment: Path, plan_of: dict[str, Any] | None = None, progress_of: dict[str, Any] | None = None,
+    record_of: dict[str, Any] | str | None = None, ended: Ended | None = None, log: str = "", stops: bool = False,
+) -> Path:  # fmt: skip
+    """Write what a run leaves, and return its folder: its plan, progress, record, the note of its end, and its log."""
     folder = experiment / "lego" / "7dgs" / "seed0"
     folder.mkdir(parents=True, exist_ok=True)
+    if plan_of is not None:
+        at_plan = planned(experiment, **plan_of)
+        plan.log_of(at_plan, 0).write_text(log)
+        if ended:
+            plan.write_ended(at_plan, 0, ended)
+    if progress_of is not None:
+        at = Progress(WORDS, **HERE, job=None, step=100, steps=400, seconds=50.0, psnr_val=21.5)  # type: ignore[arg-type]
+        at = replace(at, **progress_of)
+        progress.write(folder, at)
+        if stops:
+            progress.release_claim(folder, at, is_stopped=True)
+    if record_of is not None:
+        record = json.dumps(crowd.record(*RUN) | record_of, default=str) if isinstance(record_of, dict) else record_of
+        (folder / "record.json").write_text(record)
+        newer = time.time() + 1  # than a progress that was left over
+        os.utime(folder / "record.json", (newer, newer))
     return folder
-
-
-def recorded(experiment: Path, **changed: object) -> Path:
-    path = run_folder(experiment) / "record.json"
-    path.write_text(json.dumps(crowd.record(*RUN) | changed, default=str))
-    return path
-
-
-def trains(experiment: Path, **of: object) -> None:
-    at = Progress(WORDS, **HERE, job=None, step=100, steps=400, seconds=50.0, psnr_val=21.5)  # type: ignore[arg-type]
-    progress.write(run_folder(experiment), dataclasses.replace(at, **of))  # type: ignore[arg-type]
 
 
 def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
@@ -62,38 +74,67 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
     return run
 
 
-def test_a_run_is_planned_then_running_then_done(tmp_path: Path) -> None:
-    """Catches a plan, a progress or a record that is not matched to its run, and an ETA of nonsense."""
-    planned(tmp_path)
-    assert only(tmp_path).state == "planned"
-    trains(tmp_path)
-    run = only(tmp_path)
-    assert (run.state, run.step, run.steps, run.psnr, run.seconds_left) == ("running", 100, 400, 21.5, 150.0)
-    recorded(tmp_path)
-    os.utime(run_folder(tmp_path) / "record.json", (time.time() + 1, time.time() + 1))  # a left-over progress is older
-    run = only(tmp_path)
-    assert (run.state, run.psnr) == ("done", crowd.record(*RUN)["metrics"]["psnr"])
-
-
 @pytest.mark.parametrize(
-    ("of", "state"),
+    ("queue", "traces", "state", "reason"),
     [
-        (HERE, "running"),
-        (GONE, "lost"),
-        ({"host": "elsewhere"}, "running"),
-        ({"host": "elsewhere", "updated": time.time() - 660}, "lost"),
+        # no trace but the plan
+        (None, {"plan_of": {}}, "planned", None),
+        (None, {"plan_of": GONE}, "not started", None),
+        (Queue({"7_0": "PENDING Priority"}), {"plan_of": JOB}, "queued", "Priority"),
+        (Queue({}), {"plan_of": JOB}, "lost", "never started"),
+        (SILENT, {"plan_of": JOB}, "planned", None),
+        # a progress
+        (None, {"progress_of": HERE}, "running", None),
+        (None, {"progress_of": GONE}, "lost", "step 100 of 400"),
+        (None, {"progress_of": OTHER}, "running", None),
+        (None, {"progress_of": OTHER | {"updated": time.time() - 660}}, "lost", "step 100 of 400"),
+        (Queue({"7_0": "PENDING Resources"}), {"plan_of": JOB, "progress_of": IN_JOB}, "queued", "Resources"),
+        (Queue({"7_0": "RUNNING"}), {"plan_of": JOB, "progress_of": IN_JOB}, "running", None),
+        (Queue({"7_1": "RUNNING"}), {"plan_of": JOB, "progress_of": IN_JOB}, "lost", "at step 100 of 400"),
+        (SILENT, {"plan_of": JOB, "progress_of": {"job": "7_0"}}, "running", None),
+        # .. that a signal has stopped
+        (None, {"progress_of": {}, "stops": True}, "stopped", "stopped at step 100 of 400: the same command continues"),
+        # a record
+        (None, {"plan_of": {}, "progress_of": {}, "record_of": {}}, "done", None),
+        (None, {"plan_of": {"started": time.time() - 100}, "record_of": DIVERGED}, "failed", "diverged: step 7: loss"),
+        # .. of the command that made it, which did not name the seed
+        (None, {"plan_of": GONE, "record_of": {"overrides": ["+exp=crowd", "model=7dgs", "scene=lego"]},
+                "ended": Ended("crowd/lego/7dgs/seed0/record.json", None)}, "done", None),
+        *((None, {"record_of": text}, "failed", "seed0/record.json") for text in (
+            "", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0")),
+        # the note of its end alone
+        (None, {"plan_of": {}, "ended": Ended(None, "seed: expected >= 0, got -1")}, "failed", "seed: expected >= 0"),
+        (Queue({}), {"plan_of": JOB, "ended": Ended(None, "it ended without a record"),
+                     "log": "step 5\ngsbench: error: its record cannot be written: No space left on device\n"},
+         "failed", "it ended without a record; its log ends: gsbench: error: its record cannot be written: No space"),
     ],
-)
-def test_a_run_is_lost_when_its_process_is_gone(tmp_path: Path, of: dict[str, object], state: str) -> None:
-    """Catches a hard death that is taken for running for ever, and a living run that is taken for lost."""
-    trains(tmp_path, **of)
-    assert only(tmp_path).state == state
+)  # fmt: skip
+def test_the_state_of_a_run_follows_from_its_traces(
+    queue: Queue | None, traces: dict[str, Any], state: str, reason: str | None, tmp_path: Path
+) -> None:
+    """Catches a trace that is not matched to its run, a hard death that is taken for running for ever, a living,
+    requeued or refused run that is taken for lost, a damaged record that stops the status of all others, and a reason
+    that is named nowhere."""
+    traced(tmp_path / "crowd", **traces)
+    run = only(tmp_path / "crowd", queue)
+    assert run.state == state
+    assert (reason or "") in (run.reason or "")
+    assert (run.reason is None) == (reason is None)
+    if state == "running":
+        assert (run.step, run.steps, run.psnr, run.seconds_left) == (100, 400, 21.5, 150.0)
+    if state == "done":
+        assert run.psnr == crowd.record(*RUN)["metrics"]["psnr"]
+    if traces.get("progress_of") == IN_JOB:
+        assert run.job == "7_0"
+    if queue is SILENT:
+        text = "\n".join(lines(status.Experiment(tmp_path / "crowd", queue=queue), [run]))
+        assert "squeue is not on this machine" in text
 
 
 def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
     """Catches a check that asks only whether the process number is in use, zombies included."""
     sleeper = subprocess.Popen(["sleep", "60"])
-    trains(tmp_path, pid=sleeper.pid, born=born(sleeper.pid))
+    folder = traced(tmp_path, progress_of={"pid": sleeper.pid, "born": born(sleeper.pid)})
     assert only(tmp_path).state == "running"
     sleeper.kill()
     time.sleep(0.2)
@@ -101,56 +142,11 @@ def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
     sleeper.wait()
     assert run.state == "lost"
     assert f"process {sleeper.pid}" in str(run.reason)
-    assert "step 100 of 400" in str(run.reason)
-
-
-@pytest.mark.parametrize(
-    ("states", "state", "reason"),
-    [
-        ({"7_0": "PENDING Resources"}, "queued", "Resources"),
-        ({"7_0": "RUNNING"}, "running", None),
-        ({"7_1": "RUNNING"}, "lost", "at step 100 of 400"),
-    ],
-)
-def test_slurm_decides_about_its_jobs(tmp_path: Path, states: dict[str, str], state: str, reason: str | None) -> None:
-    """Catches a requeued job that is taken for running, and a job that Slurm forgot for anything but lost."""
-    planned(tmp_path, job="7")
-    trains(tmp_path, job="7_0", **GONE)
-    run = only(tmp_path, Queue(states))
-    assert run.state == state
-    assert run.job == "7_0"
-    assert reason is None or reason in str(run.reason)
-
-
-def test_a_job_without_a_trace_is_queued_or_lost(tmp_path: Path) -> None:
-    """Catches a submitted run that is planned for ever after its job was cancelled."""
-    planned(tmp_path, job="7")
-    assert only(tmp_path, Queue({"7_0": "PENDING Priority"})).state == "queued"
-    run = only(tmp_path, Queue({}))
-    assert (run.state, run.job) == ("lost", "7_0")
-    assert "never started" in str(run.reason)
-
-
-def test_a_slurm_that_is_silent_is_said(tmp_path: Path) -> None:
-    """Catches runs that are lost because squeue did not answer."""
-    planned(tmp_path, job="7")
-    down = Queue({}, "squeue is not on this machine")
-    assert only(tmp_path, down).state == "planned"
-    trains(tmp_path, job="7_0")
-    run = only(tmp_path, down)
-    assert run.state == "running"
-    assert "squeue is not on this machine" in "\n".join(lines(status.Experiment(tmp_path, queue=down), [run]))
-
-
-def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> None:
-    """Catches a full disk that is named nowhere: the note of the run's end still fitted, its record did not."""
-    folder = planned(tmp_path, job="7")
-    plan.log_of(folder, 0).write_text("step 5\ngsbench: error: its record cannot be written: No space left on device\n")
-    plan.write_ended(folder, 0, Ended(None, "it ended without a record"))
-    run = only(tmp_path, Queue({}))
-    assert run.state == "failed"
-    assert "it ended without a record; its log ends: gsbench: error: its record" in str(run.reason)
-    assert "No space left on device" in str(run.reason)
+    assert "continues" not in str(run.reason)
+    (folder / "checkpoint.pt").touch()
+    assert str(only(tmp_path).reason).endswith(
+        "at step 100 of 400: the same command continues from its last checkpoint"
+    )
 
 
 @pytest.mark.parametrize(
@@ -158,98 +154,27 @@ def test_a_job_that_ended_without_a_record_quotes_its_log(tmp_path: Path) -> Non
     [
         (
             "FAILED|9:0", "OUT_OF_MEMORY|0:125",
-            ["step 5", "slurmstepd: error: Detected 1 oom_kill event", "srun: error: n1: task 0: Killed"],
+            "step 5\nslurmstepd: error: Detected 1 oom_kill event\nsrun: error: n1: task 0: Killed",
             "job 7_0 ended: OUT_OF_MEMORY; its log ends: slurmstepd: error: Detected 1 oom_kill event",
         ),
-        ("FAILED|1:0", "COMPLETED|0:0", ["bar 50 %| gsbench: error: no such file", "bye"],
+        ("FAILED|1:0", "COMPLETED|0:0", "bar 50 %| gsbench: error: no such file\nbye",
          "job 7_0 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file"),
-        ("TIMEOUT|0:0", "CANCELLED|0:15", ["step 5", "step 6"], "job 7_0 ended: TIMEOUT; its log ends: step 6"),
+        ("TIMEOUT|0:0", "CANCELLED|0:15", "step 5\nstep 6", "job 7_0 ended: TIMEOUT; its log ends: step 6"),
     ],
     ids=["memory", "error", "time"],
 )  # fmt: skip
 def test_a_lost_job_says_how_it_ended(
-    job: str, step: str, log: list[str], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    job: str, step: str, log: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches memory that ran out told as a kill, as only the step of a job knows of it, and a log's last line."""
-    bin_of_slurm = tmp_path / "bin"
-    bin_of_slurm.mkdir()
-    sacct = bin_of_slurm / "sacct"
+    sacct = tmp_path / "sacct"
     sacct.write_text(f"#!/bin/sh\nprintf '7_0|{job}\\n7_0.batch|{step}\\n7_1|COMPLETED|0:0\\n'\n")
     sacct.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{bin_of_slurm}:{os.environ['PATH']}")
-    plan.log_of(planned(tmp_path / "crowd", job="7"), 0).write_text("\n".join(log))
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    traced(tmp_path / "crowd", plan_of=JOB, log=log)
     run = only(tmp_path / "crowd", Queue({}))
     assert run.state == "lost"
     assert reason in str(run.reason)
-
-
-def test_a_run_that_never_started_is_lost_with_its_sweep(tmp_path: Path) -> None:
-    """Catches runs of a killed sweep that are planned for ever."""
-    planned(tmp_path, **GONE)
-    assert (only(tmp_path).state, only(tmp_path).reason) == ("not started", None)
-
-
-def test_failures_keep_their_reason_until_they_are_tried_again(tmp_path: Path) -> None:
-    """Catches a reason that is not shown, and a retried run that still looks failed."""
-    planned(tmp_path, started=time.time() - 100)
-    recorded(tmp_path, status="diverged", reason="step 7: loss is nan", metrics=None, cost=None)
-    run = only(tmp_path)
-    assert (run.state, run.reason) == ("failed", "diverged: step 7: loss is nan")
-    time.sleep(0.05)
-    planned(tmp_path, SECOND)
-    assert only(tmp_path).state == "planned"
-
-
-def test_one_run_in_other_words_is_one_run(tmp_path: Path) -> None:
-    """Catches a kept run that looks lost because the record names the overrides of the command that made it."""
-    recorded(tmp_path, overrides=["+exp=crowd", "model=7dgs", "scene=lego"])  # seed 0 is the default
-    folder = planned(tmp_path, **GONE)
-    plan.write_ended(folder, 0, Ended(f"{tmp_path.name}/lego/7dgs/seed0/record.json", None))
-    assert only(tmp_path).state == "done"
-
-
-@pytest.mark.parametrize("newer", ["a", "b"])
-def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> None:
-    """Catches the first one found, or the older one: folders of a run done again under another name remain."""
-    now = time.time()
-    for folder in ("a", "b"):
-        path = tmp_path / folder / "record.json"
-        path.parent.mkdir()
-        path.write_text(json.dumps(crowd.record(*RUN) | {"metrics": {"psnr": 20.0 + (folder == newer)}}, default=str))
-        os.utime(path, (now, now - 60 * (folder != newer)))
-    assert only(tmp_path).psnr == 21.0
-    for folder in ("a", "b"):
-        (tmp_path / folder / "record.json").unlink()
-        age = 0 if folder == newer else 60
-        at = Progress(WORDS, **HERE, job=None, step=100 - age, steps=400, seconds=5.0, updated=now - age)  # type: ignore[arg-type]
-        progress.write(tmp_path / folder, at)
-    assert only(tmp_path).step == 100
-
-
-@pytest.mark.parametrize(("of", "state"), [(HERE, "running"), (GONE, "lost")])
-def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
-    tmp_path: Path, of: dict[str, object], state: str
-) -> None:
-    """Catches a live training that no status shows, and a killed one that is not lost: they were taken for the planned
-    one, which has no record either."""
-    planned(tmp_path)
-    other = tmp_path / "lego" / "7dgs" / "seed1"
-    other.mkdir(parents=True)
-    progress.write(other, Progress(crowd.overrides("7dgs", "lego", 1), **of, steps=400))  # type: ignore[arg-type]
-    states = {run.overrides[-1]: run.state for run in status.status(status.read(tmp_path))}
-    assert states == {"seed=0": "planned", "seed=1": state}
-
-
-def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches escapes of a progress.json or a record that clear the screen, or write a line that gsbench did not."""
-    escape = "\x1b[2J\x07\x9b\r\nall is well"
-    trains(tmp_path, overrides=[*WORDS, f"x={escape}"], host=f"a{escape}", updated=0.0)
-    recorded(tmp_path, overrides=[f"y={escape}"], status="failed", reason=escape, metrics=None, cost=None)
-    assert main(["status", str(tmp_path)]) == 1
-    shown = capsys.readouterr().out
-    assert len(shown.splitlines()) == 3
-    assert all(line.isprintable() for line in shown.splitlines())
-    assert r"x=\x1b[2J" in shown
 
 
 @pytest.mark.parametrize(
@@ -273,27 +198,66 @@ def test_a_log_is_quoted_where_it_names_the_cause(log: str, cause: str, tmp_path
     assert status.cause_in(path) == "(no log)"
 
 
-def test_a_run_that_ended_without_a_record_is_failed(tmp_path: Path) -> None:
-    """Catches a refused run that is lost: nothing broke down, it was refused."""
-    plan.write_ended(planned(tmp_path), 0, Ended(None, "seed: expected >= 0, got -1"))
-    run = only(tmp_path)
-    assert (run.state, run.reason) == ("failed", "seed: expected >= 0, got -1")
+def test_a_failure_is_planned_once_it_is_tried_again(tmp_path: Path) -> None:
+    """Catches a retried run that still looks failed."""
+    folder = traced(tmp_path, plan_of={"started": time.time() - 100}, record_of=DIVERGED)
+    os.utime(folder / "record.json", (time.time() - 1, time.time() - 1))
+    assert only(tmp_path).state == "failed"
+    planned(tmp_path, "2026-11-22_00-00-01.000000")
+    assert only(tmp_path).state == "planned"
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0"])
-def test_a_damaged_record_is_named(tmp_path: Path, text: str) -> None:
-    """Catches a record that stops the status of all others."""
-    path = recorded(tmp_path)
-    path.write_text(text)
-    run = only(tmp_path)
-    assert run.state == "failed"
-    assert str(path) in str(run.reason)
+@pytest.mark.parametrize("newer", ["a", "b"])
+def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> None:
+    """Catches the first one found, or the older one: folders of a run done again under another name remain."""
+    now = time.time()
+    for name in ("a", "b"):
+        path = tmp_path / name / "record.json"
+        path.parent.mkdir()
+        path.write_text(json.dumps(crowd.record(*RUN) | {"metrics": {"psnr": 20.0 + (name == newer)}}, default=str))
+        os.utime(path, (now, now - 60 * (name != newer)))
+    assert only(tmp_path).psnr == 21.0
+    for name in ("a", "b"):
+        (tmp_path / name / "record.json").unlink()
+        age = 0 if name == newer else 60
+        progress.write(tmp_path / name, Progress(WORDS, step=100 - age, steps=400, seconds=5.0, updated=now - age))
+    assert only(tmp_path).step == 100
+
+
+@pytest.mark.parametrize(("of", "state"), [(HERE, "running"), (GONE, "lost")])
+def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
+    tmp_path: Path, of: dict[str, Any], state: str
+) -> None:
+    """Catches a live training that no status shows, and a killed one that is not lost: they were taken for the planned
+    one, which has no record either."""
+    planned(tmp_path)
+    other = tmp_path / "lego" / "7dgs" / "seed1"
+    other.mkdir(parents=True)
+    progress.write(other, Progress(crowd.overrides("7dgs", "lego", 1), **of, steps=400))
+    states = {run.overrides[-1]: run.state for run in status.status(status.read(tmp_path))}
+    assert states == {"seed=0": "planned", "seed=1": state}
+
+
+def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches escapes of a progress.json or a record that clear the screen, or write a line that gsbench did not."""
+    escape = "\x1b[2J\x07\x9b\r\nall is well"
+    traced(
+        tmp_path,
+        progress_of={"overrides": [*WORDS, f"x={escape}"], "host": f"a{escape}", "updated": 0.0},
+        record_of=DIVERGED | {"overrides": [f"y={escape}"], "reason": escape},
+    )
+    assert main(["status", str(tmp_path)]) == 1
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) == 3
+    assert all(line.isprintable() for line in shown.splitlines())
+    assert r"x=\x1b[2J" in shown
 
 
 def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
     """Catches a plan of another version that stops the status of all runs, or that is left out in silence."""
-    (planned(tmp_path) / plan.FILE_NAME).write_text('{"launcher": "basic"}')
-    recorded(tmp_path)
+    traced(tmp_path, plan_of={}, record_of={})
+    (path,) = tmp_path.rglob(plan.FILE_NAME)
+    path.write_text('{"launcher": "basic"}')
     experiment = status.read(tmp_path)
     (run,) = status.status(experiment)
     assert run.state == "done"

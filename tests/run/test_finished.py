@@ -149,7 +149,7 @@ def test_weights_that_come_and_go_cost_no_training(
     assert refused.status == "failed"
     assert "kept in record.stale.json" in str(files.read(run.folder / files.FILE_NAME).reason)
     run.lose_checkpoint()
-    assert run.again() == measured
+    assert run.again() == files.read(run.folder / files.FILE_NAME) == measured
 
     run.change()  # without LPIPS again, and without a checkpoint to measure it
     weights.add("vgg")
