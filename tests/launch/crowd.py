@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from report.make_golden import make
+from report.records import make
 
 from gsbench.config import Config
 from gsbench.launch import plan
