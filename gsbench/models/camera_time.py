@@ -59,7 +59,7 @@ class CameraTime(NamedTuple):
                                  f"{time.device}")  # fmt: skip
         elif time is not None:
             check_number(time, "query: time")
-            time = center.new_full((), time)
+            time = center.new_full((), float(time))  # an int beyond 64 bits is a number too
         return cls(center, time)
 
 

@@ -14,6 +14,22 @@ TEXTS = ("", " ", "\0", "a\nb", "../..", "/etc/passwd", "\ud800", "\u202e", "ü"
 OTHERS = (None, True, False, [], {}, [[]], {"": None}, [1, [2, [3, [4]]]], [0] * 5000)
 
 
+def damage_file(r: random.Random, path: Path) -> str:
+    """Damage a file, a JSON in its values and keys too, or put something else in its place; return what was done."""
+    kind = r.choice(("values", "a key twice", "bytes", "file") if path.suffix == ".json" else ("bytes", "file"))
+    if kind == "file":
+        return replace_file(r, path)
+    data = path.read_bytes()
+    if kind == "values":
+        content = json.loads(data)
+        what = damage_json(r, content)
+        data = json.dumps(content).encode()
+    else:
+        data, what = damage_bytes(r, data) if kind == "bytes" else double_a_key(r, data)
+    path.write_bytes(data)
+    return f"{path.name}: {what}"
+
+
 def hostile_value(r: random.Random) -> Any:
     """Choose a JSON value that is none of those expected, or hardly."""
     return copy.deepcopy(r.choice(r.choice((NUMBERS, TEXTS, OTHERS))))

@@ -22,11 +22,20 @@ from gsbench.kernels.slices import (
     slice_universal,
 )
 from gsbench.measure.quality import evaluate, psnr, psnr_channel_mean, quantise, ssim
+from gsbench.models import CameraTime, build
+from gsbench.models.render import render
 from gsbench.models.slicing import slice_gaussians
 from gsbench.raster import rasterize
+from gsbench.scenes import Camera
 from gsbench.scenes.points import nearest_distances, random_points
 
 N = 6
+MODELS: dict[str, dict[str, Any]] = {
+    "3dgs": {},
+    "4dgs": {"time_degree": 2, "scheme": "square_root", "lambda_t": 1.0},
+    "6dgs": {"lambda_d": 0.5, "factor_order": "paper", "scheme": "schur", "off_diagonal": "raw"},
+    "7dgs": {"lambda_d": 0.5, "lambda_t": 0.5, "directional_half": True},
+}
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,9 @@ def targets() -> dict[str, Target]:
     step = {"parameter": rand(N, 3), "gradient": rand(N, 3), "mean": rand(N, 3), "square": rand(N, 3),
             "drawn": torch.ones(N, dtype=torch.bool), "rate": 0.1, "betas": [0.9, 0.999], "eps": 1e-8,
             "step": torch.tensor(1.0)}  # fmt: skip
-    return {
+    model = {"agr": True, "agr_octaves": 4, "sh_degree": 2, "time": 0.5, "center": torch.tensor([0.0, 0.0, -4.0])}
+    models = {name: Target(_model, {"name": name, **options, **model}, ("center",)) for name, options in MODELS.items()}
+    return models | {
         "rasterize": Target(rasterize, {**scene, "background": rand(3), "backend": "cpu"}, ("Ks",)),
         "rasterize by auto": Target(rasterize, {**scene, "background": rand(3), "antialias": True}, ("Ks",)),
         "rasterize by reference": Target(rasterize, {**scene, "near": 0.1, "backend": "reference"}, ("Ks",)),
@@ -98,6 +109,20 @@ def targets() -> dict[str, Target]:
         "random_points": Target(_random_points, {"count": 5, "half_width": 1.3}),
         "nearest_distances": Target(nearest_distances, {"means": rand(N, 3), "k": 3}, ("means",)),
     }  # fmt: skip
+
+
+@torch.enable_grad()
+def _model(name: Any, center: Any, time: Any, **options: Any) -> list[Tensor]:
+    """Build a model, slice it from a place and return its image; the gradients of its parameters are finite."""
+    model, g = build(name, **options), torch.Generator().manual_seed(0)
+    model.initialise(random_points(20, 1.0, g), 1.0, g)
+    means = model.slice(CameraTime.at(center, time)).means.detach()
+    viewmat, K = torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]])
+    viewmat[2, 3] = 4.0
+    image = render(model, Camera(viewmat, K, 16, 16), time, torch.zeros(3))
+    image.sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+    return [image.detach(), means]
 
 
 def _refine(a: Any, b: Any, **layers: Any) -> list[Tensor]:

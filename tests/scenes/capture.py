@@ -4,8 +4,8 @@ import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
+from scenes.tiny_scene import write_image
 from scipy.spatial.transform import Rotation
 
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
@@ -72,7 +72,18 @@ def circle(count: int) -> np.ndarray:  # [count, 4, 4]
     return viewmats
 
 
-def write_image(path: Path, rgb: np.ndarray) -> None:
-    """Write RGB or grey as PNG by OpenCV, whose order is BGR."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), rgb[..., ::-1] if rgb.ndim == 3 else rgb)
+WIDTH, HEIGHT, COUNT = 16, 12, 9  # of the small capture
+NAMES = [f"frame_{i:03d}.png" for i in range(COUNT)]
+
+
+def small_model(root: Path, names: list[str] = NAMES, viewmats: np.ndarray | None = None) -> Path:
+    """Write the model of the small capture, as text, with these images and cameras; return `root`."""
+    viewmats = circle(COUNT)[: len(names)] if viewmats is None else viewmats
+    return Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, viewmats).write(root, "txt")
+
+
+def small_capture(root: Path) -> Path:
+    """Write nine images, each of one grey, and their model; return `root`."""
+    for i, name in enumerate(NAMES):
+        write_image(root / "images" / name, np.full((HEIGHT, WIDTH, 3), 20 * i, np.uint8))
+    return small_model(root)

@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from capture import COLOR, Capture, circle, write_image
+from capture import COLOR, COUNT, HEIGHT, NAMES, WIDTH, Capture, circle, small_model
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_run import main_here
+from tiny_scene import check_message, write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -24,9 +25,6 @@ from gsbench.run.load import SceneDescription
 from gsbench.scenes import colmap, images
 from gsbench.scenes.sample import folder
 from gsbench.scenes.scene import up_of
-
-WIDTH, HEIGHT, COUNT = 16, 12, 9
-NAMES = [f"frame_{i:03d}.png" for i in range(COUNT)]
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +73,8 @@ def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kin
 
 
 def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
-    """Catches a scene that the loader accepts and a run does not, and cameras that do not belong to the images."""
+    """Catches a scene that the loader accepts and a run does not, cameras that do not belong to the images, and a
+    choice that is printed and then forgotten."""
     write_embedded(tmp_path / "own", blender, "bin")
     assert not main_here(
         "+exp=colmap", "model=4dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=own", "scene.downscale=4",
@@ -84,6 +83,7 @@ def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
     (loaded,) = map(record.read, record.find(tmp_path / "results"))
     assert loaded.dataset == "colmap"
     assert loaded.metrics["psnr"] > 12.6  # 13.4; 11.8 where cameras have the images of others
+    assert loaded.provenance.data_notes == list(scenes.load(tmp_path / "own").notes) != []
 
 
 def rays(K: np.ndarray) -> np.ndarray:  # [H, W, 2]
@@ -140,37 +140,50 @@ def test_distortion_is_undone(
     assert set(view.regions.unique().tolist()) == {0, 9}
     half = scenes.load(tmp_path, downscale=2).train[0]
     torch.testing.assert_close(half.camera.K[:2] * 2, view.camera.K[:2])
+    shutil.rmtree(tmp_path / "masks")
+    for name in NAMES:  # the lens is that of the full size, the images are not
+        reduced = cv2.resize(picture(visible), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+        write_image(tmp_path / "images" / name, np.rint(reduced * 255).astype(np.uint8))
+    half = scenes.load(tmp_path).train[0]
+    torch.testing.assert_close(half.camera.K[:2] * 2, view.camera.K[:2], rtol=0.02, atol=0)
+    expected = picture(rays(half.camera.K.double().numpy())[: height // 2, : width // 2])
+    assert np.abs(half.image.numpy() - expected)[2:-2, 2:-2].max() < 0.02
 
 
-@pytest.fixture
-def taken(tmp_path: Path) -> Path:
-    """A capture of nine images of 16 x 12, as text, with the principal point off the centre."""
-    for i, name in enumerate(NAMES):
-        write_image(tmp_path / "images" / name, np.full((HEIGHT, WIDTH, 3), 20 * i, np.uint8))
-    return Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES, circle(COUNT)).write(tmp_path, "txt")
-
-
-def test_a_pinhole_stays_exact(taken: Path) -> None:
-    """Catches a principal point that is moved to the centre, and pixels that are resampled without a reason."""
+def test_a_pinhole_stays_exact(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a principal point that is moved to the centre, pixels that are resampled without a reason, and images of
+    half the size that are refused or read with the intrinsics of the full one."""
     view = scenes.load(taken).train[3]
     assert view.camera.K.tolist() == [[20, 0, 3.25], [0, 21, 9.5], [0, 0, 1]]
     assert (view.image * 255).unique().tolist() == [60]
+    for path in (taken / "images").iterdir():
+        write_image(path, np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
+    view = scenes.load(taken).train[0]
+    assert view.camera.K.tolist() == [[10, 0, 1.625], [0, 10.5, 4.75], [0, 0, 1]]
+    assert "images of 8x6 are resized from those of their camera, 16x12" in capsys.readouterr().err
 
 
-def rename(taken: Path, names: list[str]) -> None:
-    """Give the images other names, in the model and in the folder."""
+NAMINGS: dict[str, tuple[Callable[[int], str], Callable[[int], float], str]] = {  # names, their times, a note
+    "JPEGs of a camera": (lambda i: f"cam9/take2_{100 - 10 * i}.jpg", lambda i: 1 - i / 8, "number 3 of 3 in"),
+    "a rig, frames first": (lambda i: f"frame_{i // 3:04d}/cam{i % 3}.png", lambda i: i // 3 / 2, "number 1 of 2 in"),
+    "with spaces": (lambda i: f"my shot {i}.png", lambda i: i / 8, "the number in each name, 0 to 8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_times_of_names(taken: Path, naming: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a number of the folder or the camera taken for the time, order by text, JPEGs that are not found, a name
+    that is cut at its first space, and a choice that is not printed."""
+    name_of, time_of, note = NAMINGS[naming]
+    names = [name_of(i) for i in range(COUNT)]
     for old, new in zip(NAMES, names, strict=True):
         (taken / "images" / new).parent.mkdir(exist_ok=True)
         (taken / "images" / old).rename((taken / "images" / new).with_suffix(".png"))
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(taken, "txt")
-
-
-def test_times_of_names(taken: Path) -> None:
-    """Catches a number of the folder or the camera taken for the time, order by text, and JPEGs that are not found."""
-    rename(taken, [f"cam9/take2_{100 - 10 * i}.jpg" for i in range(COUNT)])
+    small_model(taken, names, np.tile(circle(3), (3, 1, 1)) if "rig" in naming else None)
     scene = scenes.load(taken)
-    assert [view.time for view in scene.train] == [i / 8 for i in (0, 1, 2, 3, 4, 5, 6, 8)]
-    assert [view.name for view in scene.test] == ["cam9/take2_90"]
+    times = {view.name: view.time for view in (*scene.train, *scene.test)}
+    assert times == {name_of(i)[:-4]: time_of(i) for i in range(COUNT)}
+    assert f"{taken.name}: times: {note}" in capsys.readouterr().err
 
 
 def test_an_exif_orientation_is_told(taken: Path) -> None:
@@ -193,7 +206,7 @@ def write_jpegs(taken: Path) -> list[str]:
     across, down = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     for i, name in enumerate(names):
         write_image(taken / "images" / name, np.stack([10 * across, 20 * down, 0 * down + 20 * i], -1).astype(np.uint8))
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, circle(COUNT)).write(taken, "txt")
+    small_model(taken, names)
     return names
 
 
@@ -215,50 +228,6 @@ def test_jpegs_are_read(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert [view.name for view in scene.test] == ["frame_007"]
     scene = scenes.load(taken, downscale=2)
     assert scene.train[0].image.shape == (HEIGHT // 2, WIDTH // 2, 3)
-
-
-def grey(taken: Path, name: str) -> None:
-    write_image(taken / "images" / name, np.zeros((HEIGHT, WIDTH), np.uint8))
-
-
-@pytest.mark.parametrize(
-    ("break_it", "message"),
-    [
-        (
-            lambda taken, name: os.truncate(path := taken / "images" / name, path.stat().st_size - 40),
-            "damaged JPEG.*truncated",
-        ),
-        (
-            lambda taken, name: os.truncate(taken / "images" / name, 20),
-            "frame_001.jpeg.*damaged JPEG",
-        ),
-        (
-            lambda taken, name: (taken / "images" / name).write_bytes(b"GIF89a"),
-            "frame_001.jpeg.*expected a PNG",
-        ),
-        (grey, "expected a JPEG of RGB, got one of L"),
-        (
-            lambda taken, name: write_image(taken / "images" / name, np.zeros((9, 9, 3), np.uint8)),
-            "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
-        ),
-        (
-            lambda taken, name: [
-                (taken / "images" / name).unlink(),
-                (taken / "images" / name).symlink_to("/etc/passwd"),
-            ],
-            "expected a PNG or a JPEG",
-        ),
-    ],
-)
-def test_a_jpeg_that_is_not_whole_is_refused(
-    taken: Path, break_it: Callable[[Path, str], object], message: str
-) -> None:
-    """Catches missing rows that are read as grey, and a stack trace of the decoder."""
-    names = write_jpegs(taken)
-    break_it(taken, names[1])
-    with pytest.raises(InputError, match=message) as caught:
-        scenes.load(taken)
-    assert "\n" not in str(caught.value)
 
 
 @given(at=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=8))
@@ -308,26 +277,16 @@ def test_up_turns_with_the_world(tmp_path: Path, blender: scenes.Scene) -> None:
         assert SceneDescription.of(scene).up == list(scene.up)  # which a checkpoint keeps
 
 
-@pytest.mark.parametrize(
-    ("degrees", "pitch", "roll", "most"),
-    [(360, 30, 0, 0.1), (120, 30, 0, 1), (60, 40, 0, 6), (120, 30, 2, 2), (360, 30, 5, 4), (0, 0, 0, 0.1)],
-)
-def test_up_is_level_to_the_cameras(degrees: float, pitch: float, roll: float, most: float) -> None:
-    """Catches the mean of up vectors, which leans by 25 degrees on an arc of 120 from which cameras look down."""
-    assert lean(up_of(torch.from_numpy(arc(degrees, pitch, roll))), np.array([0, 0, 1])) < most
-
-
-def test_cameras_that_stand_every_way_have_no_up() -> None:
-    """Catches a division by the length of a zero vector."""
+def test_up_is_level_to_the_cameras() -> None:
+    """Catches the mean of up vectors, which leans by 25 degrees on an arc of 120 from which cameras look down, and a
+    division by the length of a zero vector where cameras stand every way."""
+    for degrees, pitch, roll, most in (
+        (360, 30, 0, 0.1), (120, 30, 0, 1), (60, 40, 0, 6), (120, 30, 2, 2), (360, 30, 5, 4), (0, 0, 0, 0.1),
+    ):  # fmt: skip
+        assert lean(up_of(torch.from_numpy(arc(degrees, pitch, roll))), np.array([0, 0, 1])) < most
     viewmats = arc(360, 0)
     viewmats[::2, :2] *= -1
     assert up_of(torch.from_numpy(viewmats)) == (0, 0, 1)
-
-
-def test_names_without_numbers_have_no_times(taken: Path) -> None:
-    """Catches times that come from nowhere."""
-    rename(taken, [f"{letter}.png" for letter in "abcdefghi"])
-    assert not scenes.load(taken).has_time
 
 
 def text(part: str, old: str, new: str, count: int = 1) -> Callable[[Path], object]:
@@ -343,6 +302,23 @@ def text(part: str, old: str, new: str, count: int = 1) -> Callable[[Path], obje
 
 def table(content: str) -> Callable[[Path], object]:
     return lambda taken: (taken / "times.csv").write_text(content)
+
+
+def image(change: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda taken: change(taken / "images/frame_001.png")
+
+
+def jpeg(change: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Make all images JPEGs and change the second, frame_001.jpeg."""
+    return lambda taken: change(taken / "images" / write_jpegs(taken)[1])
+
+
+def paint(*shape: int) -> Callable[[Path], None]:
+    return lambda path: write_image(path, np.zeros(shape, np.uint8))
+
+
+def link(target: str) -> Callable[[Path], object]:
+    return lambda path: [path.unlink(), path.symlink_to(target)]
 
 
 ROWS = "".join(f"{name},{i}\n" for i, name in enumerate(NAMES))
@@ -366,16 +342,17 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "name of a folder": (text("images", "frame_001.png", "."), "expected a number in its name"),
     "no number": (text("images", "frame_001.png", "x.png"), "expected a number in its name"),
     "endless number": (text("images", "frame_001", "9" * 5000), "expected a time"),
-    "image missing": (lambda taken: (taken / "images/frame_001.png").unlink(), "frame_001.png.*found none"),
-    "image is a link to a device": (
-        lambda taken: [(file := taken / "images/frame_001.png").unlink(), file.symlink_to("/dev/zero")],
-        "expected a file, found a device",
-    ),
-    "image truncated": (lambda taken: os.truncate(taken / "images/frame_001.png", 40), "truncated PNG"),
-    "another size": (
-        lambda taken: write_image(taken / "images/frame_001.png", np.zeros((9, 9, 3), np.uint8)),
-        "expected 16x12 as its camera, or both sides resized by one ratio, got 9x9",
-    ),
+    "fewer images than the split needs": (lambda taken: small_model(taken, NAMES[:7]), "at least 8 images"),
+    "image missing": (image(Path.unlink), "frame_001.png.*found none"),
+    "image is a link to a device": (image(link("/dev/zero")), "expected a file, found a device"),
+    "image truncated": (image(lambda path: os.truncate(path, 40)), "truncated PNG"),
+    "another size": (image(paint(9, 9, 3)), "expected 16x12 as its camera, or both sides resized by one .*got 9x9"),
+    "jpeg cut": (jpeg(lambda path: os.truncate(path, path.stat().st_size - 40)), "damaged JPEG.*truncated"),
+    "jpeg's head alone": (jpeg(lambda path: os.truncate(path, 20)), "frame_001.jpeg.*damaged JPEG"),
+    "jpeg is a gif": (jpeg(lambda path: path.write_bytes(b"GIF89a")), "frame_001.jpeg.*expected a PNG"),
+    "jpeg is grey": (jpeg(paint(HEIGHT, WIDTH)), "expected a JPEG of RGB, got one of L"),
+    "jpeg of another size": (jpeg(paint(9, 9, 3)), "expected 16x12 as its camera, .*got 9x9"),
+    "jpeg is a link to text": (jpeg(link("/etc/passwd")), "expected a PNG or a JPEG"),
     "folded": (text("cameras", "PINHOLE 16 12 20.0 21.0", "RADIAL 16 12 5 5 5 -9 9"), "PINHOLE|RADIAL with"),
     "too distorted": (
         text("cameras", "PINHOLE 16 12 20.0 21.0 3.25 9.5", "RADIAL 16 12 5.0 8 6 -9.0 1.0"),
@@ -394,24 +371,17 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_fault_is_one_line_that_says_what_is_wrong(taken: Path, fault: str) -> None:
-    """Catches a fault let through, and a stack trace from the depths."""
+    """Catches a fault let through, missing rows that are read as grey, and a stack trace from the depths."""
     apply, message = FAULTS[fault]
     apply(taken)
     with pytest.raises(InputError, match=message) as caught:
         scenes.load(taken)
-    assert "\n" not in str(caught.value)
-
-
-def test_fewer_images_than_the_split_needs(taken: Path) -> None:
-    """Catches a scene without a test view."""
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 8.0, 6.0), NAMES[:7], circle(7)).write(taken, "txt")
-    with pytest.raises(InputError, match="at least 8 images"):
-        scenes.load(taken)
+    check_message(caught.value)
 
 
 def model(taken: Path, where: str, count: int) -> None:
     """Write a model of the first `count` images into another folder of the capture."""
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES[:count], circle(COUNT)[:count]).write(taken, "txt")
+    small_model(taken, NAMES[:count])
     target = taken / where
     target.mkdir(parents=True, exist_ok=True)
     for path in (taken / "sparse" / "0").iterdir():
@@ -488,69 +458,6 @@ def test_images_txt_without_second_lines_is_refused(taken: Path, which: str) -> 
     path.write_text("\n".join([head, *(line for pair in pairs for line in pair)]))
     with pytest.raises(InputError, match=r"expected the keypoints .* or an empty line, got .*after each image"):
         scenes.load(taken)
-
-
-def test_names_with_spaces(taken: Path) -> None:
-    """Catches a name that is cut at its first space."""
-    rename(taken, [f"my shot {i}.png" for i in range(COUNT)])
-    assert scenes.load(taken).train[2].name == "my shot 2"
-
-
-def test_images_of_half_the_size(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a folder images_2 refused with advice that does not help, or read with the full size's intrinsics."""
-    for path in (taken / "images").iterdir():
-        write_image(path, np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
-    view = scenes.load(taken).train[0]
-    assert view.camera.K.tolist() == [[10, 0, 1.625], [0, 10.5, 4.75], [0, 0, 1]]
-    assert "images of 8x6 are resized from those of their camera, 16x12" in capsys.readouterr().err
-
-
-def test_images_of_half_the_size_are_undistorted(tmp_path: Path) -> None:
-    """Catches the lens of the full size used for a reduced image: both show the same rays in the middle."""
-    lens, names = (50.0, 54.0, 33.0, 23.0, -0.2, 0.03, 0.01, -0.02), NAMES
-    big = rays(np.array([[50.0, 0, 33], [0, 54, 23], [0, 0, 1]]))
-    visible = picture(ray_seen(big, *lens[4:]))
-    for root, pixels in (
-        (tmp_path / "whole", visible),
-        (tmp_path / "half", cv2.resize(visible, (32, 24), None, 0, 0, 3)),
-    ):
-        for name in names:
-            write_image(root / "images" / name, np.rint(pixels * 255).astype(np.uint8))
-        Capture("OPENCV", WIDTH * 4, HEIGHT * 4, lens, names, circle(COUNT)).write(root, "bin")
-    whole, half = (scenes.load(tmp_path / name) for name in ("whole", "half"))
-    torch.testing.assert_close(half.train[0].camera.K[:2] * 2, whole.train[0].camera.K[:2], rtol=0.02, atol=0)
-    K = half.train[0].camera.K.double().numpy()
-    y, x = np.mgrid[:24, :32] + 0.5
-    expected = picture(np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], -1))
-    assert np.abs(half.train[0].image.numpy() - expected)[2:-2, 2:-2].max() < 0.02
-
-
-def test_a_rig_named_by_frames_first(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches the number of the camera taken for the time, and a choice that is not printed."""
-    names = [f"frame_{i // 3:04d}/cam{i % 3:02d}.png" for i in range(COUNT)]
-    for old, new in zip(NAMES, names, strict=True):
-        (taken / "images" / new).parent.mkdir(exist_ok=True)
-        (taken / "images" / old).rename(taken / "images" / new)
-    Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, np.tile(circle(3), (3, 1, 1))).write(taken, "txt")
-    scene = scenes.load(taken)
-    assert {view.name: view.time for view in scene.train}["frame_0001/cam02"] == 0.5
-    line = f"{taken.name}: times: number 1 of 2 in each name, 0 to 2 (whole numbers), scaled to [0, 1]"
-    assert line in capsys.readouterr().err
-
-
-def test_notes_are_in_the_record(taken: Path) -> None:
-    """Catches a choice that is printed and then forgotten, and a record of before that is refused."""
-    (taken / "capture").mkdir()
-    for name in ("images", "sparse"):
-        shutil.move(taken / name, taken / "capture" / name)
-    assert main_here(
-        "+exp=colmap", "model=3dgs", f"data.root={taken}", "scene=custom", "scene.name=capture",
-        "train.iterations=1", f"results={taken / 'results'}",
-    ) == 0  # fmt: skip
-    (path,) = record.find(taken / "results")
-    provenance = record.read(path).provenance
-    assert provenance.data_notes == list(scenes.load(taken / "capture").notes)
-    assert "times: the number in each name, 0 to 8" in provenance.data_notes[0]
 
 
 READERS: dict[str, Callable[[colmap.ModelFile], Any]] = {

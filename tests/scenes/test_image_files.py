@@ -5,30 +5,24 @@ from pathlib import Path
 
 import cv2
 import pytest
-from tiny_scene import edit
+from tiny_scene import IMAGES, edit
 
 from gsbench import scenes
 from gsbench.errors import InputError
 from gsbench.scenes.files import ImageFinder
 
-IMAGES = ("train/r_0", "train/r_1", "val/r_0", "test/r_0")
-
-
-def as_jpegs(root: Path, suffix: str) -> None:
-    """Replace the PNGs of the tiny scene by JPEGs."""
-    for name in IMAGES:
-        image = cv2.imread(str(root / f"{name}.png"), cv2.IMREAD_COLOR)
-        (root / f"{name}.png").unlink()
-        (root / f"{name}{suffix}").write_bytes(cv2.imencode(".jpg", image)[1].tobytes())
+SPLITS = ("train", "val", "test")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".JPG", ".jpeg", ".Jpeg", ".png", ".PNG"])
 @pytest.mark.parametrize("named", ["", ".jpg", ".png"])
 def test_jpegs_of_a_blender_scene(tiny: Path, suffix: str, named: str) -> None:
     """Catches r_0.jpg.png, a JPEG that is called .png refused, and a suffix left in the names of views."""
-    as_jpegs(tiny, suffix)
-    for split in ("train", "val", "test"):
-        edit(tiny, lambda c: [f.update(file_path=f["file_path"] + named) for f in c["frames"]], split)
+    for path in map(tiny.joinpath, IMAGES):
+        jpeg = cv2.imencode(".jpg", cv2.imread(str(path), cv2.IMREAD_COLOR))[1].tobytes()
+        path.unlink()
+        path.with_suffix(suffix).write_bytes(jpeg)
+    edit(tiny, lambda c: [f.update(file_path=f["file_path"] + named) for f in c["frames"]], *SPLITS)
     scene = scenes.load(tiny)
     assert [view.name for view in scene.train] == ["train/r_0", "train/r_1"]
     differs = bool(named) and named != suffix
@@ -50,13 +44,15 @@ def test_the_image_that_is_named_comes_first(tiny: Path) -> None:
 
 
 def test_links_of_the_user_are_followed(tiny: Path, tmp_path: Path) -> None:
-    """Catches images on another disk refused, by file or by folder, or told apart by the fingerprint."""
+    """Catches images on another disk, or a whole scene there, refused, of another name or of another fingerprint."""
     expected = scenes.load(tiny)
     shutil.move(tiny / "train", tmp_path / "disk")
     (tiny / "train").symlink_to(tmp_path / "disk")
     shutil.move(tiny / "test" / "r_0.png", tmp_path / "elsewhere.png")
     (tiny / "test" / "r_0.png").symlink_to(tmp_path / "elsewhere.png")
-    linked = scenes.load(tiny)
+    (tmp_path / "linked").symlink_to(tiny)
+    linked = scenes.load(tmp_path / "linked")
+    assert linked.name == "linked"
     assert linked.fingerprint == expected.fingerprint
     assert [view.name for view in linked.train] == [view.name for view in expected.train]
     assert all((a.image == b.image).all() for a, b in zip(linked.train, expected.train, strict=True))
@@ -87,8 +83,7 @@ def test_views_that_splits_share_are_counted(tiny: Path, capsys: pytest.CaptureF
 
 def test_two_images_of_one_camera_and_time_are_refused(tiny: Path) -> None:
     """Catches contradictory times, and all times equal where the camera moves, which is a still scene."""
-    for split in ("train", "val", "test"):
-        edit(tiny, lambda c: [f.update(time=0.25) for f in c["frames"]], split)
+    edit(tiny, lambda c: [f.update(time=0.25) for f in c["frames"]], *SPLITS)
     scene = scenes.load(tiny)
     assert not scene.has_time
     assert scene.notes == ("times: none, as all times are 0.25",)

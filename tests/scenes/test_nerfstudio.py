@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from capture import circle
-from tiny_scene import write_png
+from tiny_scene import check_message, write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -26,7 +27,7 @@ def root(tmp_path: Path) -> Path:
     """A scene of 17 images without times, and a file that has its images in another order."""
     frames = []
     for i, viewmat in enumerate(circle(COUNT)):
-        write_png(tmp_path / "images" / f"frame_{i:05d}.png", np.full((6, 8, 3), 10 * i, np.uint8))
+        write_image(tmp_path / "images" / f"frame_{i:05d}.png", np.full((6, 8, 3), 10 * i, np.uint8))
         matrix = (np.linalg.inv(viewmat) @ np.diag([1, -1, -1, 1])).tolist()
         frames.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix, "colmap_im_id": i})
     order = np.random.default_rng(0).permutation(COUNT)
@@ -40,9 +41,12 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def content_of(root: Path) -> dict[str, Any]:
+    return json.loads((root / "transforms.json").read_text())
+
+
 def change(root: Path, **values: Any) -> None:
-    content = json.loads((root / "transforms.json").read_text())
-    (root / "transforms.json").write_text(json.dumps(content | values))
+    (root / "transforms.json").write_text(json.dumps(content_of(root) | values))
 
 
 def test_it_is_read(root: Path) -> None:
@@ -75,20 +79,19 @@ def test_its_own_split(root: Path) -> None:
     assert scene.notes[0] == "split: as the file lists, 10, 2 and 1 of 17 views"
 
 
-def test_times_of_the_file(root: Path) -> None:
-    """Catches times of frames that give way to the numbers of names."""
-    content = json.loads((root / "transforms.json").read_text())
-    change(root, frames=[frame | {"time": -float(frame["file_path"][-9:-4])} for frame in content["frames"]])
-    assert [view.name for view in scenes.load(root).test] == ["images/frame_00009", "images/frame_00001"]
-
-
-def test_times_of_a_table(root: Path) -> None:
-    """Catches the cure of the messages, times.csv, that is not read here, or not part of the fingerprint."""
+def test_times_of_the_file_or_of_a_table(root: Path) -> None:
+    """Catches times of frames that give way to the numbers of names, and the cure of the messages, times.csv, that is
+    not read here or not part of the fingerprint."""
+    plain = content_of(root)["frames"]
+    change(root, frames=[frame | {"time": -float(frame["file_path"][-9:-4])} for frame in plain])
+    timed = scenes.load(root)
+    change(root, frames=plain)
     before = scenes.load(root).fingerprint
     (root / "times.csv").write_text("name,time\n" + "".join(f"frame_{i:05d},{-i}\n" for i in range(COUNT)))
-    scene = scenes.load(root)
-    assert [view.name for view in scene.test] == ["images/frame_00009", "images/frame_00001"]
-    assert scene.fingerprint != before
+    tabled = scenes.load(root)
+    for scene in (timed, tabled):
+        assert [view.name for view in scene.test] == ["images/frame_00009", "images/frame_00001"]
+    assert tabled.fingerprint != before
 
 
 def test_fingerprint(root: Path) -> None:
@@ -98,65 +101,61 @@ def test_fingerprint(root: Path) -> None:
     before.add(scenes.load(root).fingerprint)
     change(root, fl_x=9.25)
     before.add(scenes.load(root).fingerprint)
-    write_png(root / "images" / "frame_00003.png", np.full((6, 8, 3), 1, np.uint8))
+    write_image(root / "images" / "frame_00003.png", np.full((6, 8, 3), 1, np.uint8))
     assert scenes.load(root).fingerprint not in before
     assert len(before) == 3
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"camera_model": "OPENCV_FISHEYE"}, "transforms.json: camera_model: expected a pinhole"),
-        ({"k1": 0.02}, "transforms.json: k1: .*undistort"),
-        ({"ply_file_path": "../x.ply"}, "ply_file_path: expected a path inside"),
-        ({"ply_file_path": 3}, "ply_file_path: expected the path of a PLY"),
-        ({"ply_file_path": "none.ply"}, "none.ply"),
-        ({"train_filenames": ["images/frame_00000.png"]}, "1 and 0: list them"),
-        ({"train_filenames": ["images/x.png"]}, "train_filenames: expected file_path of frames, got .*add its frame"),
-        ({"test_filenames": 3}, "test_filenames: expected file_path of frames, got 3"),
-        ({"frames": []}, "at least one frame"),
-        ({"w": math.inf}, "w: expected a finite number"),
-    ],
-)
-def test_what_is_wrong_is_one_line(root: Path, values: dict[str, Any], words: str) -> None:
-    """Catches a stack trace, and lists that name images of no frame."""
-    change(root, **values)
-    with pytest.raises(InputError, match=words) as caught:
-        scenes.load(root)
-    assert "\n" not in str(caught.value)
+def frames(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], None]:
+    """Change the list of frames."""
+
+    def apply(root: Path) -> None:
+        content = content_of(root)
+        change(content["frames"])
+        (root / "transforms.json").write_text(json.dumps(content))
+
+    return apply
 
 
-def test_views_that_train_and_test_share_are_told(root: Path) -> None:
-    """Catches lists that overlap, and a frame that is there twice, which may be once in train and once in test."""
-    frames = json.loads((root / "transforms.json").read_text())["frames"]
-    names = [frame["file_path"] for frame in frames]
-    change(root, train_filenames=names, test_filenames=names[:2])
-    assert any("2 of 2 views of test are views of train too" in note for note in scenes.load(root).notes)
-
-
-def test_a_cloud_without_colours_says_which_are_read(root: Path) -> None:
-    """Catches a message that asks for f_dc_0 alone."""
+def without_colours(root: Path) -> None:
     lines = PLY.splitlines()
     body = lines.index("end_header")
     rows = [line for line in lines[:body] if "uchar" not in line] + ["end_header"]
     rows += [" ".join(line.split()[:3]) for line in lines[body + 1 :]]
     (root / "sparse_pc.ply").write_text("\n".join(rows))
-    with pytest.raises(InputError, match="expected colours as red green blue, or as f_dc_0"):
+
+
+FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
+    ({"camera_model": "OPENCV_FISHEYE"}, "transforms.json: camera_model: expected a pinhole"),
+    ({"k1": 0.02}, "transforms.json: k1: .*undistort"),
+    ({"ply_file_path": "../x.ply"}, "ply_file_path: expected a path inside"),
+    ({"ply_file_path": 3}, "ply_file_path: expected the path of a PLY"),
+    ({"ply_file_path": "none.ply"}, "none.ply"),
+    ({"train_filenames": ["images/frame_00000.png"]}, "1 and 0: list them"),
+    ({"train_filenames": ["images/x.png"]}, "train_filenames: expected file_path of frames, got .*add its frame"),
+    ({"test_filenames": 3}, "test_filenames: expected file_path of frames, got 3"),
+    ({"frames": []}, "at least one frame"),
+    ({"w": math.inf}, "w: expected a finite number"),
+    (without_colours, "expected colours as red green blue, or as f_dc_0"),
+    (
+        frames(lambda listed: listed.__delitem__(slice(7, None))),
+        "at least 8, .*list train_filenames and test_filenames",
+    ),
+    (frames(lambda listed: listed[3].update(time=0.5)), r"frames\[3\]\.time: this frame has a time and the first"),
+]
+
+
+@pytest.mark.parametrize(("fault", "words"), FAULTS)
+def test_what_is_wrong_is_one_line(root: Path, fault: Any, words: str) -> None:
+    """Catches a stack trace, lists that name images of no frame, and a scene without a test view."""
+    fault(root) if callable(fault) else change(root, **fault)
+    with pytest.raises(InputError, match=words) as caught:
         scenes.load(root)
+    check_message(caught.value)
 
 
-def test_too_few_for_a_split(root: Path) -> None:
-    """Catches a scene without a test view."""
-    content = json.loads((root / "transforms.json").read_text())
-    change(root, frames=content["frames"][:7])
-    with pytest.raises(InputError, match=r"at least 8, .*list train_filenames and test_filenames"):
-        scenes.load(root)
-
-
-def test_a_time_for_some(root: Path) -> None:
-    """Catches frames without a time between frames that have one."""
-    content = json.loads((root / "transforms.json").read_text())
-    content["frames"][3]["time"] = 0.5
-    change(root, frames=content["frames"])
-    with pytest.raises(InputError, match=r"frames\[3\]\.time: this frame has a time and the first frame has none"):
-        scenes.load(root)
+def test_views_that_train_and_test_share_are_told(root: Path) -> None:
+    """Catches lists that overlap, and a frame that is there twice, which may be once in train and once in test."""
+    names = [frame["file_path"] for frame in content_of(root)["frames"]]
+    change(root, train_filenames=names, test_filenames=names[:2])
+    assert any("2 of 2 views of test are views of train too" in note for note in scenes.load(root).notes)

@@ -1,19 +1,21 @@
 """A scene is trained at a standard place and size, wherever it lies, and goes out in the user's coordinates."""
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from capture import Capture, circle, write_image
+from capture import Capture, circle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tiny_run import overrides, run_here, write_moving_square
+from tiny_scene import edit, write_image
 
 from gsbench import load_run, load_scene
 from gsbench.errors import InputError
+from gsbench.export import main as export
 from gsbench.scenes import Scene, sample
 from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.placement import place_and_size
@@ -70,8 +72,6 @@ def test_a_moved_scene_is_trained_where_it_would_have_been(name: str, tmp_path: 
     assert plain.placement.is_identity
     assert not moved.placement.is_identity
     torch.testing.assert_close(cameras_of(moved), cameras_of(plain), rtol=0, atol=2e-6)
-    assert plain.points is not None
-    assert moved.points is not None
     torch.testing.assert_close(moved.points.means, plain.points.means, rtol=0, atol=2e-6)
     assert moved.points.means.dtype == moved.train[0].camera.viewmat.dtype == torch.float32
     assert moved.extent == pytest.approx(plain.extent, rel=1e-6)
@@ -106,7 +106,6 @@ def test_any_scene_comes_to_a_standard_place(
     scale = max(scale, 1e-8 * max(map(abs, offset)))  # of float64 something must be left
     root = write_capture(tmp_path_factory.mktemp("any"), scale, offset, viewmats=viewmats, points=points)
     scene = load_scene(root)
-    assert scene.points is not None
     middle = scene.points.means.double().median(0).values
     distances = (torch.stack([view.camera.center for view in scene.train]).double() - middle).norm(dim=1)
     assert middle.norm() < 0.5 * STANDARD
@@ -157,7 +156,6 @@ def test_far_points_do_not_count(count: int, away: float, tmp_path: Path) -> Non
     points = random.normal(0, 0.5, (3000, 3))
     far = np.concatenate([points, away * random.uniform(0.5, 1, (count, 3))])
     scene = load_scene(write_capture(tmp_path, points=far))
-    assert scene.points is not None
     plain = torch.from_numpy(points).float()
     assert size_of(scene.points) == pytest.approx(size_of(Points(plain, plain)), rel=1e-3)
     assert scene.placement.is_identity
@@ -177,14 +175,13 @@ def test_points_of_another_place_are_told_or_refused(tmp_path: Path) -> None:
 
 def moved_square(root: Path, scale: float, offset: tuple[float, float, float]) -> Path:
     """The moving square, scaled and moved as a whole."""
-    write_moving_square(root)
-    for split in ("train", "val", "test"):
-        path = root / "square" / f"transforms_{split}.json"
-        content = json.loads(path.read_text())
+
+    def move(content: dict[str, Any]) -> None:
         for frame in content["frames"]:
             for row, by in zip(frame["transform_matrix"], offset, strict=False):
                 row[3] = scale * row[3] + by
-        path.write_text(json.dumps(content))
+
+    edit(write_moving_square(root) / "square", move, "train", "val", "test")
     return root
 
 
@@ -192,8 +189,6 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches PLY files in other coordinates than the cameras', and a start from a PLY that is taken as it is."""
-    from gsbench.export import main as export
-
     offset = (500.0, -200.0, 300.0)
     records, trained = {}, {}
     for name, data in {
@@ -205,8 +200,6 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
         assert export([str(folder), "--ply", str(tmp_path / f"{name}.ply"), "--time", "0.5"]) == 0
         trained[name] = read_trained(tmp_path / f"{name}.ply")
     plain, moved = records["plain"].metrics, records["moved"].metrics
-    assert plain is not None
-    assert moved is not None
     assert moved["psnr"] == pytest.approx(plain["psnr"], abs=0.01)
     assert "trained in units of 100" in " ".join(records["moved"].provenance.data_notes)
     there = 100 * trained["plain"].means + torch.tensor(offset)

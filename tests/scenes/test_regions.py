@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_scene import COUNTS, edit, write_png
+from tiny_scene import COUNTS, check_message, edit, write_image, write_images
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -22,9 +22,8 @@ NUMBERS = np.arange(48, dtype=np.uint8).reshape(6, 8)  # of the tiny scene's siz
 def write_masks(root: Path) -> None:
     """Give every image of the tiny scene a mask: NUMBERS, and the image's index more."""
     for split, count in COUNTS.items():
-        (root / split / "masks").mkdir()
         for index in range(count):
-            assert cv2.imwrite(str(root / split / "masks" / f"r_{index}.png"), NUMBERS + np.uint8(index))
+            write_image(root / split / "masks" / f"r_{index}.png", NUMBERS + np.uint8(index))
 
 
 @pytest.mark.parametrize("in_8_bits", [False, True])
@@ -35,8 +34,7 @@ def test_alpha_is_kept_as_stored(
     """Catches an alpha lost to the composite, taken from a colour, or rounded down from 16 bits."""
     limit = np.iinfo(dtype).max
     rgba = np.random.default_rng(1).integers(0, limit + 1, (6, 8, 4)).astype(dtype)
-    for name in ("train/r_0", "train/r_1", "val/r_0", "test/r_0"):
-        write_png(tiny / f"{name}.png", rgba)
+    write_images(tiny, rgba)
     if in_8_bits:
         monkeypatch.setattr(images, "_MOST_FLOATS", 0)
     for view in scenes.load(tiny).to("cpu").train:
@@ -45,22 +43,17 @@ def test_alpha_is_kept_as_stored(
 
 
 def test_alpha_is_averaged_with_the_image(tiny: Path) -> None:
-    """Catches an alpha of the full size beside a reduced image, or one that is cut out of it."""
+    """Catches an alpha of the full size beside a reduced image, one that is cut out of it, and one of opaque images."""
     alpha = cv2.imread(str(tiny / "train/r_1.png"), cv2.IMREAD_UNCHANGED)[..., 3].astype(float)
     view = scenes.load(tiny, downscale=2).train[1]
     np.testing.assert_allclose(view.alpha, alpha.reshape(3, 2, 4, 2).mean(axis=(1, 3)), atol=0.51)
-
-
-def test_an_image_without_alpha_has_none(tiny: Path) -> None:
-    """Catches an alpha made up for opaque images."""
-    for name in ("train/r_0", "train/r_1", "val/r_0", "test/r_0"):
-        write_png(tiny / f"{name}.png", np.zeros((6, 8, 3), np.uint8))
+    write_images(tiny, np.zeros((6, 8, 3), np.uint8))
     scene = scenes.load(tiny)
     assert all(view.alpha is None for view in scene.train + scene.val + scene.test)
 
 
 def test_regions_are_the_masks_beside_the_images(tiny: Path) -> None:
-    """Catches the mask of another view, numbers that are changed, and a fingerprint that old records do not have."""
+    """Catches the mask of another view, changed numbers, another fingerprint, and images without masks refused."""
     before = scenes.load(tiny)
     assert all(view.regions is None for view in before.train + before.val + before.test)
     write_masks(tiny)
@@ -70,15 +63,8 @@ def test_regions_are_the_masks_beside_the_images(tiny: Path) -> None:
             assert view.regions.dtype == torch.uint8
             np.testing.assert_array_equal(view.regions, NUMBERS + index)
     assert scene.fingerprint == before.fingerprint
-
-
-def test_only_masked_folders_have_regions(tiny: Path) -> None:
-    """Catches a scene that is refused because its training images alone have masks."""
-    write_masks(tiny)
     shutil.rmtree(tiny / "test" / "masks")
-    scene = scenes.load(tiny)
-    assert scene.train[0].regions is not None
-    assert scene.test[0].regions is None
+    assert scenes.load(tiny).test[0].regions is None
 
 
 @pytest.mark.parametrize("downscale", [2, 3])
@@ -87,8 +73,8 @@ def test_regions_are_not_averaged(tiny: Path, downscale: int) -> None:
     numbers = np.arange(72, dtype=np.uint8).reshape(6, 12)
     write_masks(tiny)
     for path in tiny.glob("*/r_*.png"):
-        write_png(path, np.zeros((6, 12, 4), np.uint8))
-        assert cv2.imwrite(str(path.parent / "masks" / path.name), numbers)
+        write_image(path, np.zeros((6, 12, 4), np.uint8))
+        write_image(path.parent / "masks" / path.name, numbers)
     view = scenes.load(tiny, downscale=downscale).train[0]
     assert view.regions.shape == view.image.shape[:2]
     np.testing.assert_array_equal(view.regions, numbers[1::downscale, 1::downscale])
@@ -98,44 +84,31 @@ def test_a_coarse_view_drops_both(tiny: Path) -> None:
     """Catches the full-size alpha and regions of a view whose image was reduced for an early step."""
     write_masks(tiny)
     coarse = reduced(scenes.load(tiny).train[0], 2)
-    assert coarse.alpha is None
-    assert coarse.regions is None
+    assert coarse.alpha is coarse.regions is None
 
 
-def written(image: np.ndarray) -> Callable[[Path], bool]:
-    return lambda path: cv2.imwrite(str(path), image)
+DAMAGES: list[tuple[Callable[[Path], object], str]] = [
+    (Path.unlink, "r_1.png"),
+    (lambda path: write_image(path, NUMBERS[:, :7]), "expected 8x6 as the image of this mask, got 7x6"),
+    (lambda path: write_image(path, np.zeros((6, 8, 3), np.uint8)), "expected 8-bit grey"),
+    (lambda path: write_image(path, NUMBERS.astype(np.uint16)), "expected 8-bit grey"),
+    (lambda path: path.write_bytes(path.read_bytes()[:-20]), "truncated PNG"),
+    (lambda path: path.write_bytes(b"no PNG"), "expected a PNG"),
+]
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (Path.unlink, "r_1.png"),
-        (written(NUMBERS[:, :7].copy()), "expected 8x6 as the image of this mask, got 7x6"),
-        (written(np.zeros((6, 8, 3), np.uint8)), "expected 8-bit grey"),
-        (written(NUMBERS.astype(np.uint16)), "expected 8-bit grey"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-20]), "truncated PNG"),
-        (lambda path: path.write_bytes(b"no PNG"), "expected a PNG"),
-    ],
-)
-def test_a_damaged_mask_is_refused(change: Callable[[Path], object], reason: str, tiny: Path) -> None:
-    """Catches a mask that is left out, of another size, of colours or cut off, and is found when it is measured by."""
-    write_masks(tiny)
-    change(tiny / "train" / "masks" / "r_1.png")
-    with pytest.raises(InputError) as caught:
-        scenes.load(tiny)
-    message = str(caught.value)
-    assert reason in message
-    assert "the mask of train/r_1.png" in message
-    assert "\n" not in message
-
-
-def test_masks_on_another_disk_are_read(tiny: Path, tmp_path: Path) -> None:
-    """Catches a link of the user that is refused."""
+@pytest.mark.parametrize(("damage", "words"), DAMAGES)
+def test_a_damaged_mask_is_refused(damage: Callable[[Path], object], words: str, tiny: Path, tmp_path: Path) -> None:
+    """Catches a mask that is left out, of another size, of colours or cut off; and a link of the user refused."""
     write_masks(tiny)
     mask = tiny / "train" / "masks" / "r_1.png"
     mask.rename(tmp_path / "elsewhere.png")
     mask.symlink_to(tmp_path / "elsewhere.png")
     assert scenes.load(tiny).train[1].regions is not None
+    damage(mask)
+    with pytest.raises(InputError) as caught:
+        scenes.load(tiny)
+    check_message(caught.value, words, "the mask of train/r_1.png")
 
 
 @pytest.mark.skipif(not MUJOCO.is_dir(), reason="../shared/data/mujoco is not here")

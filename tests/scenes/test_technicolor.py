@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from scenes.tiny_scene import write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -33,8 +33,8 @@ def root(tmp_path: Path) -> Path:
     (folder / CAMERAS).write_text("\n".join([HEADER, *map(row, range(COUNT))]) + "\n")
     for frame in FRAMES:
         for camera in range(COUNT):
-            image = np.full((HEIGHT, WIDTH, 3), (7, frame, camera), np.uint8)  # BGR
-            assert cv2.imwrite(str(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png"), image)
+            image = np.full((HEIGHT, WIDTH, 3), (camera, frame, 7), np.uint8)
+            write_image(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png", image)
     return folder
 
 
@@ -50,11 +50,7 @@ def test_cameras_times_and_splits(root: Path) -> None:
     torch.testing.assert_close(view.camera.K, torch.tensor([[10.0, 0, 3.5], [0, 15.0, 2.5], [0, 0, 1]]))
     assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
     assert scene.points is None
-
-
-def test_images_stay_in_eight_bits_unless_they_are_reduced(root: Path) -> None:
-    """Catches 21 GB for a scene of the release, and pixels that lose their fraction by the filter."""
-    assert scenes.load(root).train[0].pixels.dtype == torch.uint8
+    assert view.pixels.dtype == torch.uint8  # 21 GB of floats for a scene of the release
     half = scenes.load(root, downscale=2).train[0]
     assert half.pixels.dtype == torch.float32
     assert half.image.shape == (HEIGHT // 2, WIDTH // 2, 3)
@@ -81,42 +77,38 @@ def test_columns_are_read_by_name(root: Path) -> None:
     assert torch.equal(first.K, other.K)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda text: text.replace(HEADER, HEADER.replace(" qw", "")), "expected a header with"),
-        (lambda text: text.replace(" sk ", " sk d1 d2 ").replace("1.5 0.0 ", "1.5 0.0 0.1 0.0 "), "d1: expected 0"),
-        (lambda text: text.replace("1.5 0.0 ", "1.5 0.2 "), "sk: expected 0"),
-        (lambda text: text.replace("1.0 0.0 0.0 0.0", "2.0 0.0 0.0 0.0"), "unit quaternion"),
-        (lambda text: text.replace("10.0 ", "nan "), "f: expected a number"),
-        (lambda text: text.replace("10.0 ", "-1 "), "positive f"),
-        (lambda text: "\n".join(text.splitlines()[:9]), "more than 10 cameras"),
-        (lambda text: text.replace("2.5 ", ""), "expected 12 numbers"),
-        (lambda _: "", "expected a header"),
-        (lambda text: text + row(16), "16.png of every camera"),
-    ],
-)
-def test_faulty_parameters_are_told(root: Path, change: Callable[[str], str], message: str) -> None:
-    """Catches distorted originals taken for undistorted ones, and tables that are read askew."""
-    path = root / CAMERAS
-    path.write_text(change(path.read_text()))
+def table(change: Callable[[str], str]) -> Callable[[Path], object]:
+    """Change the text of the cameras' parameters."""
+    return lambda root: (root / CAMERAS).write_text(change((root / CAMERAS).read_text()))
+
+
+IMAGE = "Tiny_undist_00101_03.png"
+FAULTS: list[tuple[Callable[[Path], object], str]] = [
+    (table(lambda text: text.replace(HEADER, HEADER.replace(" qw", ""))), "expected a header with"),
+    (table(lambda text: text.replace(" sk ", " sk d1 d2 ").replace("1.5 0.0 ", "1.5 0.0 0.1 0.0 ")), "d1: expected 0"),
+    (table(lambda text: text.replace("1.5 0.0 ", "1.5 0.2 ")), "sk: expected 0"),
+    (table(lambda text: text.replace("1.0 0.0 0.0 0.0", "2.0 0.0 0.0 0.0")), "unit quaternion"),
+    (table(lambda text: text.replace("10.0 ", "nan ")), "f: expected a number"),
+    (table(lambda text: text.replace("10.0 ", "-1 ")), "positive f"),
+    (table(lambda text: "\n".join(text.splitlines()[:9])), "more than 10 cameras"),
+    (table(lambda text: text.replace("2.5 ", "")), "expected 12 numbers"),
+    (table(lambda _: ""), "expected a header"),
+    (table(lambda text: text + row(16)), "16.png of every camera"),
+    (lambda root: (root / IMAGE).unlink(), "undist_00101_03"),
+    (lambda root: write_image(root / IMAGE, np.zeros((4, 4, 3), np.uint8)), "expected 8x6"),
+    (
+        lambda root: (root / IMAGE).rename(root / "Other_undist_00101_03.png"),
+        "images of one .*, got those of Other, Tiny",
+    ),
+]
+
+
+@pytest.mark.parametrize(("apply", "message"), FAULTS)
+def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
+    """Catches distorted originals taken for undistorted ones, tables that are read askew, a missing view, one of
+    another size, and two scenes in one folder."""
+    apply(root)
     with pytest.raises(InputError, match=message):
-        scenes.load(root)
-
-
-def test_faulty_images_are_told(root: Path) -> None:
-    """Catches a missing view, one of another size, and two scenes in one folder."""
-    image = root / "Tiny_undist_00101_03.png"
-    kept = image.read_bytes()
-    image.unlink()
-    with pytest.raises(InputError, match="undist_00101_03"):
-        scenes.load(root)
-    assert cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(InputError, match="expected 8x6"):
-        scenes.load(root)
-    image.write_bytes(kept)
-    (root / "Other_undist_00101_03.png").write_bytes(kept)
-    with pytest.raises(InputError, match="images of one scene, got those of Other, Tiny"):
         scenes.load(root)
 
 

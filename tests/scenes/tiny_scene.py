@@ -8,25 +8,36 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gsbench.errors import InputError
+
 # An OpenGL camera at (0, 0, 4) that looks down its own -z axis at the origin.
 FRONT = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4.0], [0, 0, 0, 1.0]]
 # The same, from (4, 0, 0): x axis along -z of the world.
 SIDE = [[0, 0, 1.0, 4.0], [0, 1.0, 0, 0], [-1.0, 0, 0, 0], [0, 0, 0, 1.0]]
 COUNTS = {"train": 2, "val": 1, "test": 1}
+IMAGES = ("train/r_0.png", "train/r_1.png", "val/r_0.png", "test/r_0.png")
 
 
-def write_png(path: Path, rgba: np.ndarray) -> None:
-    """Write RGB or RGBA as PNG by OpenCV, whose order is BGR."""
+def write_image(path: Path, pixels: np.ndarray) -> None:
+    """Write grey [H, W], RGB or RGBA as PNG by OpenCV, whose order is BGR."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.concatenate([rgba[..., 2::-1], rgba[..., 3:]], axis=-1))
+    bgr = pixels if pixels.ndim == 2 else np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], axis=-1)
+    assert cv2.imwrite(str(path), bgr)
 
 
-def edit(root: Path, change: Callable[[dict[str, Any]], object], split: str = "train") -> None:
-    """Apply `change` to the content of transforms_<split>.json."""
-    source = root / f"transforms_{split}.json"
-    content = json.loads(source.read_text())
-    change(content)
-    source.write_text(json.dumps(content))
+def write_images(root: Path, pixels: np.ndarray) -> None:
+    """Write the same pixels as every image of the data set."""
+    for name in IMAGES:
+        write_image(root / name, pixels)
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], object], *splits: str) -> None:
+    """Apply `change` to the content of transforms_<split>.json, that of train if no split is named."""
+    for split in splits or ("train",):
+        source = root / f"transforms_{split}.json"
+        content = json.loads(source.read_text())
+        change(content)
+        source.write_text(json.dumps(content))
 
 
 def write_tiny(root: Path) -> Path:
@@ -35,9 +46,16 @@ def write_tiny(root: Path) -> Path:
     for split, count in COUNTS.items():
         frames = []
         for index in range(count):
-            write_png(root / split / f"r_{index}.png", random.integers(0, 256, (6, 8, 4), np.uint8))
+            write_image(root / split / f"r_{index}.png", random.integers(0, 256, (6, 8, 4), np.uint8))
             matrix = SIDE if index else FRONT
             frames.append({"file_path": f"./{split}/r_{index}", "time": float(index), "transform_matrix": matrix})
         content = {"camera_angle_x": 0.8, "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
     return root
+
+
+def check_message(error: InputError, *parts: str) -> None:
+    """Assert that an error is one line that names all these parts."""
+    assert "\n" not in str(error)
+    for part in parts:
+        assert part in str(error)
