@@ -1,10 +1,10 @@
-"""Write the tables of docs/licences.md from the metadata of installed packages, or print an SBOM with --sbom.
+"""Write the table of docs/licences.md from the metadata of installed packages, or print an SBOM with --sbom.
 
     python docs/site/licences.py
     python docs/site/licences.py --sbom > gsbench.cdx.json      # CycloneDX 1.6: what users install
 
-The tables say what is installed where they are written: run it in the .venv of `make test-all`, which has the versions
-of locks/.
+The table says what is installed where it is written: run it in the .venv of `make test-all`, which has the versions of
+locks/.
 """
 
 import json
@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
 OF_DEVELOPERS = ("docs", "dev")  # nothing of these is imported by gsbench
 # What no .venv of make has, as it would double its size.
 NOT_INSTALLED = {"tensorboard": "Apache-2.0", "wandb": "MIT", "mlflow": "Apache-2.0"}
-UNSAID = {"axe-playwright-python": "MIT"}  # packages whose metadata say nothing
+WITHOUT_METADATA = {"axe-playwright-python": "MIT"}
 NOTES = {
     "lpips": "its linear weights come in its wheel",
     "opencv-contrib-python-headless": "its wheel brings FFmpeg under LGPL-2.1, as a library of its own",
@@ -55,7 +56,7 @@ def name_of(requirement: str) -> str:
 
 
 def installed(requirements: Iterable[str], visited: set[str]) -> Iterator[metadata.Distribution]:
-    """Yield what requirements bring along, as far as it is installed here and not in `seen`, which is added to."""
+    """Yield what requirements bring along, as far as it is installed here and not in `visited`, which is added to."""
     for requirement in requirements:
         marker, name = Requirement(requirement).marker, name_of(requirement)
         if name in visited or (marker and not marker.evaluate({"extra": ""})):
@@ -71,18 +72,18 @@ def installed(requirements: Iterable[str], visited: set[str]) -> Iterator[metada
 
 def of_users() -> list[str]:
     """Return the requirements of gsbench and of all extras but those of developers."""
-    return [*PROJECT["project"]["dependencies"], *(requirement for extra in EXTRAS.keys() - {*OF_DEVELOPERS}
-            for requirement in EXTRAS[extra])]  # fmt: skip
+    extras = (EXTRAS[extra] for extra in EXTRAS.keys() - {*OF_DEVELOPERS})
+    return [*PROJECT["project"]["dependencies"], *chain.from_iterable(extras)]
 
 
 def direct() -> dict[str, str]:
     """Return what gsbench itself depends on, and for what: the core, an extra, or the build."""
-    groups_by_name: dict[str, str] = {}
+    group_of: dict[str, str] = {}
     groups = {"core": PROJECT["project"]["dependencies"], "build": PROJECT["build-system"]["requires"], **EXTRAS}
     for group in (*(name for name in groups if name not in OF_DEVELOPERS), *OF_DEVELOPERS):
         for requirement in groups[group]:
-            groups_by_name.setdefault(name_of(requirement), group)
-    return groups_by_name
+            group_of.setdefault(name_of(requirement), group)
+    return group_of
 
 
 def licence_of(distribution: metadata.Distribution) -> str:
@@ -90,34 +91,31 @@ def licence_of(distribution: metadata.Distribution) -> str:
     facts = distribution.metadata
     field = (facts.get("License") or "").strip()
     is_name = re.fullmatch(r"[A-Za-z0-9.+-]+( (AND|OR|WITH) [A-Za-z0-9.+-]+)*", field) and field != "UNKNOWN"
-    classifiers = [
+    names = [
         line.rpartition(" :: ")[2]
         for line in facts.get_all("Classifier") or []
         if line.startswith("License :: OSI Approved ::") or line == "License :: Public Domain"
     ]
-    short = ", ".join(SHORT.get(name, name.removesuffix(" License")) for name in classifiers)
-    unsaid = UNSAID.get(name_of(facts["Name"]), field.partition("\n")[0])
-    return facts.get("License-Expression") or (field if is_name else "") or short or unsaid
+    short = ", ".join(SHORT.get(name, name.removesuffix(" License")) for name in names)
+    missing = WITHOUT_METADATA.get(name_of(facts["Name"]), field.partition("\n")[0])
+    return facts.get("License-Expression") or (field if is_name else "") or short or missing
 
 
 def tables() -> str:
-    """Return the tables of the page: what gsbench depends on, and what that brings along to users."""
-    rows = ["| dependency | version | for | licence |", "| --- | --- | --- | --- |"]
-    for name, group in direct().items():
-        if name in NOT_INSTALLED:
-            version, licence = "", NOT_INSTALLED[name]
-        else:
-            try:
-                package = metadata.distribution(name)
-            except metadata.PackageNotFoundError:
-                sys.exit(f"licences: expected {name} to be installed, it is not: run make docs first")
-            version, licence = package.version.partition("+")[0], licence_of(package)
-        licence = f"**{licence}**" if "GPL" in licence else licence
-        rows.append(f"| {name} | {version} | {group} | {'; '.join(filter(None, (licence, NOTES.get(name))))} |")
-    rows += ["", "These bring along, to users:", "", "| package | version | licence |", "| --- | --- | --- |"]
-    for package in along():
-        rows.append(f"| {name_of(package.metadata['Name'])} | {package.version} | {licence_of(package)} |")
-    return "\n".join(rows)
+    """Return the table of the page, a row for each licence, and what is to be known of single packages."""
+    packages = dict.fromkeys(direct(), "") | {name_of(package.metadata["Name"]): "" for package in along()}
+    for name in packages:
+        try:
+            packages[name] = NOT_INSTALLED.get(name) or licence_of(metadata.distribution(name))
+        except metadata.PackageNotFoundError:
+            sys.exit(f"licences: expected {name} to be installed, it is not: run make docs first")
+    developers = {name for name, group in direct().items() if group in OF_DEVELOPERS}
+    rows = ["| licence | of users | of developers only |", "| --- | --- | --- |"]
+    for licence in sorted(set(packages.values())):
+        names = [name for name in sorted(packages) if packages[name] == licence]
+        users, others = (", ".join(n for n in names if (n in developers) is only) for only in (False, True))
+        rows.append(f"| {f'**{licence}**' if 'GPL' in licence else licence} | {users} | {others} |")
+    return "\n".join([*rows, "", *(f"- {name}: {note}." for name, note in NOTES.items())])
 
 
 def along() -> list[metadata.Distribution]:
@@ -131,19 +129,21 @@ def sbom() -> dict[str, Any]:
     """Return what users install here as a bill of materials in the format CycloneDX 1.6."""
 
     def component(kind: str, name: str, version: str, licence: str) -> dict[str, Any]:
-        return {"type": kind, "name": name, "version": version, "purl": f"pkg:pypi/{name}@{version}",
-                "licenses": [{"license": {"name": licence}}]}  # fmt: skip
+        facts = {"type": kind, "name": name, "version": version, "purl": f"pkg:pypi/{name}@{version}"}
+        return facts | {"licenses": [{"license": {"name": licence}}]}
 
     packages = {name_of(package.metadata["Name"]): package for package in installed(of_users(), set())}
     project = PROJECT["project"]
     return {
-        "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1,
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.6",
+        "version": 1,
         "metadata": {"component": component("application", project["name"], __version__, project["license"])},
         "components": [
             component("library", name, package.version, licence_of(package))
             for name, package in sorted(packages.items())
         ],
-    }  # fmt: skip
+    }
 
 
 def main(arguments: list[str]) -> None:

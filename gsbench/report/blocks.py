@@ -40,21 +40,6 @@ ABLATIONS = {
     "cholesky": "slices by a Cholesky factor", "no_time_split": "Gaussians split in space only",
     "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
 }  # fmt: skip
-QUICK = {
-    "recipe=quick": "",
-    "recipe=quick,iterations=6500,densify.max_gaussians=110000": ", 6,500 iterations, at most 110,000 Gaussians",
-    "recipe=quick,iterations=12000,densify.max_gaussians=110000": ", 12,000 iterations, at most 110,000 Gaussians",
-}
-TREX100 = "downscale=8,initial_points=20000,iterations=3000"
-RECIPES = {  # study, variant
-    "trex 100 × 100, 3,000 iterations, test": ("dnerf_trex100", TREX100),
-    "the same with `+recipe=long`": ("dnerf_trex100", f"recipe=long,{TREX100}"),
-    "the earlier suzanne, 1,000 iterations, test": ("old_suzanne", ""),
-    "4,000 iterations": ("old_suzanne", "iterations=4000"),
-    "4,000 iterations, `+recipe=long`": ("old_suzanne", "recipe=long,iterations=4000"),
-    "500 to 4,000 iterations, chosen on val (`train.lengths=4`)": ("old_suzanne", "iterations=4000,lengths=4"),
-    "lego 100 × 100, 1,000 iterations, val ([why](protocol.md#how-it-is-measured))": ("dnerf_lego100", None),
-}
 
 
 @cache
@@ -396,7 +381,7 @@ OF_TREX = (
 
 
 def trex400(published: Path) -> str:
-    """Return trex as the paper trains it, beside the paper's rows."""
+    """Return trex as the paper trains it, beside the paper's rows, and with other recipes."""
     of = mean(load(published / "dnerf").finished, *OF_TREX)  # a chapter has times of one machine
     rows = []
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
@@ -420,23 +405,14 @@ def trex400(published: Path) -> str:
                 "Gaussians": number(numbers.gaussians, 0),
             }
         )
-    for name in ("paper", "authors"):
-        row = _at_paper(of.loc[("7dgs_noagr", f"recipe={name},{AT_PAPER}")], gpu=False)
-        rows.append({"trex, 400 x 400": f"7dgs_noagr, `+recipe={name}`, CPU"} | row)
+    others = {
+        ("7dgs_noagr", "paper"): f"recipe=paper,{AT_PAPER}",
+        ("7dgs_noagr", "authors"): f"recipe=authors,{AT_PAPER}",
+    } | {(model, "quick"): "recipe=quick" for model in ("7dgs", "4dgs", "7dgs_noagr")}
+    for (model, name), variant in others.items():
+        row = _at_paper(of.loc[(model, variant)], gpu=False)
+        rows.append({"trex, 400 x 400": f"{model}, `+recipe={name}`, CPU"} | row)
     return block(rows, list(rows[0])[1:])
-
-
-def quick(published: Path) -> str:
-    """Return trex with `+recipe=quick`, and with other lengths and a limit of Gaussians."""
-    of = mean(load(published / "dnerf").finished, *OF_TREX)  # a chapter has times of one machine
-    rows = [
-        {"trex, 400 x 400": f"{model}{words}"} | _at_paper(of.loc[(model, variant)], gpu=False)
-        for variant, words in QUICK.items()
-        for model in ("7dgs", "4dgs", "7dgs_noagr")
-        if (model, variant) in of.index
-    ]
-    kept = [name for name in rows[0] if name not in ("best on test (leaks)", "training views")]
-    return block([{name: row[name] for name in kept} for row in rows], kept[1:])
 
 
 def trex200(published: Path) -> str:
@@ -446,19 +422,6 @@ def trex200(published: Path) -> str:
     table = of.xs("downscale=4,iterations=7000", level="variant").sort_values("psnr_db", ascending=False)[names]
     rank = (table.psnr_db == table.psnr_db.max()).astype(int)
     return markdown(Section("", "", "", table.assign(**{"psnr_db rank": rank}).reset_index()))
-
-
-def recipe(published: Path) -> str:
-    """Return PSNR by scene, length and recipe."""
-    rows = []
-    for title, (name, variant) in RECIPES.items():
-        of = mean(only(published, name), "psnr_db")
-        at = {
-            m: of.xs(m, level="model").iloc[0] if variant is None else of.loc[(m, variant)]
-            for m in ("7dgs", "7dgs_noagr", "4dgs")
-        }
-        rows.append({"": title} | {model: with_half(row) for model, row in at.items()})
-    return block(rows, list(rows[0])[1:])
 
 
 def on_demand(published: Path) -> str:
@@ -509,9 +472,7 @@ RESULTS: dict[str, Callable[[Path], str]] = {
     "suite_choices": suite_choices,
     "lengths": lengths,
     "ablation": ablation,
-    "recipe": recipe,
     "trex200": trex200,
     "trex400": trex400,
-    "quick": quick,
     "on_demand": on_demand,
 }
