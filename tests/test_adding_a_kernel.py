@@ -13,6 +13,7 @@ from tiny_run import ROOT, environment
 from benchmarks.against import WITHOUT_EDITABLE
 from gsbench import kernels
 
+PAGE = (ROOT / "docs/adding_a_kernel.md").read_text()
 CHECK = (
     f"{WITHOUT_EDITABLE}\n"
     + """
@@ -39,18 +40,22 @@ for x, a, b in zip(raw, got, want, strict=True):
 )
 
 
-def blocks() -> list[tuple[str, str | None, str]]:
-    """The example's files: path, the line that the text goes before (None: a new file), the text."""
-    page = (ROOT / "docs" / "adding_a_kernel.md").read_text()
-    listings = re.findall(r"^`(gsbench/[\w/]+\.\w+)`(?:, before `(.*?)`)?:\n\n```\w+\n(.*?)^```", page,
-                       flags=re.MULTILINE | re.DOTALL)  # fmt: skip
-    return [(path, before or None, text) for path, before, text in listings]
+def insertions() -> list[tuple[str, str, str]]:
+    """What the page inserts into files: path, the line that the text goes before, the text."""
+    listings = r"^`(gsbench/[\w/]+\.\w+)`, before `(.*?)`:\n\n```\w+\n(.*?)^```"
+    return re.findall(listings, PAGE, flags=re.MULTILINE | re.DOTALL)
+
+
+def files() -> list[tuple[Path, str]]:
+    """The example's files, and the folder into which the page puts each."""
+    rows = re.findall(r"\]\(\.\./(examples/kernel/[\w.]+)\) \| `(gsbench/kernels/\w*/?)`", PAGE)
+    return [(ROOT / file, folder) for file, folder in rows]
 
 
 def test_it_touches_fewer_than_eight_files() -> None:
     """Catches seams that cost more again: a kernel for a new slice once touched 22 files."""
-    assert len({path for path, _, _ in blocks()}) == 5
-    assert len(blocks()) == 6
+    assert sorted(path for path, _ in files()) == sorted((ROOT / "examples/kernel").iterdir())
+    assert len(files()) + len({path for path, _, _ in insertions()}) == 5
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja", "c++"))), reason="needs cmake, ninja and a compiler")
@@ -64,12 +69,11 @@ def test_the_worked_example_builds_and_differentiates(tmp_path: Path) -> None:
     (project / "tests/kernels").mkdir(parents=True)
     for path in (ROOT / "tests/kernels").glob("cuda_shim.*"):
         shutil.copy(path, project / "tests/kernels")
-    for path, before, text in blocks():
-        target = project / path
-        if before is None:
-            assert not target.exists()
-            target.write_text(text)
-            continue
+    for path, folder in files():
+        assert not (project / folder / path.name).exists()
+        shutil.copy(path, project / folder)
+    for name, before, text in insertions():
+        target = project / name
         whole = target.read_text()
         assert whole.count(before) == 1
         target.write_text(whole.replace(before, text + before))
