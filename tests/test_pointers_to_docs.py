@@ -15,11 +15,14 @@ SOURCES = sorted((ROOT / "gsbench").rglob("*.py"))
 
 
 def pointers_in(source: str) -> list[str]:
-    """What the calls in a source give as `docs=`, as text or by a constant of the module."""
+    """What a source gives as `docs=`, and its constants that point to a heading, which other modules may import."""
     nodes = list(ast.walk(ast.parse(source)))
     constants = {ast.unparse(node.targets[0]): node.value for node in nodes if isinstance(node, ast.Assign)}
     words = [word.value for node in nodes if isinstance(node, ast.Call) for word in node.keywords if word.arg == "docs"]
-    return [ast.literal_eval(constants.get(ast.unparse(word), word)) for word in words]
+    values = [constants.get(ast.unparse(word), word) for word in words]
+    here = [ast.literal_eval(value) for value in values if not isinstance(value, ast.Name)]  # others are imported
+    texts = [value.value for value in constants.values() if isinstance(value, ast.Constant)]
+    return here + [text for text in texts if isinstance(text, str) and ".md#" in text]
 
 
 def missing(pointer: str) -> bool:
@@ -41,6 +44,7 @@ def test_a_test_of_pointers_finds_them() -> None:
     """Catches a walk that sees no pointer, and a check that accepts any."""
     assert sum(len(pointers_in(path.read_text())) for path in SOURCES) > 30
     assert pointers_in("raise InputError(f'{x}', docs='data.md#fetching') from None") == ["data.md#fetching"]
+    assert pointers_in("PAGE = 'data.md#times'") == ["data.md#times"]
     assert pointers_in("PAGE = 'data.md'\nraise InputError('no images', docs=PAGE)") == ["data.md"]
     assert not missing("data.md#fetching")
     assert missing("data.md#fetched")
