@@ -14,11 +14,11 @@ from benchmarks.roofline import UNITS, Limits, limits
 from benchmarks.rows import SECTIONS
 from benchmarks.timing import Row, measure
 from gsbench import kernels
-from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit, versions
+from gsbench.reading import as_json
 
 HEADER = "| | median ms | p10 | p90 | wall ms | ns a pixel | target ms | least ms by the machine's limit | ratio |"
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from gsbench.as_json import as_json
 from gsbench.errors import how_to_install, one_line, printable
 from gsbench.measure.machine import hardware
 from gsbench.measure.provenance import git_commit
+from gsbench.reading import as_json
 from gsbench.version import __version__
 
 OK, ABSENT, BROKEN = "ok", "absent", "broken"  # absent: an optional part that is not there

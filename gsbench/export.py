@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import torch
 
-from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.process.memory import is_out_of_memory, require
+from gsbench.reading import as_json
 from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
 from gsbench.scenes import Camera, Scene, View

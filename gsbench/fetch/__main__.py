@@ -4,10 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line, printable
 from gsbench.fetch.sources import Source, find, sources
 from gsbench.process.ending import end_with
+from gsbench.reading import as_json
 
 
 def main(arguments: list[str] | None = None) -> int:

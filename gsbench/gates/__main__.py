@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from gsbench import scenes
-from gsbench.as_json import as_json
 from gsbench.config_roles import facts
 from gsbench.errors import InputError, one_line
 from gsbench.gates import messages
 from gsbench.gates.screen import screen_time
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
+from gsbench.reading import as_json
 
 BUDGET = facts("effects.budget_db")
 Answer = tuple[dict[str, Any], list[str]]  # the result of a command for JSON, and as lines

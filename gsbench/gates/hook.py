@@ -20,12 +20,12 @@ from gsbench.gates.sensitivity import MOST_VIEWS, probe, share_asleep, visible_t
 from gsbench.measure.exact_views import decides
 from gsbench.measure.quality import evenly
 from gsbench.measure.record import Direction, Gate
-from gsbench.measure.schema import parse
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import DIRECTION, EffectSets
 from gsbench.models.gated import as_gated, has_gates
 from gsbench.models.simplifications import STATIC, shares_of
+from gsbench.reading import parse
 from gsbench.scenes import View
 from gsbench.train.hooks import Hook, Training
 

@@ -14,12 +14,12 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsbench.as_json import as_json
 from gsbench.errors import InputError, printable
 from gsbench.launch import estimate, plan
 from gsbench.launch.plan import identity
 from gsbench.launch.status import BROKEN, GOING, STATES, Experiment, RunStatus, read, status
 from gsbench.process.ending import end_with
+from gsbench.reading import as_json
 from gsbench.run import stop
 
 WATCH_SECONDS = 10.0

@@ -5,21 +5,19 @@ contain the same overrides, so that runs are matched with files without composin
 """
 
 import contextlib
-import json
 import os
 import shutil
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from statistics import fmean
 
 from gsbench.config_roles import repeating
 from gsbench.measure.atomic import write_atomically
-from gsbench.measure.schema import parse
-from gsbench.reading import MAX_JSON, parse_json, read_file
+from gsbench.reading import as_json, read_json
 from gsbench.run.progress import born
 
 FOLDER, FILE_NAME, ENDED = ".sweep", "plan.json", "ended"
@@ -65,12 +63,12 @@ def folder_of(results: str, experiment: str) -> Path:
 
 def write(plan: Plan, folder: Path) -> None:
     """Write the plan of a sweep to plan.json in its folder."""
-    write_atomically(folder / FILE_NAME, (json.dumps(asdict(plan), indent=1) + "\n").encode())
+    write_atomically(folder / FILE_NAME, f"{as_json(plan)}\n".encode())
 
 
 def read(path: Path) -> Plan:
     """Read the plan of a sweep; an InputError names the file and the field that are not valid."""
-    return parse(Plan, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path), MOST_RUNS)
+    return read_json(Plan, path, most=MOST_RUNS)
 
 
 def find(experiment: Path) -> list[Path]:
@@ -92,7 +90,7 @@ def log_of(folder: Path, number: int) -> Path:
 
 def write_ended(folder: Path, number: int, ended: Ended) -> None:
     """Write the outcome of run `number` of the sweep whose plan is in `folder`."""
-    write_atomically(folder / ENDED / f"{number}.json", json.dumps(asdict(ended)).encode())
+    write_atomically(folder / ENDED / f"{number}.json", as_json(ended).encode())
 
 
 def read_ended(folder: Path) -> dict[int, Ended]:
@@ -100,9 +98,7 @@ def read_ended(folder: Path) -> dict[int, Ended]:
     outcomes = {}
     for path in (folder / ENDED).glob("*.json"):
         with contextlib.suppress(ValueError):  # InputError too
-            outcomes[int(path.stem)] = parse(
-                Ended, parse_json(read_file(path, str(path), MAX_JSON), str(path)), str(path)
-            )
+            outcomes[int(path.stem)] = read_json(Ended, path)
     return outcomes
 
 

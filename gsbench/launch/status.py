@@ -1,6 +1,5 @@
 """Determine the state of every run of an experiment, from its plans, the files of its runs and Slurm's queue."""
 
-import json
 import os
 import re
 import socket
@@ -8,7 +7,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from gsbench.errors import InputError, one_line
 from gsbench.launch import plan
@@ -268,14 +268,22 @@ def _files(folder: Path) -> Iterator[Path]:
                 yield path
 
 
+class _Outcome(msgspec.Struct):
+    """The keys of a record that say how its run ended; others are not looked at."""
+
+    status: str
+    reason: str | None
+    overrides: list[str]
+    metrics: dict[str, float | None] | None
+
+
 def record_status(path: Path) -> tuple[list[str], RecordStatus]:
     """Read the overrides and the outcome of a run from its record, much faster than by validating it all."""
     written = path.stat().st_mtime
     try:
-        plain: Any = json.loads(read_file(path, str(path), MAX_FILE))
-        state, reason, metrics = plain["status"], plain["reason"], plain["metrics"] or {}
-        overrides = list(map(str, plain["overrides"]))
-        return overrides, RecordStatus(path, str(state), reason and str(reason), metrics.get("psnr"), written)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        outcome = msgspec.json.decode(read_file(path, str(path), MAX_FILE), type=_Outcome)
+    except (InputError, msgspec.MsgspecError, RecursionError) as error:
         reason = f"{path} is damaged ({one_line(error)}): delete it"
         return [], RecordStatus(path, "failed", reason, None, written)
+    psnr = (outcome.metrics or {}).get("psnr")
+    return outcome.overrides, RecordStatus(path, outcome.status, outcome.reason, psnr, written)

@@ -21,9 +21,8 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.exact_views import MOST_PSNR
 from gsbench.measure.machine import Hardware, named
-from gsbench.measure.schema import parse
 from gsbench.measure.speed import RenderTimes
-from gsbench.reading import parse_json, read_file
+from gsbench.reading import parse, parse_json, read_file
 
 VERSION = 1
 LONGEST_NAME = 200  # bytes; of a scene, a model or an experiment, which are names of folders

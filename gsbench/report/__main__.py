@@ -5,10 +5,10 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gsbench.as_json import as_json
 from gsbench.errors import InputError, one_line, printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.process.ending import end_with
+from gsbench.reading import as_json
 from gsbench.report import live, output, paper_tables, reproduction, select
 from gsbench.report.frame import Results, load
 from gsbench.report.publish import publish

@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from gsbench.config import Config
 from gsbench.errors import InputError, one_line
-from gsbench.measure.schema import parse
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
+from gsbench.reading import parse
 from gsbench.run.settings import check_values
 from gsbench.run.setup import PACKAGE, build_with_placeholders, check_scene_names, load_scene
 from gsbench.scenes import Scene

@@ -11,7 +11,6 @@ import dataclasses
 import errno
 import fcntl
 import hashlib
-import json
 import os
 import socket
 import time
@@ -24,8 +23,7 @@ from typing import IO
 from gsbench.errors import InputError
 from gsbench.measure.atomic import create_atomically, write_atomically
 from gsbench.measure.curve import Point
-from gsbench.measure.schema import parse
-from gsbench.reading import parse_json, read_file
+from gsbench.reading import as_json, parse, parse_json, read_json
 
 FILE_NAME = "progress.json"
 STOPPED = "stopped.json"  # the progress of a run that a signal stopped; its process is gone
@@ -62,7 +60,7 @@ def write(folder: Path, progress: Progress) -> None:
 
 def encode(progress: Progress) -> bytes:
     """Return a progress as JSON."""
-    return json.dumps(dataclasses.asdict(progress), indent=1, allow_nan=False).encode()
+    return as_json(progress).encode()
 
 
 class Reporter:
@@ -100,20 +98,9 @@ class Reporter:
             return
 
 
-def write_stopped(folder: Path, progress: Progress) -> None:
-    """Write stopped.json in the folder of a run that a signal has stopped, atomically."""
-    stopped = dataclasses.replace(progress, updated=time.time())
-    write_atomically(folder / STOPPED, encode(stopped), lasting=False)
-
-
 def read(path: Path) -> Progress:
     """Read a progress.json or stopped.json; an InputError says why it is invalid."""
-    return decode(read_file(path, str(path), LARGEST), str(path))
-
-
-def decode(content: bytes, where: str) -> Progress:
-    """Return the progress in the content of the file `where`; an InputError says why it is invalid."""
-    return parse(Progress, parse_json(content, where), where)
+    return read_json(Progress, path, LARGEST)
 
 
 def is_alive(progress: Progress) -> bool:
@@ -192,7 +179,8 @@ def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) ->
             _, other = _read(path)
             if other is not None and _is_same_process(other, claim):
                 if is_stopped:
-                    write_stopped(folder, other)
+                    stopped = dataclasses.replace(other, updated=time.time())
+                    write_atomically(folder / STOPPED, encode(stopped), lasting=False)
                 path.unlink(missing_ok=True)
     except OSError:  # the folder cannot be written any more; the claim expires with this process
         return
@@ -205,7 +193,7 @@ def _read(path: Path) -> tuple[bytes | None, Progress | None]:
         if content is None:
             break
         try:
-            return content, decode(content, str(path))
+            return content, parse(Progress, parse_json(content, str(path)), str(path))
         except InputError:
             time.sleep(PAUSE)
     return content, None

@@ -10,9 +10,9 @@ from gsbench.config import Config
 from gsbench.errors import InputError, one_line
 from gsbench.measure.curve import Curve
 from gsbench.measure.exact_views import MOST_PSNR
-from gsbench.measure.schema import parse
 from gsbench.measure.speed import Effort, StageClock
 from gsbench.models import GaussianModel
+from gsbench.reading import parse
 from gsbench.scenes import Scene, View
 from gsbench.schedule import Schedule
 from gsbench.train.batches import Batches

@@ -55,7 +55,7 @@ COMMANDS = (
     "+exp=mini scene=suzanne model=auto effects.compare=true",
     "+exp=mini scene=suzanne model=7dgs effects.gate=both effects.budget_db=0.1",
     "+exp=mini scene=suzanne model=7dgs effects.gate=off",
-    "+exp=mini scene=suzanne model=4dgs optim=sparse_adam train.patience=0.2 train.lengths=4",
+    "+exp=mini scene=suzanne model=4dgs optim=sparse_adam train.lengths=4",
     "+exp=mini scene=suzanne model=6dgs +ablation=schur",
     "+exp=ablation scene=suzanne model=7dgs +ablation=no_agr",
     "+exp=mini scene=suzanne model=freetime train.penalties.strain.weight=0.5 train.penalties.strain.stop=100",
@@ -66,7 +66,7 @@ COMMANDS = (
     "+exp=dnerf data.root=/data scene=trex model=dgs protocol=dgs2026 +recipe=authors",
     "+exp=dnerf data.root=/data scene=lego +recipe=quick device=cuda",
     "+exp=frontier scene=pendulum model=6dgs train.densify.grad_threshold=4e-4",
-    "+exp=technicolor data.root=/data scene=Painter scene.frames=[0,49] protocol.quantise=true protocol.renders=3",
+    "+exp=technicolor data.root=/data scene=Painter scene.frames=[0,49] protocol.quantise=true protocol.renders=40",
     "+exp=tuning data.root=/data scene=suzanne +trial=late_harmonics train.average_from=800"
     " train.coarse=[[4,100],[2,300]]",
     "+exp=mini scene=suzanne model=7dgs model.lr.means.start=0.001 model.options.lambda_t=0.3 train.cooldown_from=900"

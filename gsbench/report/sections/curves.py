@@ -11,7 +11,7 @@ import pandas as pd
 from gsbench.config import TrainConfig
 from gsbench.errors import InputError
 from gsbench.measure.record import Record
-from gsbench.measure.schema import parse
+from gsbench.reading import parse
 from gsbench.report import paper
 from gsbench.report.frame import Results
 from gsbench.report.paper_protocol import has_images_of_paper

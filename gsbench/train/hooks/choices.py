@@ -79,7 +79,7 @@ def choices_in(state: dict[str, Any]) -> ChosenOnVal:
 
 def _parsed(state: object) -> ChosenOnVal:
     from gsbench.measure.record import LengthChoice, ModelComparison
-    from gsbench.measure.schema import parse
+    from gsbench.reading import parse
 
     kinds = {"length": LengthChoice, "comparison": ModelComparison}
     if not isinstance(state, dict) or state.keys() != kinds.keys():

@@ -100,7 +100,7 @@ class EarlyStop(Hook):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         from gsbench.measure.record import Stop
-        from gsbench.measure.schema import parse
+        from gsbench.reading import parse
 
         best, self._kept = state["best"], state["kept"]
         if best is not None and not (len(best) == 2 and isinstance(best[0], int) and isinstance(best[1], float)):
