@@ -40,9 +40,9 @@ TRAININGS: dict[str, tuple[str, ...]] = {
              "train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1",
              "train.coarse=[[2,20]]", "train.cooldown_from=50",
              "raster.antialias=true", "optim=sparse_adam", "train.patience=0.5", "seed=3"),
-    "7dgs": ("model=7dgs", "train.iterations=800", "train.densify.stop=17000", "train.densify.every=50",
-             "train.densify.max_gaussians=2000", "data.initial_points=100", "train.average_from=25000",
-             "effects.gate=both", "train.checkpoint_minutes=0.003"),
+    "7dgs": ("model=7dgs", "data.initial_lambda_t=0.05", "train.iterations=800", "train.densify.stop=17000",
+             "train.densify.every=50", "train.densify.max_gaussians=2000", "data.initial_points=100",
+             "train.average_from=25000", "effects.gate=both", "train.checkpoint_minutes=0.003"),
 }  # fmt: skip
 RESUMED = ("7dgs", 2)  # killed after so many checkpoints, again and again
 COMMANDS = (
@@ -55,7 +55,8 @@ COMMANDS = (
     "+exp=mini scene=suzanne model=auto effects.compare=true",
     "+exp=mini scene=suzanne model=7dgs effects.gate=both effects.budget_db=0.1",
     "+exp=mini scene=suzanne model=7dgs effects.gate=off",
-    "+exp=mini scene=suzanne model=4dgs optim=sparse_adam train.lengths=4",
+    "+exp=mini scene=suzanne model=4dgs optim=sparse_adam train.patience=0.2",
+    "+exp=mini scene=suzanne model=4dgs train.lengths=4",
     "+exp=mini scene=suzanne model=6dgs +ablation=schur",
     "+exp=ablation scene=suzanne model=7dgs +ablation=no_agr",
     "+exp=mini scene=suzanne model=freetime train.penalties.strain.weight=0.5 train.penalties.strain.stop=100",
