@@ -7,12 +7,11 @@ import os
 import random
 import subprocess
 import sys
-import time
 from importlib import metadata
 from pathlib import Path
 
 import pytest
-from hostile.mutations import damage_bytes, damage_json, double_a_key, replace_file
+from hostile.mutations import damage_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tiny_run import ROOT
@@ -115,20 +114,6 @@ def test_a_metric_that_is_not_finite_becomes_null_with_its_reason(tmp_path, valu
     assert read.curve == [Point(1, 1.0, None)]
 
 
-def test_a_curve_of_too_many_points_is_refused(tmp_path):
-    """Would catch a long record that is read for seconds and drawn for minutes."""
-    path = tmp_path / "record.json"
-    files.write(make(), path)
-    many = json.loads(path.read_text())
-    many["curve"] = [[i, float(i), 20.0] for i in range(100_000)]
-    path.write_text(json.dumps(many))
-    started = time.process_time()
-    refused(path, "curve: expected array of length <= 10000")
-    assert time.process_time() - started < 2
-    with pytest.raises(InputError, match="curve: expected array"):
-        files.write(make(curve=[Point(i, float(i), 20.0) for i in range(10_001)]), path)
-
-
 def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):
     """Would catch a failed run that cannot be recorded, and so would vanish from the table."""
     record = make(status="diverged", reason="step 3: means", metrics=None, missing={}, cost=None, per_view=[], curve=[])
@@ -152,6 +137,7 @@ def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):
         ({"protocol": {"far": math.inf}}, "protocol.far"),
         ({"protocol": {"path": Path("x")}}, "plain JSON"),
         ({"curve": [Point(2, 1.0, None), Point(1, 2.0, None)]}, "curve"),
+        ({"curve": [Point(i, float(i), 20.0) for i in range(10_001)]}, "curve: expected array"),
         ({"version": 2}, "version"),
         ({"seed": "0"}, "seed"),
         ({"effects": {"time": True}}, "effects: object missing required field direction"),
@@ -179,6 +165,7 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
         (["per_view", 0, "ssim"], [], ["per_view[0].ssim"]),
         (["curve", 1], [1, 2], ["curve[1]", "expected array of length 3, got 2"]),
         (["curve", 1, 0], 0.5, ["curve[1][0]"]),
+        (["curve"], [[i, i, 20] for i in range(100_000)], ["curve: expected array of length <= 10000"]),
         (["provenance", "versions", "python"], None, ["provenance.versions", "expected str, got null"]),
         (["model"], "\ud800", ["model", "Unicode"]),
         (["version"], 2, ["version", "expected 1"]),
@@ -215,25 +202,14 @@ def test_what_is_no_record_is_refused(tmp_path, text):
     refused(path)
 
 
-DAMAGES = {
-    "values": lambda r, content: (damage_json(r, content), json.dumps(content).encode())[1],
-    "bytes": lambda r, content: damage_bytes(r, json.dumps(content).encode())[0],
-    "a key twice": lambda r, content: double_a_key(r, json.dumps(content).encode())[0],
-}
-
-
-@pytest.mark.parametrize("damage", [*DAMAGES, "another file"])
-def test_a_damaged_record_is_read_or_refused(tmp_path, damage):
+def test_a_damaged_record_is_read_or_refused(tmp_path):
     """Would catch any exception but InputError, a message of several lines, and a record that is read and cannot be
     written again: JSON of any values, truncated and changed bytes, keys twice, links, folders and pipes for files."""
-    files.write(make(), tmp_path / "whole.json")
-    text, refusals = (tmp_path / "whole.json").read_text(), 0
-    for seed in range(400 if damage in DAMAGES else 40):
-        r, path = random.Random(f"{damage} {seed}"), tmp_path / str(seed) / "record.json"
-        path.parent.mkdir()
-        path.write_bytes(DAMAGES[damage](r, json.loads(text)) if damage in DAMAGES else text.encode())
-        if damage not in DAMAGES:
-            replace_file(r, path)
+    refusals = 0
+    for seed in range(400):
+        path = tmp_path / str(seed) / "record.json"
+        files.write(make(), path)
+        damage_file(random.Random(seed), path)
         try:
             record = files.read(path)
         except InputError as error:
@@ -243,7 +219,7 @@ def test_a_damaged_record_is_read_or_refused(tmp_path, damage):
         else:
             files.write(record, tmp_path / "again.json")
             assert files.read(tmp_path / "again.json") == record
-    assert refusals > 20
+    assert 200 < refusals < 400
 
 
 def test_a_failure_while_writing_leaves_the_old_record(tmp_path, monkeypatch):
@@ -316,28 +292,11 @@ def test_git_ignores_what_this_machine_measured_and_nothing_that_is_published():
     assert done.stdout.split() == ignored
 
 
-def test_the_commit_is_that_of_this_checkout():
-    """Would catch the commit of the folder the run was started in, and changes to tracked files kept quiet."""
-    here = Path(files.__file__).parent
-    git = ["git", "-C", str(here)]
-    tracked = subprocess.run([*git, "ls-files", "--error-unmatch", "record.py"], capture_output=True, check=False)
-    if tracked.returncode:
-        pytest.skip("gsbench is not in a git checkout here")
-    head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-    assert git_commit() in (head, f"{head}-dirty")
-
-
 def test_a_record_has_the_commit_of_the_code_that_ran(monkeypatch):
     """Would catch a commit that was made during a long training, and that its record says instead."""
     first = provenance(config={}, data_hash="", threads=1).git_commit
     monkeypatch.setattr("gsbench.measure.provenance.git_commit", lambda: "made since")
     assert provenance(config={}, data_hash="", threads=1).git_commit == first
-
-
-def test_the_commit_is_unknown_where_git_is_missing(monkeypatch):
-    """Would catch a run on a machine without git that ends in an exception after hours of training."""
-    monkeypatch.setenv("PATH", "")
-    assert git_commit() is None
 
 
 def test_records_and_tables_do_not_import_torch():
@@ -351,7 +310,8 @@ def test_records_and_tables_do_not_import_torch():
 
 
 def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches records called dirty because another's record was written over, and changed or new code that is not."""
+    """Catches the commit of the folder a run was started in, records called dirty because another's was written over,
+    changed or new code that is not, and a run without git that ends in an exception."""
     place = tmp_path / "gsbench/measure/provenance.py"
     for path in (place, tmp_path / "results/record.json", tmp_path / "README.md"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -359,7 +319,9 @@ def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.Monkey
     for words in (["init", "-q"], ["add", "-A"], ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x"]):
         subprocess.run(["git", *words], cwd=tmp_path, check=True)
     monkeypatch.setattr("gsbench.measure.provenance.__file__", str(place))
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
     clean = git_commit()
+    assert clean == head.stdout.strip()
     (tmp_path / "results/record.json").write_text("2")
     (tmp_path / "README.md").write_text("2")
     (tmp_path / "data.npy").write_text("2")
@@ -370,6 +332,8 @@ def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.Monkey
     added.unlink()
     place.write_text("2")
     assert git_commit() == f"{clean}-dirty"
+    monkeypatch.setenv("PATH", "")
+    assert git_commit() is None
 
 
 @pytest.fixture
@@ -389,8 +353,9 @@ def system(tmp_path, monkeypatch):
 EPYC = "processor\t: {n}\ncpu family\t: {family}\nmodel\t\t: 1\nmodel name\t: AMD EPYC\nstepping\t: 1\n\n"
 
 
-def test_processors_of_one_name_are_told_apart(system):
-    """Would catch generations of EPYC that pool silently: their names are alike, their seconds are not."""
+def test_a_machine_is_what_seconds_depend_on(system):
+    """Would catch generations of EPYC that pool silently, whose seconds differ as their names do not, "1 threads", a
+    machine that is another after each boot, and a run lost for want of a family, on aarch64 or without /proc."""
     zen3, zen5 = (system("".join(EPYC.format(n=n, family=f) for n in range(2)), instruction_set="v3") for f in (25, 26))
     assert str(zen3) == "AMD EPYC family 25 model 1 stepping 1, 2 cores, v3, 24 GiB"
     assert str(zen5) == "AMD EPYC family 26 model 1 stepping 1, 2 cores, v3, 24 GiB"
@@ -399,16 +364,10 @@ def test_processors_of_one_name_are_told_apart(system):
     assert of.machine != dataclasses.replace(of, hardware=zen5).machine
     assert of.machine != dataclasses.replace(of, hardware=dataclasses.replace(zen3, instruction_set="v2")).machine
     assert dataclasses.replace(of, device="A GPU").machine == f"A GPU in {zen3}, 2 threads"
-
-
-def test_a_boot_makes_no_other_machine(system):
-    """Would catch a machine whose seconds no longer compare with its own: the system keeps some MB more or fewer."""
-    cpuinfo = EPYC.format(n=0, family=25)
+    plain = make().provenance
+    assert [dataclasses.replace(plain, threads=n).machine for n in (1, 2)] == ["a CPU, 1 thread", "a CPU, 2 threads"]
+    cpuinfo = EPYC.format(n=0, family=25)  # the system keeps some MB more or fewer at each boot
     assert system(cpuinfo, "24684092 kB") == system(cpuinfo, "24690001 kB") != system(cpuinfo, "32690001 kB")
-
-
-def test_a_system_that_says_little_is_described(system):
-    """Would catch a run lost on aarch64, or where /proc is hidden, for want of a family."""
     arm = "processor\t: 0\nCPU implementer\t: 0x41\nCPU part\t: 0xd0c\nCPU revision\t: 1\n"
     assert "family 0x41 model 0xd0c stepping 1, 2 cores" in str(system(arm))
     assert str(system("", "?")).endswith(", 2 cores")
@@ -424,10 +383,3 @@ def test_a_record_without_its_machine_is_read(tmp_path):
     del plain["provenance"]["hardware"]
     path.write_text(json.dumps(plain))
     assert files.read(path).provenance.machine == "a CPU, 2 threads"
-
-
-def test_a_machine_is_named_by_its_threads() -> None:
-    """Catches "1 threads" on every page, and seconds of different numbers of threads taken for one machine's."""
-    of = make().provenance
-    assert of.machine == "a CPU, 2 threads"
-    assert dataclasses.replace(of, threads=1).machine == "a CPU, 1 thread"

@@ -12,18 +12,27 @@ from gsbench.measure import speed
 from gsbench.measure.curve import Curve, Point
 
 
-def test_render_times_are_percentiles_after_warm_up(monkeypatch):
-    """Would catch warm-up calls in the figures, percentiles taken wrongly, and an FPS that is not 1000 / median."""
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands still unless seconds are added to its only entry."""
     now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    return now
+
+
+def test_render_times_are_percentiles_after_warm_up(clock):
+    """Would catch warm-up calls in the figures, percentiles taken wrongly, an FPS that is not 1000 / median, and one of
+    a handful of frames."""
     costs = iter([100.0] * 5 + list(range(1, 32)))  # warm-up is slow, then 1..31 ms
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0] / 1000)
 
     def render(_: int) -> None:
-        now[0] += next(costs)
+        clock[0] += next(costs) / 1000
 
     times = speed.time_renders(render, count=31, warmup=5)
     assert (times.p10, times.p50, times.p90) == pytest.approx((4, 16, 28))
     assert times.fps == pytest.approx(1000 / 16)
+    with pytest.raises(InputError, match="30"):
+        speed.time_renders(lambda _: None, count=29)
 
 
 def test_the_device_is_waited_for_inside_the_timed_region():
@@ -33,29 +42,28 @@ def test_the_device_is_waited_for_inside_the_timed_region():
     assert events == [event for i in range(30) for event in ("wait", f"render {i}", "wait")]
 
 
-def test_too_few_renders_are_refused():
-    """Would catch an FPS from a handful of frames."""
-    with pytest.raises(InputError, match="30"):
-        speed.time_renders(lambda _: None, count=29)
+def test_stages_survive_a_resume_and_do_not_nest(clock):
+    """Would catch a resumed run whose stages start at zero, a stage whose time is lost when its body raises, and
+    seconds counted twice, so that stage_s adds up to more than train_s."""
 
-
-def test_stages_add_up_and_survive_a_resume(monkeypatch):
-    """Would catch a resumed run whose stages start at zero, and a stage whose time is lost when its body raises."""
-    now = iter(range(100))
-    monkeypatch.setattr(time, "perf_counter", lambda: float(next(now)))
-    stages = speed.StageClock()
-    for name in ("slice", "raster", "slice"):
+    def work(stages, name, error=None):
         with stages(name):
-            pass
-    with pytest.raises(KeyError), stages("loss"):
-        raise KeyError
+            clock[0] += 1
+            if error is not None:
+                raise error
+
+    stages, resumed = speed.StageClock(), speed.StageClock()
+    for name in ("slice", "raster", "slice"):
+        work(stages, name)
+    with pytest.raises(KeyError):
+        work(stages, "loss", KeyError())
     assert stages.seconds == {"slice": 2.0, "raster": 1.0, "loss": 1.0}
-    resumed = speed.StageClock()
     resumed.load_state_dict(stages.state_dict())
-    with resumed("slice"):
+    work(resumed, "slice")
+    assert (resumed.seconds["slice"], stages.seconds["slice"]) == (3.0, 2.0)
+    with pytest.raises(InputError, match="'b' was opened inside 'a'"), stages("a"), stages("b"):
         pass
-    assert resumed.seconds["slice"] == 3.0
-    assert stages.seconds["slice"] == 2.0
+    work(stages, "b")  # and the refusal does not leave "a" open
 
 
 def test_effort_adds_up_and_survives_a_resume(monkeypatch):
@@ -99,13 +107,12 @@ def test_an_effort_that_is_not_known_is_none(fault, monkeypatch):
     assert (effort.cpu_s, effort.load) == (None, None)
 
 
-def test_laps_are_all_of_the_time(monkeypatch):
+def test_laps_are_all_of_the_time(clock):
     """Would catch time between two stages that counts for neither, and a stage that comes again and starts anew."""
-    now = iter([0.0, 1.0, 3.0, 7.0, 15.0])
-    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
     laps = speed.Laps()
-    for name in ("slice", "raster", "slice", "loss"):
+    for name, seconds in (("slice", 1.0), ("raster", 2.0), ("slice", 4.0), ("loss", 8.0)):
         assert not laps.has("loss")
+        clock[0] += seconds
         laps.end(name)
     assert laps.has("loss")
     assert list(laps.seconds.items()) == [("slice", 5.0), ("raster", 2.0), ("loss", 8.0)]
@@ -160,14 +167,12 @@ def test_workers_share_the_time_they_took_together():
     assert sum(stages.seconds.values()) == pytest.approx(6.5)
 
 
-def test_stages_add_up_to_the_wall_clock(monkeypatch):
+def test_stages_add_up_to_the_wall_clock(clock):
     """Would catch work between stages that no stage has, work of threads that counts twice, and time outside of
     `running` that counts at all."""
-    now = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
-    def work(seconds: float) -> None:
-        now[0] += seconds
+    def work(seconds):
+        clock[0] += seconds
 
     stages = speed.StageClock()
     for _ in range(2):
@@ -177,8 +182,8 @@ def test_stages_add_up_to_the_wall_clock(monkeypatch):
                 work(1.0)
             work(0.2)
             with stages.side_by_side(2) as clocks:
-                for clock in clocks:
-                    with clock("raster"):
+                for worker in clocks:
+                    with worker("raster"):
                         work(2.0)
                 work(0.5)
             work(0.3)
@@ -190,15 +195,6 @@ def test_stages_add_up_to_the_wall_clock(monkeypatch):
     with stages("gate"):  # after the loop
         work(7.0)
     assert sum(stages.seconds.values()) == pytest.approx(21.0)
-
-
-def test_stages_do_not_nest():
-    """Would catch seconds counted twice, so that stage_s adds up to more than train_s."""
-    stages = speed.StageClock()
-    with pytest.raises(InputError, match="'b' was opened inside 'a'"), stages("a"), stages("b"):
-        pass
-    with stages("b"):  # and the refusal does not leave "a" open
-        pass
 
 
 def test_peak_memory_sees_an_allocation_and_can_start_anew():
@@ -235,30 +231,20 @@ def test_on_a_gpu_the_stage_that_caused_the_work_pays_for_it():
     assert speed.peak_memory("cuda") >= 4096 * 4096 * 4
 
 
-def test_the_curve_answers_best_last_and_time_to_accuracy():
-    """Would catch interpolation between points that were never measured, and a best that NaN wins."""
-    curve = Curve()
-    assert curve.best is None
-    assert curve.last is None
+def test_the_curve_answers_best_last_and_time_to_accuracy(tmp_path):
+    """Would catch interpolation between points that were never measured, a best that NaN wins, a resume that adds
+    points twice, and a state that weights_only=True refuses to load."""
+    curve, resumed = Curve(), Curve()
+    assert curve.best is curve.last is None
     for iteration, seconds, psnr in ((100, 1.0, 20.0), (200, 2.0, 24.0), (300, 3.0, float("nan")), (400, 4.0, 24.0)):
         curve.add(iteration, seconds, psnr)
-    assert curve.best == Point(400, 4.0, 24.0)  # of equal ones the last
-    assert curve.last == Point(400, 4.0, 24.0)
+    assert curve.best == curve.last == Point(400, 4.0, 24.0)  # of equal ones the last
     assert curve.points[2].psnr_val is None
-    assert curve.seconds_to(20.0) == 1.0
-    assert curve.seconds_to(20.1) == 2.0
-    assert curve.seconds_to(24.1) is None
-
-
-def test_a_curve_continues_from_its_checkpoint_and_never_goes_back(tmp_path):
-    """Would catch a resume that adds points twice, or a state that weights_only=True refuses to load."""
-    curve = Curve()
-    curve.add(100, 1.0, 20.0)
+    assert [curve.seconds_to(psnr) for psnr in (20.0, 20.1, 24.1)] == [1.0, 2.0, None]
     torch.save(curve.state_dict(), tmp_path / "state.pt")
-    resumed = Curve()
     resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert resumed.points == curve.points
-    for iteration, seconds in ((100, 2.0), (200, 0.5)):
+    for iteration, seconds in ((400, 5.0), (500, 3.5)):
         with pytest.raises(InputError, match="checkpoint"):
             resumed.add(iteration, seconds, 21.0)
 

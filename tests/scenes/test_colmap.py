@@ -325,6 +325,7 @@ ROWS = "".join(f"{name},{i}\n" for i, name in enumerate(NAMES))
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no cameras": (lambda taken: (taken / "sparse/0/cameras.txt").unlink(), r"cameras\.bin or cameras\.txt"),
     "no points": (lambda taken: (taken / "sparse/0/points3D.txt").write_text("# none\n"), "at least one point"),
+    "no images": (lambda taken: (taken / "sparse/0/images.txt").write_text("# none\n"), "at least one image"),
     "fisheye": (text("cameras", "PINHOLE", "OPENCV_FISHEYE"), "OPENCV_FISHEYE.*colmap image_undistorter"),
     "unknown model": (text("cameras", "PINHOLE", "LENS\t"), "got 'LENS'"),
     "too few parameters": (text("cameras", " 9.5", ""), "PINHOLE with fx fy cx cy"),
