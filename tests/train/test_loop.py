@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from tiny_run import ROOT
 from tiny_training import compose, train, trainer
 
 from gsbench.errors import InputError
@@ -14,7 +13,7 @@ from gsbench.kernels.adam import adam_all
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.run.settings import check_values
-from gsbench.train.hooks import Hook, hook_types
+from gsbench.train.hooks import Hook
 from gsbench.train.hooks.best import Best
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import rate_at
@@ -142,12 +141,6 @@ def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: 
     assert fitted.step == 10
     assert fitted.stages.seconds == pytest.approx({"loss": 20.0, "other": 10.0})
     assert [(p.iteration, p.seconds) for p in fitted.curve.points] == [(n, 3.0 * n) for n in (2, 4, 6, 8, 10)]
-
-
-def test_every_hook_is_in_the_table_of_the_docs() -> None:
-    """Catches a hook that no page names."""
-    page = (ROOT / "docs/adding_a_training_option.md").read_text()
-    assert [hook.name for hook in hook_types() if f"`{hook.name}`" not in page] == []
 
 
 def test_a_hook_has_a_name() -> None:
