@@ -71,14 +71,12 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def load(path: Path, out: Path, data_root: str | None = None) -> Subject:
-    """Load a model with its views.
-
-    Args:
-        path: the folder of a run, or a PLY of 3DGS. A run is measured in its evaluated views; without its data set, or
-            from a PLY, in views on an orbit, of which there are no photographs.
-        out: the folder in which a PLY's picture is written; a run's picture lies in its own folder.
-        data_root: the folder of the data set, if it is not the one in the run's settings.
+def load(
+    path: Path,  # the folder of a run, or a PLY of 3DGS
+    out: Path,  # the folder of a PLY's picture; a run's lies in its folder
+    data_root: str | None = None,  # of the data set, if it has moved
+) -> Subject:
+    """Load a model with its evaluated views; without data set, or from a PLY, with views of an orbit, no photographs.
 
     Raises:
         InputError: the folder has no checkpoint, or the file is not a PLY of trained Gaussians.

@@ -1,7 +1,7 @@
 """Measure the error of float32 in the images of a model: its bound, its change of PSNR, and the Gaussians behind it."""
 
+import copy
 import math
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -12,17 +12,17 @@ from torch import Tensor
 
 from gsbench.errors import InputError, one_line
 from gsbench.kernels.raster import Viewport
-from gsbench.measure.images import STEPS, Pixels, rounding_image
+from gsbench.measure.images import STEPS
 from gsbench.measure.quality import capped_psnr, evenly
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.joint import JointModel
+from gsbench.models.render import rasterize_slice
 from gsbench.models.slicing import reduce, subtract
 from gsbench.raster import EPS2D, FAR, NEAR
-from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U
+from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U, exact_image
 from gsbench.raster.reference import project
 from gsbench.scenes.scene import Camera, View
-from gsbench.stability.float64_render import float64_camera, float64_image, float64_model, render_twice
 
 VIEWS = 3  # of a run's `psnr_float32`, evenly spaced; a view takes ten to twenty times as long as a frame
 WORST = 10  # Gaussians that are listed
@@ -100,16 +100,13 @@ class Exactness:
 
 
 def measure(
-    model: GaussianModel, shots: Sequence[Shot], background: Sequence[float], title: str, antialias: bool = False
+    model: GaussianModel,  # trained, on the CPU
+    shots: Sequence[Shot],
+    background: Sequence[float],  # [3]
+    title: str,
+    antialias: bool = False,  # as in `gsbench.raster.rasterize`
 ) -> Exactness:
     """Render each shot in float32 by the CPU kernels and in float64, and compare.
-
-    Args:
-        model: a trained model on the CPU, float32.
-        shots: the cameras and times, at least one.
-        background: the background colour, three numbers.
-        title: the name of the model in reports.
-        antialias: whether opacities are scaled by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
 
     Raises:
         InputError: there is no shot, or the CPU kernels are not installed.
@@ -179,18 +176,81 @@ def psnr_float32(
     return max(changes), ""
 
 
+# ---- the same image in float32 and in float64
+
+
+class RenderedTwice(NamedTuple):
+    """The images of one view in float32 and in float64, and the 3D Gaussians in float64."""
+
+    image: Tensor  # [H, W, 3] float32
+    gaussians: Gaussians3D  # float64
+    exact: ExactImage
+
+
+def check_exactness(model: GaussianModel) -> None:
+    """Raise InputError if the images of a model have no bound on the error of float32: they need the CPU kernels."""
+    means = model.splats["means"]
+    if means.device.type != "cpu":
+        raise InputError(f"expected a model on the CPU, whose kernels have a float64 twin, got one on "
+                         f"{means.device}: start the viewer with --device cpu")  # fmt: skip
+    if not model.backend.serves(means):
+        raise InputError("expected the CPU kernels, which have a float64 twin, but they are not built in this "
+                         "installation: reinstall with a C++20 compiler",
+                         docs="install.md#without-a-compiler")  # fmt: skip
+
+
+def float64_model(model: GaussianModel) -> GaussianModel:
+    """Return a copy of a float32 model on the CPU that computes in float64."""
+    return copy.deepcopy(model).double()
+
+
+def float64_camera(camera: Camera) -> Camera:
+    """Return a camera whose matrices are float64; its position is computed in float64 too."""
+    return Camera(camera.viewmat.double(), camera.K.double(), camera.width, camera.height)
+
+
+@torch.inference_mode()
+def render_twice(
+    model: GaussianModel,
+    double: GaussianModel,  # its `float64_model`
+    camera: Camera,
+    time: float | None,
+    background: Tensor,  # [3] float32
+    antialias: bool,
+) -> RenderedTwice:
+    """Render a view of a model in float32, and of its copy in float64.
+
+    Raises:
+        InputError: the CPU kernels are not installed, or a Gaussian has a value that is not finite.
+    """
+    single = model.slice(CameraTime.of(camera, time))
+    image = rasterize_slice(single, camera, background, model.backend, antialias).image[0]
+    gaussians = double.slice(CameraTime.of(float64_camera(camera), time))
+    return RenderedTwice(image, gaussians, float64_image(gaussians, single, camera, background, antialias))
+
+
+def float64_image(
+    gaussians: Gaussians3D,  # float64
+    single: Gaussians3D,  # the same in float32
+    camera: Camera,
+    background: Tensor,  # [3] float32
+    antialias: bool,
+) -> ExactImage:
+    """Render 3D Gaussians in float64, and bound the error of their image in float32; see `exact_image`."""
+    return exact_image(gaussians, single, camera.viewmat, camera.K, camera.width, camera.height,
+                       background=background, antialias=antialias)  # fmt: skip
+
+
 # ---- which Gaussians, and why
 
 
-def blame(double: GaussianModel, gaussians: Gaussians3D, shot: Shot, exact: ExactImage) -> list[Culprit]:
-    """Return the Gaussians with the largest shares of the bounds in a view, and what makes each of them hard.
-
-    Args:
-        double: the model in float64.
-        gaussians: its 3D Gaussians in this view.
-        shot: the camera and the time.
-        exact: the exact image.
-    """
+def blame(
+    double: GaussianModel,
+    gaussians: Gaussians3D,  # its slice for this shot, float64
+    shot: Shot,
+    exact: ExactImage,
+) -> list[Culprit]:
+    """Return the Gaussians with the largest shares of the bounds in a view, and what makes each of them hard."""
     blamed = exact.culprit.flatten() >= 0
     ids = exact.culprit.flatten()[blamed].long()
     bounds, branches = exact.bound.flatten()[blamed], exact.branches.flatten()[blamed]
@@ -260,56 +320,3 @@ def conditioning(double: GaussianModel) -> Conditioning | None:
 
 def _is_indefinite(cov: Tensor) -> Tensor:
     return torch.linalg.eigvalsh(cov)[:, 0] < 0
-
-
-# ---- a frame of the viewer
-
-
-class Float32Error(NamedTuple):
-    """The bound on the error of float32 in a frame: its image, and a summary in steps of 8 bits, 1/255."""
-
-    image: Pixels  # [H, W, 3] RGB, on the scale of `gsbench.measure.images.rounding_image`
-    largest: float  # bound of a pixel
-    median: float  # bound of the pixels that show a Gaussian
-    undecided: float  # share of the pixels in which rounding may decide what is blended, or in which order
-    seconds: float  # that it took
-
-
-@torch.inference_mode()
-def float32_error(
-    double: GaussianModel,
-    single: Gaussians3D,
-    query: CameraTime,
-    camera: Camera,
-    background: Tensor,  # [3] float32
-    antialias: bool,
-) -> Float32Error:
-    """Bound the error of each pixel of a float32 image.
-
-    Args:
-        double: the model in float64; used by one thread at a time.
-        single: the slice of the float32 model that the image shows.
-        query: the viewpoint and the time of that slice, float64.
-        camera: the camera of the image.
-        background: the background colour.
-        antialias: whether opacities are scaled, as in `gsbench.raster.rasterize`.
-
-    Raises:
-        InputError: the model does not compute in float64, or a Gaussian has a value that is not finite.
-    """
-    start = time.perf_counter()
-    try:
-        gaussians = double.slice(query)
-    except InputError:
-        raise
-    except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
-        raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
-    exact = float64_image(gaussians, single, camera, background, antialias)
-    bound = STEPS * exact.bound
-    return Float32Error(
-        rounding_image(bound.numpy()),
-        largest=float(bound.max()),
-        median=STEPS * exact.median_bound,
-        undecided=float(exact.undecided.double().mean()),
-        seconds=time.perf_counter() - start,
-    )

@@ -1,6 +1,7 @@
 """Render and time one frame of the viewer: a model as the controls ask for it, or two models in one image."""
 
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -9,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsbench.errors import InputError, one_line
 from gsbench.gates.gate import most_cost
 from gsbench.gates.picture import cost_colors, effect_set_colors
 from gsbench.kernels.operation import Operation
 from gsbench.kernels.tape import Tape
-from gsbench.measure.images import Pixels, inferno, to_bytes
+from gsbench.measure.images import STEPS, Pixels, inferno, rounding_image, to_bytes
 from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
 from gsbench.models.camera_time import CameraTime
@@ -21,8 +23,7 @@ from gsbench.models.render import rasterize_slice
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
-from gsbench.stability.float32_error import Float32Error, float32_error
-from gsbench.stability.float64_render import check_exactness, float64_camera, float64_model
+from gsbench.stability.float32_error import check_exactness, float64_camera, float64_image, float64_model
 from gsbench.view.labels import measurements, short_names
 
 SLICE, RASTER = "slice", "raster"  # compute the 3D Gaussians at a time and a viewpoint, and rasterize them
@@ -69,6 +70,16 @@ class Frame(NamedTuple):
     def ms(self, part: str) -> float:
         """Return the milliseconds of SLICE or RASTER, summed over the models."""
         return sum(cost.of(part) for cost in self.costs)
+
+
+class Float32Error(NamedTuple):
+    """The bound on the error of float32 in a frame: its image, and a summary in steps of 8 bits, 1/255."""
+
+    image: Pixels  # [H, W, 3] RGB, on the scale of `gsbench.measure.images.rounding_image`
+    largest: float  # bound of a pixel
+    median: float  # bound of the pixels that show a Gaussian
+    undecided: float  # share of the pixels in which rounding may decide what is blended, or in which order
+    seconds: float  # that it took
 
 
 class StageWatch(Tape):
@@ -144,16 +155,30 @@ class FrameRenderer:
             InputError: there is no such bound: the model is on a GPU, the CPU kernels are not built, or the model does
                 not compute in float64.
         """
-        run, center = self.run, request.center
+        run, center, start = self.run, request.center, time.perf_counter()
         check_exactness(run.model)
-        with self._exact_lock:
-            with self._lock, torch.inference_mode():
+        with self._exact_lock, torch.inference_mode():
+            with self._lock:
                 self._exact = self._exact or float64_model(run.model)
                 run.model.active = self._exact.active = self._active(request)
                 single = run.model.slice(CameraTime.at(camera.center if center is None else center, request.time))
             query = CameraTime.at(float64_camera(camera).center if center is None else center.double(), request.time)
-            background = self._background(request)
-            return float32_error(self._exact, single, query, camera, background, run.config.raster.antialias)
+            try:
+                gaussians = self._exact.slice(query)
+            except InputError:
+                raise
+            except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
+                raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
+            antialias = run.config.raster.antialias
+            exact = float64_image(gaussians, single, camera, self._background(request), antialias)
+            bound, undecided = STEPS * exact.bound, float(exact.undecided.double().mean())
+            return Float32Error(
+                rounding_image(bound.numpy()),
+                float(bound.max()),
+                STEPS * exact.median_bound,
+                undecided,
+                time.perf_counter() - start,
+            )
 
     def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[Tensor, dict[str, float]]:
         """Return the image of a camera, [H, W, 3], and the milliseconds of each stage."""

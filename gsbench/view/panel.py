@@ -9,9 +9,8 @@ import numpy as np
 from gsbench.gates.messages import EFFECT_SETS
 from gsbench.gates.picture import COLOURS
 from gsbench.measure.images import ERROR_SCALE, ROUNDING_SCALE, data_url, inferno
-from gsbench.stability.float32_error import Float32Error
 from gsbench.view.controls import ShownImage
-from gsbench.view.frame import CLASS, COST, FLOAT32, STAGES, FrameCost
+from gsbench.view.frame import CLASS, COST, FLOAT32, STAGES, Float32Error, FrameCost
 from gsbench.view.training_views import Nearest, ViewComparison
 
 STOPS = 9  # of a gradient

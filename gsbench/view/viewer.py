@@ -15,15 +15,24 @@ from gsbench.measure.images import png
 from gsbench.models import cameras
 from gsbench.run.load import LoadedRun, scene_of
 from gsbench.scenes import Camera, Scene
-from gsbench.stability.float32_error import Float32Error
 from gsbench.view import video
-from gsbench.view.controls import SIDE, WIPE, Controls, ShownImage
-from gsbench.view.frame import FLOAT32, IMAGE, RASTER, SLICE, Frame, FrameRenderer, beside, renderers_of, wiped
+from gsbench.view.controls import SIDE, WIPE, Controls, ShownImage, ViserPose
+from gsbench.view.frame import (
+    FLOAT32,
+    IMAGE,
+    RASTER,
+    SLICE,
+    Float32Error,
+    Frame,
+    FrameRenderer,
+    beside,
+    renderers_of,
+    wiped,
+)
 from gsbench.view.labels import Label, labelled
 from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.request_guard import RequestGuard
 from gsbench.view.training_views import TrainingViews, compare
-from gsbench.view.viser_cameras import ViserPose
 
 REST_S = 0.2  # seconds without a change after which a frame is rendered with all pixels
 FRAME_S = 1 / 30  # seconds between two frames while the scene is played

@@ -21,7 +21,7 @@ from gsbench.report.intervals import Spread
 from gsbench.run.setup import build, load_scene
 from gsbench.scenes.points import random_points
 from gsbench.scenes.scene import Points, Scene, View
-from gsbench.stability.float64_render import float64_camera
+from gsbench.stability.float32_error import float64_camera
 from gsbench.train.batches import generator
 from gsbench.train.divergence import DivergedError, explain
 from gsbench.train.loop import Trainer

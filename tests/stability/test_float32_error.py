@@ -22,7 +22,7 @@ from gsbench.scenes import Points, View
 from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 from gsbench.stability import float32_error, report
 from gsbench.stability.__main__ import main
-from gsbench.stability.float64_render import float64_camera
+from gsbench.stability.float32_error import float64_camera
 from gsbench.train.batches import generator
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")

@@ -11,9 +11,8 @@ from gsbench.gates.messages import EFFECT_SETS
 from gsbench.gates.picture import COLOURS
 from gsbench.models.effect_sets import NAMES
 from gsbench.scenes import Camera, View
-from gsbench.stability.float32_error import Float32Error
 from gsbench.view.controls import ShownImage
-from gsbench.view.frame import CLASS, COST, FLOAT32, IMAGE, FrameCost
+from gsbench.view.frame import CLASS, COST, FLOAT32, IMAGE, Float32Error, FrameCost
 from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.training_views import Nearest, ViewComparison
 

@@ -14,9 +14,8 @@ import torch
 from test_viewer_frame import camera_of, renderer
 
 from gsbench.view.__main__ import main
-from gsbench.view.controls import ONE, SIDE, WIPE, _is_rgb
+from gsbench.view.controls import ONE, SIDE, WIPE, ViserPose, _is_rgb
 from gsbench.view.viewer import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Browser, Resolution
-from gsbench.view.viser_cameras import ViserPose
 
 
 def test_resolution_falls_while_the_camera_moves() -> None:

@@ -26,7 +26,7 @@ from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
 from gsbench.scenes.scene import UP
 from gsbench.schedule import ActiveComponents
-from gsbench.stability.float64_render import check_exactness, float64_model, render_twice
+from gsbench.stability.float32_error import check_exactness, float64_model, render_twice
 from gsbench.view import video
 from gsbench.view.frame import (
     CLASS,
