@@ -45,20 +45,15 @@ class GaussianModel(nn.Module, ABC):
     geometry: ClassVar[tuple[str, ...]]  # the raw parameters of the covariance: AGR changes them
     lengths: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters of both kinds that are in world units
     initial_opacity: ClassVar[float] = 0.1
+    kernel: Operation | None = None  # the kernel that computes slices as `condition` does; None: torch does
     warm_up: int = 0  # the step, of 30,000, until which `active.warms_up`; a model with a static first stage sets it
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Raise InputError if `cls` overrides `condition`, but inherits a `slice_geometry` that does not call it."""
+        """Let torch slice a model that overrides `condition` and inherits the kernel of its base."""
         super().__init_subclass__(**more)
-        first: dict[str, Any] = {  # the class whose method is called
-            name: next(base for base in cls.__mro__ if name in vars(base)) for name in ("condition", "slice_geometry")
-        }
-        condition, sliced = first.values()
-        calls_it = getattr(sliced.condition, "__isabstractmethod__", False)  # that of GaussianModel and GatedModel
-        if not calls_it and cls.__mro__.index(condition) < cls.__mro__.index(sliced):
-            raise InputError(f"{cls.__name__}: expected slice_geometry in {condition.__name__}, which overrides "
-                             f"condition, got that of {sliced.__name__}, which does not call it: override it too",
-                             docs="adding_a_model.md")  # fmt: skip
+        order = [next(base for base in cls.__mro__ if name in vars(base)) for name in ("condition", "kernel")]
+        if cls.__mro__.index(order[0]) < cls.__mro__.index(order[1]):
+            cls.kernel = None
 
     def __init__(
         self,
@@ -136,10 +131,6 @@ class GaussianModel(nn.Module, ABC):
     def log_sizes(self, index: int) -> Tensor:
         """Return the log sizes of one Gaussian in its n dimensions, [n]; by default only the largest size, [1]."""
         return self.scales()[index : index + 1].log()
-
-    def log_duration(self, index: int) -> float | None:
-        """Return the log size of a Gaussian in time (1 = the length of the scene); None for a model without time."""
-        return None
 
     def durations(self) -> Tensor | None:
         """Return each Gaussian's standard deviation in time, [N] (1 = the length of the scene); None without time."""
@@ -279,22 +270,24 @@ class GaussianModel(nn.Module, ABC):
         return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), beta_exponents)
 
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
+        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time."""
+        if not self.uses_kernel(raw):
+            means, factors, opacity_factor, beta_exponents = self.condition(raw, query)
+            return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, beta_exponents)
+        assert self.kernel is not None
+        known, names = self.kernel_arguments(raw, query), (*self.kernel.inputs, *self.kernel.numbers)
+        outputs = self.kernel(**{name: known[name] for name in names if name in known})
+        part = dict(zip(self.kernel.outputs, outputs, strict=True))
+        return Geometry(part.get("means", raw["means"]), part["factors"], part["opacities"], part.get("shapes"))
 
-        A subclass that has a kernel for this overrides the method.
-        """
-        means, factors, opacity_factor, beta_exponents = self.condition(raw, query)
-        return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, beta_exponents)
+    def uses_kernel(self, raw: Raw) -> bool:
+        """Return whether `kernel` computes the slice of these parameters, on their device and in their type."""
+        return self.kernel is not None and self.backend.serves(raw["means"])
 
-    def slice_by(self, operation: Operation, raw: Raw, query: CameraTime, **numbers: Any) -> Geometry:
-        """Compute the 3D Gaussians for a camera and a time by a kernel.
-
-        Its inputs are found by their names: raw parameters, `center`, `time`, `log_lambda_t` and `log_lambda_d`.
-        """
-        known = raw | {"center": query.center} | {f"log_lambda_{name[0]}": x for name, x in self.log_lambda.items()}
-        if "time" in self.observes and query.time is not None:
-            known["time"] = query.time
-        return Geometry(*operation(**{name: known[name] for name in operation.inputs if name in known}, **numbers))
+    def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
+        """Return what `kernel` may take, by the names of its inputs and numbers; it takes those that it declares."""
+        lambdas = {f"log_lambda_{name[0]}": value for name, value in self.log_lambda.items()}
+        return raw | lambdas | {"center": query.center, "time": query.time if "time" in self.observes else None}
 
     @property
     def orders(self) -> Tensor | None:

@@ -17,7 +17,7 @@ from gsbench.kernels.slices import slice_universal
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime, unit
-from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
+from gsbench.models.gaussian_batch import Conditioned, reach
 from gsbench.models.portable_math import exp, log, log1p, sqrt
 from gsbench.models.registry import register
 from gsbench.models.slicing import Reduced, cholesky3, gain_of, reduce, triangularise, whiten
@@ -134,8 +134,8 @@ def softplus_inverse(y: Tensor) -> Tensor:
 
 def skew_factor(scales: Tensor, skew: Tensor) -> Tensor:
     """Compute factors (I + A) diag(s) from parameters of sizes [N, 3] and the numbers A_01, A_02, A_12 [N, 3]."""
-    one, (a, b, c) = torch.ones_like(skew[:, 0]), skew.unbind(-1)
-    turn = torch.stack([one, a, b, -a, one, c, -b, -c, one], -1).unflatten(-1, (3, 3))
+    unit_diagonal, (a, b, c) = torch.ones_like(skew[:, 0]), skew.unbind(-1)
+    turn = torch.stack([unit_diagonal, a, b, -a, unit_diagonal, c, -b, -c, unit_diagonal], -1).unflatten(-1, (3, 3))
     return turn * positive(scales)[:, None, :]
 
 
@@ -160,6 +160,7 @@ class UniversalBetaModel(BetaModel):
     observes: ClassVar[tuple[str, ...]] = ("time", "direction")
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")
     geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "lower", "betas")
+    kernel = slice_universal
 
     def __init__(
         self, *, time_size: float = 1.0, view_size: float = 1.0, modulation: str = "whitened", **options: Any
@@ -213,11 +214,8 @@ class UniversalBetaModel(BetaModel):
         profile = profiles(raw)
         return Conditioned(raw["means"] + shift, factors, opacity_factor(white, raw["betas"]), profile)
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the modulation."""
-        if self.modulation != "whitened" or not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return self.slice_by(slice_universal, raw, query)
+    def uses_kernel(self, raw: Raw) -> bool:
+        return self.modulation == "whitened" and super().uses_kernel(raw)
 
     def hold_lifetimes(self, least: float) -> None:
         """Raise the size of time such that the Gaussian exp(-b y_t^2) of each opacity factor is at least `least` long.

@@ -15,9 +15,8 @@ from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime, times_inside, unit
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, CholeskyLayout, rotation, sizes
-from gsbench.models.gated import OPACITY_MARGIN, GatedModel
-from gsbench.models.gaussian_batch import Conditioned, Geometry
-from gsbench.models.joint import JointModel
+from gsbench.models.gated import OPACITY_MARGIN, JointModel
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.portable_math import exp, log
 from gsbench.models.registry import register
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
@@ -43,6 +42,7 @@ class CholeskyModel(JointModel):
 
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
     lengths = ("means", "motion")
+    kernel = slice_triangular
     directional_half = True  # whether f_dir has the 1/2 of 7DGS eq. 12
     unit_directions = False  # whether mean directions are normalised when a Gaussian is sliced
     bounded_times = False  # whether mean times are sigmoids of their parameters
@@ -94,15 +94,19 @@ class CholeskyModel(JointModel):
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         """Condition Gaussians on time t and on the unit vector d from the camera to their means (7DGS, algorithm 1)."""
         factor, offset = self.factors(raw), self.offset(raw, query)
-        reduced = self._blocks(factor) if self.is_reduced else reduce(factor)
+        k = offset.shape[1]
+        # With the rows (d, t, p) the factor has the form [T_qq 0; T_pq T_pp] as it is.
+        reduced = (
+            Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:]) if self.is_reduced else reduce(factor)
+        )
         # If q is so far from mu_q that the opacity is zero, T_qq is replaced by the identity and q by mu_q, and the
         # opacity factor is zero. Otherwise the huge numbers would give gradients of 0 x inf.
         with torch.no_grad():
-            visible = self._exponent(reduced.T_qq, offset, whiten(reduced.T_qq, offset)) < EXPONENT_MAX
+            visible = self.exponents(reduced.T_qq, offset, whiten(reduced.T_qq, offset))["static"] < EXPONENT_MAX
         delta = torch.where(visible[:, None], offset, 0.0)
         T_qq = torch.where(visible[:, None, None], reduced.T_qq, torch.eye(delta.shape[1]).to(delta))
         white = whiten(T_qq, delta)
-        opacity_factor = torch.where(visible, exp(-self._exponent(T_qq, delta, white)), 0.0)
+        opacity_factor = torch.where(visible, exp(-self.exponents(T_qq, delta, white)["static"]), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
@@ -119,24 +123,20 @@ class CholeskyModel(JointModel):
         factors = CholeskyLayout("ppp", self.layout.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
-        has_kernel = self.scheme == "square_root" or (self.scheme == "cholesky" and raw["means"].device.type == "cpu")
-        if not has_kernel or not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        parameters = raw | {"coupling": raw.get("coupling", raw["motion"].detach()[:, :0])}
-        parameters |= {"times": self.mean_times(raw)} if "time" in self.observes else {}
-        parameters |= {"directions": self.mean_directions(raw)} if "direction" in self.observes else {}
-        return self.slice_by(
-            slice_triangular,
-            parameters,
-            query,
-            half=0.5 if self.directional_half else 1.0,
-            conditioned_first=self.factor_order == "conditioned_first",
-            form=OFF_DIAGONALS.index(self.layout.form),
-            subtracts=self.scheme == "cholesky",
-            conditioned=self.conditioned,
-        )
+    def uses_kernel(self, raw: Raw) -> bool:
+        schemes = ("square_root", "cholesky") if raw["means"].is_cpu else ("square_root",)
+        return self.scheme in schemes and super().uses_kernel(raw)
+
+    def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
+        named = super().kernel_arguments(raw, query) | {
+            "coupling": raw.get("coupling", raw["motion"].detach()[:, :0]),
+            "half": 0.5 if self.directional_half else 1.0,
+            "conditioned_first": self.factor_order == "conditioned_first",
+            "form": OFF_DIAGONALS.index(self.layout.form),
+            "subtracts": self.scheme == "cholesky",
+        }
+        named |= {"times": self.mean_times(raw)} if "time" in self.observes else {}
+        return named | ({"directions": self.mean_directions(raw)} if "direction" in self.observes else {})
 
     def spatial_scales(self) -> Tensor:
         """Return the diagonal entries of position in each Cholesky factor, [N, 3]."""
@@ -150,10 +150,6 @@ class CholeskyModel(JointModel):
     def log_sizes(self, index: int) -> Tensor:
         """Return the logarithms of the diagonal entries of the Cholesky factor of the Gaussian `index`."""
         return self.splats["log_diagonal"].detach()[index]
-
-    def log_duration(self, index: int) -> float | None:
-        """Return the log diagonal entry of time in one Gaussian's Cholesky factor; None for a model without time."""
-        return float(self.log_sizes(index)[self.rows["t"][0]]) if "time" in self.observes else None
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
@@ -199,7 +195,9 @@ class CholeskyModel(JointModel):
     def _assembled(self, T_qq: Tensor, T_pq: Tensor, T_pp: Tensor) -> Tensor:
         """Assemble covariance factors [N, n, n] from blocks [T_qq 0; T_pq T_pp] of position p and other variables q."""
         q_rows = torch.cat([T_qq, T_qq.new_zeros(*T_qq.shape[:2], 3)], -1)
-        return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, self.own_order()]
+        sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
+        order = sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)  # back to that of the model's factor
+        return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, order]
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         """Return masks of the parameter entries that are used: a static Gaussian uses none of time and direction."""
@@ -328,20 +326,6 @@ class CholeskyModel(JointModel):
             exponents["time"] = 0.5 * self.lambda_of("time") * distance.square()
         return exponents | {"static": torch.stack(list(exponents.values())).sum(0)}
 
-    def _exponent(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> Tensor:
-        """Compute -ln of the factor by which time and direction dim a Gaussian, [N]."""
-        return self.exponents(T_qq, delta, white)["static"]
-
-    def _blocks(self, factor: Tensor) -> Reduced:
-        """Split triangular factors into the blocks T_qq, T_pq, T_pp; q is direction and time, p is position."""
-        k = factor.shape[-1] - 3
-        return Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:])
-
-    def own_order(self) -> list[int]:
-        """Return for each row of the triangular factor its index in the order (position, direction, time)."""
-        sorted_rows = self.rows["p"] + self.rows["d"] + self.rows["t"]
-        return sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)
-
     def moves_long(self, factor: Tensor) -> Tensor:
         """Return which Gaussians with covariance factors [N, n, n] move and are long in time (7DGS, section 4.4)."""
         if "time" not in self.observes or not self.split_in_time:
@@ -432,9 +416,8 @@ class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
                                  f"{options['lambda_t']}: a joint gate has one lambda")  # fmt: skip
             del self.log_lambda["direction"]
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute conditional 3D Gaussians by a kernel if the backend has one; with a joint gate, in torch."""
-        return GatedModel.slice_geometry(self, raw, query) if self.joint_gate else super().slice_geometry(raw, query)
+    def uses_kernel(self, raw: Raw) -> bool:
+        return not self.joint_gate and super().uses_kernel(raw)
 
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
         """Compute -ln of the factor by which each variable dims a Gaussian, and of both (`static`), [N] each.

@@ -17,6 +17,7 @@ from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
 from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_exponents
+from gsbench.models.slicing import reduce
 
 OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
 _STATE = "effect_sets."  # prefix of the names of these tensors in a checkpoint
@@ -84,9 +85,13 @@ class GatedModel(GaussianModel):
         """The number of Gaussians, from the first row on, that change with time or direction; None: all of them."""
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
+    def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
+        """Return what `kernel` may take, by name, with the number of Gaussians that it conditions."""
+        return super().kernel_arguments(raw, query) | {"conditioned": self.conditioned}
+
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Compute the 3D Gaussians for a camera and time; Gaussians that ignore both are copied, not conditioned."""
-        if self.conditioned is None:
+        if self.conditioned is None or self.uses_kernel(raw):
             return super().slice_geometry(raw, query)
         changing = {name: x[: self.conditioned] for name, x in raw.items()}
         others = {name: x[self.conditioned :] for name, x in raw.items()}
@@ -133,6 +138,27 @@ class GatedModel(GaussianModel):
             value[there] = packed
             whole[key] = value
         return whole
+
+
+class JointModel(GatedModel):
+    """The base class of 4DGS, 6DGS and 7DGS: a covariance over position and time, direction or both, sliced at a query.
+
+    The conditional covariance is the same for all times and directions.
+    """
+
+    @abstractmethod
+    def factors(self, raw: Raw) -> Tensor:
+        """Compute factors of the covariances [N, n, n]; the first rows are position, and the last is time if any."""
+
+    def spread(self, rows: Tensor) -> Tensor:
+        """Return factors of the conditional 3D covariances of the Gaussians `rows` [M], [M, 3, 3]."""
+        return reduce(self.factors(self.raw_of(rows))).T_pp
+
+    def durations(self) -> Tensor | None:
+        """Return the standard deviation in time of each Gaussian, [N]; None for a model without time."""
+        if "time" not in self.observes:
+            return None
+        return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1)
 
 
 def has_gates(model: GaussianModel) -> TypeGuard[GatedModel]:

@@ -12,7 +12,7 @@ from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gated import GatedModel
-from gsbench.models.gaussian_batch import Conditioned, Geometry
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.portable_math import log
 from gsbench.models.registry import register
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -24,6 +24,7 @@ class Gaussians3DModel(GatedModel, gates=True):
     """3DGS: the covariance of a Gaussian is R S S^T R^T, with rotation R and scales S (3DGS, eq. 6)."""
 
     geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")
+    kernel = slice_static
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres whose radii are the distances [N] of the points to their neighbours."""
@@ -46,12 +47,6 @@ class Gaussians3DModel(GatedModel, gates=True):
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Return an empty dictionary, because 3DGS has no dependence on time or direction that could be removed."""
         return {}
-
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute covariance factors and opacities by the backend's kernel if it has one, else in torch."""
-        if not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return Geometry(raw["means"], *slice_static(raw["scales"], raw["quats"], raw["opacities"]))
 
     def spatial_scales(self) -> Tensor:
         """Return the three scales of each Gaussian, [N, 3]."""

@@ -16,9 +16,8 @@ from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
-from gsbench.models.gated import OPACITY_MARGIN
-from gsbench.models.gaussian_batch import Conditioned, Geometry
-from gsbench.models.joint import JointModel
+from gsbench.models.gated import OPACITY_MARGIN, JointModel
+from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.portable_math import exp, log
 from gsbench.models.registry import register
 from gsbench.models.slicing import check_scheme, gain_of, mahalanobis, reduce, slice_gaussians
@@ -43,6 +42,7 @@ class Gaussians4DModel(JointModel, gates=True):
     observes = ("time",)
     centers = ("means", "times")
     geometry = ("scales", "left_quats", "right_quats")
+    kernel = slice_rotated
 
     def __init__(
         self,
@@ -171,11 +171,11 @@ class Gaussians4DModel(JointModel, gates=True):
         left = self.splats["left_quats"].data[effect_sets.conditioned :]
         self.splats["right_quats"].data[effect_sets.conditioned :] = partner(left)
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute conditional 3D Gaussians by a kernel, or in torch if the backend has none for the method `scheme`."""
-        if self.scheme != "square_root" or not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return self.slice_by(slice_rotated, raw | {"clock": self.clock}, query, conditioned=self.conditioned)
+    def uses_kernel(self, raw: Raw) -> bool:
+        return self.scheme == "square_root" and super().uses_kernel(raw)
+
+    def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
+        return super().kernel_arguments(raw, query) | {"clock": self.clock}
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""
@@ -201,10 +201,6 @@ class Gaussians4DModel(JointModel, gates=True):
     def log_sizes(self, index: int) -> Tensor:
         """Return the four log scales of the Gaussian `index`, [4]."""
         return self.splats["scales"].detach()[index]
-
-    def log_duration(self, index: int) -> float | None:
-        """Return the log scale in time of the Gaussian `index`, in units of the length of the scene."""
-        return float(self.splats["scales"].detach()[index, 3] - log(self.clock))
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""

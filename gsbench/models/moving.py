@@ -23,8 +23,8 @@ from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, 
 from gsbench.models.camera_time import CameraTime, times_inside, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import sizes
-from gsbench.models.gated import OPACITY_MARGIN, GatedModel
-from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
+from gsbench.models.gated import OPACITY_MARGIN
+from gsbench.models.gaussian_batch import Conditioned, reach
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.portable_math import exp, log
 from gsbench.models.registry import register
@@ -52,10 +52,6 @@ class MovingGaussians3D(Gaussians3DModel):
         shift, opacity_factor = self.change(raw, query)
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute the 3D Gaussians for a camera and a time in torch; a model with a kernel overrides this."""
-        return GatedModel.slice_geometry(self, raw, query)
-
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Replace means and opacities by their weighted averages over views; see `GatedModel.frozen`."""
@@ -77,11 +73,6 @@ class MovingGaussians3D(Gaussians3DModel):
             masks |= dict.fromkeys(self.moving, rows < effect_sets.conditioned)
         return masks
 
-    def log_duration(self, index: int) -> float | None:
-        """Return the logarithm of the standard deviation in time of the Gaussian `index`; None without time."""
-        lifetimes = self.lifetimes()
-        return None if lifetimes is None else math.log(float(lifetimes[1][index]))
-
 
 @register("freetime")
 class FreeTimeModel(MovingGaussians3D, gates=True):
@@ -97,6 +88,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
     geometry = ("scales", "quats", "durations", "velocities")
     lengths = ("means", "velocities")
     moving = ("times", "durations", "velocities")
+    kernel = slice_free_time
 
     def __init__(
         self,
@@ -123,12 +115,6 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         delta = query.time - raw["times"]
         opacity_factor = exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
         return raw["velocities"] * delta, opacity_factor
-
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute the moved 3D Gaussians by the backend's kernel if it has one, else in torch."""
-        if not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return self.slice_by(slice_free_time, raw, query, conditioned=self.conditioned)
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
@@ -165,6 +151,7 @@ class DirectModel(MovingGaussians3D, gates=True):
     centers = ("means", "times", "directions")
     geometry = ("scales", "quats", "precision", "coupling", "shares")
     moving = ("times", "directions", "precision", "coupling", "shares")
+    kernel = slice_direct
 
     def __init__(self, *, coupling: str = "text", view_precision: float = 1.0, **options: Any) -> None:
         """Make a model without Gaussians.
@@ -213,11 +200,8 @@ class DirectModel(MovingGaussians3D, gates=True):
             shift = shift + (1 - shares) * delta
         return (V_pq @ shift[..., None])[..., 0], opacity_factor
 
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute the moved 3D Gaussians by a kernel, or in torch if the backend has none for this `coupling`."""
-        if self.coupling != "text" or not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return self.slice_by(slice_direct, raw, query, conditioned=self.conditioned)
+    def uses_kernel(self, raw: Raw) -> bool:
+        return self.coupling == "text" and super().uses_kernel(raw)
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
@@ -278,6 +262,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")
     geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "precision", "coupling", "betas")
     moving: ClassVar[tuple[str, ...]] = ("times", "directions", "precision", "coupling")
+    kernel = slice_direct_beta
 
     def __init__(self, *, view_precision: float = 1.0, **options: Any) -> None:
         """Make a model without Gaussians.
@@ -319,12 +304,6 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         V_pq = coupling_matrix(raw["coupling"], positive(raw["scales"]))
         moved = V_pq @ (shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0])[..., None]
         return moved[..., 0], opacity_factor(white, raw["betas"])
-
-    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute the moved 3D Gaussians and their exponents by the backend's kernel if it has one, else in torch."""
-        if not self.backend.serves(raw["means"]):
-            return super().slice_geometry(raw, query)
-        return self.slice_by(slice_direct_beta, raw, query, conditioned=self.conditioned)
 
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return mean times [N] and standard deviations [N] of the Gaussians exp(-b z^2); None without time.

@@ -15,8 +15,8 @@ from gsbench.kernels.raster import Viewport
 from gsbench.measure.images import STEPS
 from gsbench.measure.quality import capped_psnr, evenly
 from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.gated import JointModel
 from gsbench.models.gaussian_batch import Gaussians3D
-from gsbench.models.joint import JointModel
 from gsbench.models.render import rasterize_slice
 from gsbench.models.slicing import reduce, subtract
 from gsbench.raster import EPS2D, FAR, NEAR

@@ -111,7 +111,9 @@ def resembles(model: GaussianModel, index: int) -> str | None:
     raw = {name: parameter[index].flatten() for name, parameter in model.splats.items()}
     if not all(value.isfinite().all() for value in raw.values()):
         return "learning_rates_times_30"  # the previous step was too long
-    sizes, in_time = model.log_sizes(index), model.log_duration(index)
+    sizes, lifetimes = model.log_sizes(index), model.lifetimes()
+    half_log_lambda = float(model.log_lambda["time"]) / 2 if "time" in model.log_lambda else 0.0
+    in_time = None if lifetimes is None else math.log(float(lifetimes[1][index])) + half_log_lambda
     colors = torch.cat([raw[name] for name in ("sh0", "shN") if name in raw])
     lambdas = [float(value) for value in model.log_lambda.parameters()]
     checks = {

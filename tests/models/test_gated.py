@@ -183,7 +183,6 @@ class Breathing(Gaussians3DModel):
 
     geometry = (*Gaussians3DModel.geometry, "breath")
     observes = ("time",)
-    slice_geometry = GatedModel.slice_geometry
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         return super().initial_geometry(points, distances, generator) | {"breath": torch.ones(len(distances), 1)}

@@ -49,8 +49,6 @@ class Deformed(Gaussians3DModel):
         moved = raw if self.active.warms_up else raw | {"means": raw["means"] + self.field(time)}
         return self.static(moved)
 
-    slice_geometry = Gaussians3DModel.__mro__[1].slice_geometry  # type: ignore[attr-defined]
-
 
 def deformed(*words: str) -> Trainer:
     config = compose("3dgs", 100, "effects.gate=off", *words)
