@@ -29,7 +29,9 @@ def packages(monkeypatch: pytest.MonkeyPatch) -> dict[str, MagicMock]:
     """Mocks of the packages of all trackers, which note every call; each run of theirs has an id of its own."""
     ids = map("made{}".format, itertools.count())
     mocks = {name: MagicMock() for name in (*TRACKERS, "torch.utils.tensorboard")}
-    mocks["wandb"].init.side_effect = lambda id=None, **_: MagicMock(id=id or next(ids))
+    mocks["wandb"].init.side_effect = lambda id=None, **_: MagicMock(
+        id=id or next(ids), log=mocks["wandb"].log, finish=mocks["wandb"].finish
+    )
     mocks["mlflow"].MlflowClient().create_run.side_effect = lambda *_, **__: MagicMock(
         info=SimpleNamespace(run_id=next(ids))
     )
@@ -104,9 +106,8 @@ def sent_to(name: str, packages: dict[str, MagicMock]) -> tuple[dict[int, dict[s
         calls = [(step, {key: value}) for (key, value, step), _ in writer.add_scalar.call_args_list]
         settings, end = writer.add_text.call_args.args[1], writer.close.call_args
     elif name == "wandb":
-        run = packages[name].run
-        calls = [(words["step"], numbers) for (numbers,), words in run.log.call_args_list]
-        settings, end = packages[name].init.call_args.kwargs["config"], run.finish.call_args
+        calls = [(words["step"], numbers) for (numbers,), words in packages[name].log.call_args_list]
+        settings, end = packages[name].init.call_args.kwargs["config"], packages[name].finish.call_args
     else:
         client = packages[name].MlflowClient()
         calls = [(words["step"], {key: value}) for (_, key, value), words in client.log_metric.call_args_list]
@@ -126,7 +127,6 @@ def test_a_tracker_is_sent_the_curve_and_the_results(
     name: str, ended: object, packages: dict[str, MagicMock], square: Path, tmp_path: Path
 ) -> None:
     """Catches a point or a result that does not arrive, steps that are off by one, and settings of another run."""
-    packages["wandb"].init.side_effect = lambda **_: packages["wandb"].run
     record, folder = run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
     assert record.metrics
     assert record.cost
@@ -161,6 +161,7 @@ def test_a_resumed_run_has_the_same_id(name: str, packages: dict[str, MagicMock]
         assert client.set_terminated.call_args == call("made2", "KILLED")
     else:
         assert [words["id"] for _, words in packages[name].init.call_args_list] == [None, "made0", None, None]
+        assert packages[name].finish.call_args == call(exit_code=1)
 
 
 def test_tensorboard_hides_what_is_trained_again(packages: dict[str, MagicMock], tmp_path: Path) -> None:

@@ -84,7 +84,8 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
 
 
 def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
-    """Catches dead weight that stays, Gaussians dropped before every view has looked, and miscounted rows."""
+    """Catches dead weight that stays, Gaussians dropped before every view has looked, and counts or gradients that stay
+    where they were while the Gaussians move."""
     _, _, control = control_of(4)
     for drawn, times, left in (
         ([1, 0, 0, 1], 4, [0, 1, 2, 3]),  # four views in a row may miss one of three
@@ -95,15 +96,11 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
         for _ in range(times):
             look(control, torch.zeros(len(drawn), 2), drawn)
         assert densified(control)[0] == left
-
-
-def test_counts_follow_the_rows_that_a_gate_kept() -> None:
-    """Catches counts of views that stay where they were while the Gaussians move, and gradients of other Gaussians."""
     _, _, control = control_of(4)
     for drawn in ([1, 0, 0, 0], [1, 1, 0, 1], [1, 0, 0, 1]):
         look(control, torch.ones(4, 2), drawn)
     assert control.unseen.tolist() == [0, 1, 3, 0]
-    control.rows.select(torch.tensor([3, 2, 1]))
+    control.rows.select(torch.tensor([3, 2, 1]))  # as a gate does
     assert control.unseen.tolist() == [0, 3, 1]
     assert control.gradient.tolist() == control.times_visible.tolist() == [0, 0, 0]
 
@@ -118,40 +115,32 @@ def test_large_gaussians_are_pruned_only_when_asked() -> None:
     assert densified(control, has_reset=True)[0] == [1, 2, 3]
 
 
-def test_counts_are_kept_while_gaussians_are_densified() -> None:
-    """Catches a last densification that does not know the views before it, and counting for none (2 % of a step)."""
+def test_the_rule_is_called_as_the_schedule_says() -> None:
+    """Catches a last densification that does not know the views before it, counting for none (2 % of a step), children
+    that are scattered alike in every round or not by the seed, and pruning by size before opacities were reset."""
     fitted = trainer("3dgs", "train.batch_size=1")
-    stop, counted = fitted.schedule.densify_stop, []
-    fitted.density.rule.accumulate = lambda *_: counted.append(fitted.step)  # type: ignore[method-assign]
+    rule, schedule, stop = fitted.density.rule, fitted.schedule, fitted.schedule.densify_stop
+    counted, draws, resets = list[int](), list[float](), list[bool]()
+
+    def densify(random: torch.Generator, has_reset: bool, _: int) -> int:
+        draws.append(torch.rand(1, generator=random).item())
+        resets.append(has_reset)
+        return 0
+
+    rule.accumulate, rule.densify = lambda *_: counted.append(fitted.step), densify  # type: ignore[method-assign]
     for fitted.step in (stop - 2, stop - 1, stop, stop + 1):
         fitted.train_step()
-    assert counted == [stop - 2, stop - 1]
-    assert fitted.schedule.densifies(stop - 1)
-
-
-def test_large_gaussians_go_once_opacities_were_reset() -> None:
-    """Catches pruning by size that is never asked for, or asked for from the start."""
-    fitted = trainer()
-    asked = []
-    fitted.density.rule.densify = lambda _, has_reset, __: asked.append(has_reset)  # type: ignore[method-assign]
-    fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
-    fitted.schedule.resets = lambda _: False  # type: ignore[method-assign]
-    for step in (0, fitted.schedule.reset_every - 1, fitted.schedule.reset_every):
-        fitted.step = step
-        fitted.train_step()
-    assert asked == [False, False, True]
-
-
-def test_children_of_every_densification_are_drawn_anew() -> None:
-    """Catches children that are scattered alike in every densification, and draws that are not those of the seed."""
-    fitted = trainer("3dgs")
-    drawn: list[float] = []
-    fitted.density.rule.densify = lambda random, *_: drawn.append(torch.rand(1, generator=random).item())  # type: ignore[method-assign]
-    fitted.schedule.densifies = lambda _: True  # type: ignore[method-assign]
+    assert (counted, len(draws)) == ([stop - 2, stop - 1], 1)
+    schedule.densifies, schedule.resets = lambda _: True, lambda _: False  # type: ignore[method-assign]
+    draws.clear()
     for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
         fitted.train_step()
-    assert len(set(drawn)) == 3
-    assert drawn[0] == drawn[3]
+    assert len(set(draws)) == 3
+    assert draws[0] == draws[3]
+    resets.clear()
+    for fitted.step in (0, schedule.reset_every - 1, schedule.reset_every):
+        fitted.train_step()
+    assert resets == [False, False, True]
 
 
 def test_what_is_long_in_time_is_split_along_its_path() -> None:
@@ -185,23 +174,16 @@ def test_children_in_time_stay_near_the_clip() -> None:
     assert 0.5 < moved.max() < 6
 
 
-def views(number: int, side: int) -> list[Any]:
-    return [SimpleNamespace(camera=SimpleNamespace(width=side, height=side))] * number
-
-
 @pytest.mark.parametrize(
     ("number", "side", "initial", "most"),
-    [
-        (120, 80, 1_000, 12_000),
-        (120, 80, 10_000, 40_000),
-        (100, 800, 100_000, 1_000_000),
-        (800, 2_000, 400_000, 2_000_000),
-    ],
-)
+    [(120, 80, 1_000, 12_000), (120, 80, 10_000, 40_000), (100, 800, 100_000, 1_000_000),
+     (800, 2_000, 400_000, 2_000_000)],
+)  # fmt: skip
 def test_the_limit_follows_from_the_training_pixels(number: int, side: int, initial: int, most: int) -> None:
     """Catches a limit of the views' number or of one view, one that many initial points exceed, and one without end."""
-    assert gaussian_limit(None, views(number, side), initial) == most
-    assert gaussian_limit(500, views(number, side), initial) == 500
+    views: list[Any] = [SimpleNamespace(camera=SimpleNamespace(width=side, height=side))] * number
+    assert gaussian_limit(None, views, initial) == most
+    assert gaussian_limit(500, views, initial) == 500
 
 
 def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,18 +226,3 @@ def test_blend_weights_add_up_to_alpha() -> None:
     alpha = rasterize_slice(gaussians, view.camera, torch.zeros(3), fitted.model.backend).alpha
     weights = blend_weights(fitted.model, [view], antialias=False)
     torch.testing.assert_close(weights.sum(), alpha.detach().sum(), rtol=1e-4, atol=0)
-
-
-def test_the_floor_is_held_in_training_and_follows_the_rows() -> None:
-    """Catches a minimum scale that is never held, or that is of other Gaussians once rows were moved."""
-    fitted = trainer("7dgs", "train.densify.every=1")
-    sizes = fitted.model.splats["log_diagonal"]
-    for step in (0, 60):
-        with torch.no_grad():
-            sizes[:, 4:] = -20.0
-        fitted.step = step
-        fitted.train_step()
-        held = fitted.model.splats["log_diagonal"].detach()[:, 4:].amin(1)
-        assert len(held) == len(fitted.hook(MinimumScale).least)
-        if step == 0:
-            torch.testing.assert_close(held, fitted.hook(MinimumScale).least.log(), rtol=1e-2, atol=0)

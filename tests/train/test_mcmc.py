@@ -14,7 +14,7 @@ from gsbench.train.batches import generator
 from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
 
-NAMES = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
          "ndgs": {"lambda_t": 0.5, "lambda_d": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip
 
 
@@ -62,10 +62,10 @@ def test_rows_are_drawn_in_proportion() -> None:
     assert 0.72 < counts[3] / 4000 < 0.78
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OPTIONS)
 def test_dead_gaussians_move_to_living_ones(name: str) -> None:
     """Catches copies that are not all of the source, a limit that is passed, and moments that stay with old rows."""
-    model = moved(started(build(name, **NAMES[name]), 40))
+    model = moved(started(build(name, **OPTIONS[name]), 40))
     with torch.no_grad():
         model.splats["opacities"][:] = 1.0
         model.splats["opacities"][30:] = -8.0  # dead
@@ -85,12 +85,11 @@ def test_dead_gaussians_move_to_living_ones(name: str) -> None:
     assert torch.equal(sh0, before["sh0"][sources])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OPTIONS)
 def test_shrinking_keeps_position_and_life(name: str) -> None:
     """Catches a factor that also changes how a slice moves or fades, or a covariance that is not smaller by c^2."""
-    model = started(build(name, **NAMES[name])).double()
-    if name != "4dgs":  # where it is exact only for rotations that do not mix space and time, as at the start
-        model = moved(model)
+    model = started(build(name, **OPTIONS[name])).double()
+    model = model if name == "4dgs" else moved(model)  # 4DGS: exact where rotations mix no time, as at the start
     queries = [CameraTime.at(CAMERA, time) for time in (0.2, 0.6)]
     before = [model.slice(query) for query in queries]
     model.shrink_rows(torch.tensor([3, 5]), torch.tensor([0.9, 0.7], dtype=torch.float64))
@@ -103,18 +102,15 @@ def test_shrinking_keeps_position_and_life(name: str) -> None:
         torch.testing.assert_close(new.factors @ new.factors.mT, factor * (old.factors @ old.factors.mT))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OPTIONS)
 def test_noise_is_of_the_covariance_and_of_the_transparent(name: str) -> None:
     """Catches noise on Gaussians that are seen, of another shape than theirs, or without the rate of the means."""
-    model = started(build(name, **NAMES[name]), 4000).double()
+    model = started(build(name, **OPTIONS[name]), 4000).double()
     with torch.no_grad():
         model.splats["opacities"][:2000] = -9.0
         model.splats["opacities"][2000:] = 0.0
-        if "scales" in model.splats:
-            model.splats["scales"][:, :3] = torch.tensor([0.1, 0.2, 0.4]).log()
-        else:
-            space = model.rows["p"]  # type: ignore[union-attr,index]
-            model.splats["log_diagonal"][:, space] = torch.tensor([0.1, 0.2, 0.4], dtype=torch.float64).log()
+        sizes, space = ("scales", [0, 1, 2]) if "scales" in model.splats else ("log_diagonal", model.rows["p"])
+        model.splats[sizes][:, space] = torch.tensor([0.1, 0.2, 0.4], dtype=torch.float64).log()
     before = model.splats["means"].detach().clone()
     density, _ = rule(model, noise=10.0)
     assert density.adds_noise

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from interrupted import assert_same_bits
 from models.small import started
+from test_mcmc import OPTIONS, Moments
 from tiny_training import moving_square, train, trainer
 
 from gsbench.config import DensifyConfig
@@ -23,7 +25,6 @@ from gsbench.train.rows import Rows
 
 GREY = torch.tensor([0.2, 0.3, 0.4])
 NAMES = ("3dgs", "4dgs", "6dgs", "7dgs", "dgs", "freetime")
-OPTIONS = {"6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3}}
 ROUNDS = ("train.densify.kind=multiview", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10",
           "train.densify.grad_threshold=1e-6", "train.iterations=60", "train.recipe_iterations=60",
           "train.refine_from=0")  # fmt: skip
@@ -38,6 +39,10 @@ def four_gaussians() -> GaussianModel:
         model.splats["scales"].fill_(math.log(0.15))
         model.splats["opacities"].copy_(torch.tensor([2.0, 1.0, 0.5, -1.0]))
     return model
+
+
+def scores_of(model: GaussianModel, views: list[View]) -> ErrorScore:
+    return ErrorScore(model, views, Renderer(GREY, antialias=False), ssim_weight=0.2)
 
 
 def weights_of_pixels(model: GaussianModel, view: View) -> torch.Tensor:
@@ -59,10 +64,8 @@ def test_scores_are_the_sums_by_hand() -> None:
     """Catches weights of pixels that are not flagged, errors of another range, losses of other views, and a mean that
     is a sum."""
     model = four_gaussians()
-    views = [
-        wrong_on_the_left(model, view, by) for view, by in zip(moving_square().train, (0.2, 0.5, 1.0), strict=False)
-    ]
-    importance, badness = ErrorScore(model, views, Renderer(GREY, antialias=False), 0.2)(generator(5))
+    views = [wrong_on_the_left(model, *pair) for pair in zip(moving_square().train[:3], (0.2, 0.5, 1.0), strict=True)]
+    importance, badness = scores_of(model, views)(generator(5))
     counts, weighed = torch.zeros(4), torch.zeros(4)
     for view in views:
         image = render(model, view.camera, view.time, GREY).detach()
@@ -85,7 +88,7 @@ def test_a_perfect_image_flags_nothing() -> None:
     model = four_gaussians()
     exact = [replace(view, pixels=render(model, view.camera, view.time, GREY).detach())
              for view in moving_square().train[:2]]  # fmt: skip
-    importance, badness = ErrorScore(model, exact, Renderer(GREY, antialias=False), 0.2)(generator(0))
+    importance, badness = scores_of(model, exact)(generator(0))
     assert not importance.any()
     assert not badness.any()
 
@@ -94,7 +97,7 @@ def test_a_model_without_gaussians_is_scored() -> None:
     """Catches the least of no numbers: all Gaussians of a training may have been pruned."""
     model = four_gaussians()
     Rows(model, Moments()).select(torch.arange(0))
-    score = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2)
+    score = scores_of(model, moving_square().train)
     density = MultiviewDensification(Rows(model, Moments()), DensifyConfig(), 0.005, 10, score)
     assert density.densify(generator(0), has_reset=True, most=100) == 0
     assert len(model) == 0
@@ -102,7 +105,7 @@ def test_a_model_without_gaussians_is_scored() -> None:
 
 def test_ten_different_views_are_drawn_anew() -> None:
     """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
-    score = ErrorScore(four_gaussians(), moving_square().train, Renderer(GREY, antialias=False), 0.2)
+    score = scores_of(four_gaussians(), moving_square().train)
     see, drawn = score._of_view, []
     score._of_view = lambda view: drawn.append(view.name) or see(view)  # type: ignore[assignment,func-returns-value]
     for seed in (0, 1, 0):
@@ -113,16 +116,6 @@ def test_ten_different_views_are_drawn_anew() -> None:
     assert rounds[0] == rounds[2] != rounds[1]
 
 
-class Moments:
-    """The optimizer of a model that is not trained."""
-
-    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
-        """Nothing to move."""
-
-    def forget(self, parameter: torch.Tensor) -> None:
-        raise AssertionError(parameter)
-
-
 def rule(model: GaussianModel, importance: torch.Tensor, badness: torch.Tensor) -> MultiviewDensification:
     """The rule with scores that are given, views that saw every Gaussian, and no gradients."""
     config = DensifyConfig(grad_threshold=1.0)
@@ -131,7 +124,7 @@ def rule(model: GaussianModel, importance: torch.Tensor, badness: torch.Tensor) 
 
 def of_eight(name: str, opacities: list[float], badness: list[float]) -> tuple[MultiviewDensification, torch.Tensor]:
     """The rule for a model of eight Gaussians, of which 2 to 5 are important; and their means."""
-    model = started(build(name, **OPTIONS.get(name, {})), 8)
+    model = started(build(name, **OPTIONS[name]), 8)
     with torch.no_grad():
         model.splats["opacities"].copy_(torch.tensor(opacities))
     importance = torch.full((8,), LEAST_IMPORTANCE)
@@ -195,13 +188,13 @@ def test_rows_are_drawn_once_in_proportion() -> None:
 def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
     """Catches views whose weights are added in the order that threads come by."""
     model = started(build("7dgs", **OPTIONS["7dgs"]), 300)
-    score, scores = ErrorScore(model, moving_square().train, Renderer(GREY, antialias=False), 0.2), []
+    score, scores = scores_of(model, moving_square().train), []
     for count in (1, 2, 3, 8):
         torch.set_num_threads(count)
-        scores.append(score(generator(0)))
-    assert scores[0].importance.any()
+        scores.append(list(score(generator(0))))
+    assert scores[0][0].any()
     for other in scores[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(scores[0], other, strict=True))
+        assert_same_bits(scores[0], other)
 
 
 @pytest.mark.parametrize("name", NAMES)
