@@ -1,6 +1,7 @@
 """The mean of parameters over the last steps: which steps are in it, when it starts anew, and when it is kept."""
 
 import copy
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +14,8 @@ from gsbench.errors import InputError
 from gsbench.train.hooks.average import Average
 
 
-def average_of(start: int, steps: int = 100, *, first: int = 0) -> Average:
-    """Two parameters that count steps, with an average from step `start` on; as a PSNR, small steps score high."""
+def average_from(start: int) -> Average:
+    """An average of two parameters from step `start` on; as a PSNR on val, small parameters score high."""
     model = torch.nn.ParameterDict({"a": torch.zeros(3), "b": torch.zeros(())})
     train = SimpleNamespace(average_from=start, iterations=100)
     training: Any = SimpleNamespace(
@@ -22,65 +23,52 @@ def average_of(start: int, steps: int = 100, *, first: int = 0) -> Average:
         schedule=SimpleNamespace(scaled=int), scene=SimpleNamespace(val=[None]), report=lambda _: None,
         psnr=lambda _: -float(model["a"].detach()[0]),
     )  # fmt: skip
-    average = Average(training)
-    count(average, range(first, steps))
+    return Average(training)
+
+
+def count(average: Average, *steps: int) -> Average:
+    """Let the parameters be the number of the step, in each of some steps."""
+    for step in range(*steps):
+        for value, parameter in zip((step, -step), average.training.model.parameters(), strict=True):
+            parameter.data.fill_(value)
+        average.after_step(step)
     return average
 
 
-def count(average: Average, steps: range) -> None:
-    for step in steps:
-        with torch.no_grad():
-            average.training.model["a"].fill_(step)  # type: ignore[index]
-            average.training.model["b"].fill_(-step)  # type: ignore[index]
-            average.after_step(step)
-
-
-def parameters(average: Average) -> tuple[list[float], float]:
-    model: Any = average.training.model
-    return model["a"].tolist(), float(model["b"].detach())
-
-
-def test_it_is_the_mean_of_every_tenth_step_from_its_start() -> None:
-    """Catches a mean of all steps, one that starts a step late, and a parameter that is left out."""
-    average = average_of(50)
+@pytest.mark.parametrize(
+    ("psnr", "ends_at", "kept"),
+    [(-99.0, 70.0, 50), (-69.0, 99.0, 0), (-70.0, 99.0, 0), (0.0, 99.0, 0), (math.nan, 70.0, 50)],
+)
+def test_it_is_the_mean_of_every_tenth_step_if_this_is_better(psnr: float, ends_at: float, kept: int) -> None:
+    """Catches a mean of all steps, one that starts a step late, a parameter that is left out, a mean that replaces
+    better parameters, and last parameters that are not put back."""
+    average = count(average_from(50), 100)
     assert average.after_measuring(90, -99.0) == -99.0  # before the last step
-    assert average.after_measuring(100, -99.0) == pytest.approx(-70.0)  # of 50, 60, 70, 80, 90
-    assert parameters(average) == ([70.0] * 3, -70.0)
-    assert (average.kept, average.count, average.results()) == (50, 0, {"averaged": 50})
-
-
-@pytest.mark.parametrize("psnr", [-69.0, -70.0, 0.0])
-def test_the_last_parameters_stay_where_the_mean_is_no_better(psnr: float) -> None:
-    """Catches a mean that replaces better parameters, and last parameters that are not put back."""
-    average = average_of(50)
-    assert average.after_measuring(100, psnr) == psnr
-    assert parameters(average) == ([99.0] * 3, -99.0)
-    assert (average.kept, average.count) == (0, 0)
-    average.training.psnr = lambda _: float("nan")  # type: ignore[method-assign]
-    count(average, range(60, 100))
-    assert average.after_measuring(100, psnr) == psnr
-    assert parameters(average) == ([99.0] * 3, -99.0)
+    assert average.after_measuring(100, psnr) == pytest.approx(-70.0 if kept else psnr)  # of 50, 60, 70, 80, 90
+    assert [p.tolist() for p in average.training.model.parameters()] == [[ends_at] * 3, -ends_at]
+    assert (average.kept, average.count, average.results()) == (kept, 0, {"averaged": kept})
 
 
 def test_it_starts_anew_when_gaussians_change() -> None:
     """Catches means of rows that are others now."""
-    average = average_of(50, steps=75)
+    average = count(average_from(50), 75)
     average.reindex(torch.arange(3), torch.zeros(3, dtype=torch.bool))
-    count(average, range(75, 100))
-    average.after_measuring(100, -99.0)
-    assert parameters(average)[0] == pytest.approx([85.0] * 3)
+    count(average, 75, 100).after_measuring(100, -99.0)
+    assert next(average.training.model.parameters()).tolist() == pytest.approx([85.0] * 3)
     assert average.kept == 20  # iterations: the parameters of steps 80 to 99 have had a part in the mean
 
 
 def test_a_checkpoint_has_it() -> None:
     """Catches a resumed training whose mean lacks the steps before, and state of another model."""
-    whole, state = average_of(50), copy.deepcopy(average_of(50, steps=65).state_dict())
-    resumed = average_of(50, 0)
+    whole, resumed = count(average_from(50), 100), average_from(50)
+    state = copy.deepcopy(count(average_from(50), 65).state_dict())
     resumed.load_state_dict(state)
-    count(resumed, range(65, 100))
-    whole.after_measuring(100, -99.0)
-    resumed.after_measuring(100, -99.0)
-    assert parameters(whole) == parameters(resumed)
+    count(resumed, 65, 100)
+    for average in (whole, resumed):
+        average.after_measuring(100, -99.0)
+    assert [p.tolist() for p in whole.training.model.parameters()] == [
+        p.tolist() for p in resumed.training.model.parameters()
+    ]
     resumed.load_state_dict(whole.state_dict())
     assert resumed.kept == 50  # so that the record of a finished training, measured later, says the same
     means = state["means"]
@@ -90,15 +78,14 @@ def test_a_checkpoint_has_it() -> None:
             resumed.load_state_dict(state | wrong)
 
 
-@pytest.mark.parametrize(("split", "views", "kept"), [("test", True, 50), ("val", True, 0), ("test", False, 0)])
-def test_parameters_are_averaged_where_val_may_choose(split: str, views: bool, kept: int) -> None:
+@pytest.mark.parametrize(("split", "views", "kept"), [("test", 3, 50), ("val", 3, 0), ("test", 0, 0)])
+def test_parameters_are_averaged_where_val_may_choose(split: str, views: int, kept: int) -> None:
     """Catches results on the views by which they were chosen, and means that nothing chose."""
     fitted = trainer("7dgs", "train.average_from=15000", f"scene.eval_split={split}", "train.patience=null")
-    if not views:
-        fitted.scene = replace(fitted.scene, val=[])
-    real, last = fitted.psnr, [10.0, 20.0]
+    fitted.scene = replace(fitted.scene, val=fitted.scene.val[:views])
+    scores = [10.0, 20.0]
     fitted.psnr = lambda views: (  # type: ignore[method-assign]
-        last.pop(0) if fitted.step == 99 and last and views is fitted.scene.val else real(views)
+        scores.pop(0) if fitted.step == 99 and scores and views is fitted.scene.val else 1.0
     )
     train(fitted)
     assert (fitted.hook(Average).kept, fitted.hook(Average).count) == (kept, 0)
