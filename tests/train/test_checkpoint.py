@@ -14,7 +14,6 @@ import torch
 from forked import Forked
 from interrupted import assert_resumes, assert_same_bits
 from test_early_stop import with_val
-from test_model_seam import deformed
 from tiny_run import gsbench, overrides, run_here
 from tiny_training import trainer
 
@@ -79,9 +78,8 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
                          "model.min_opacity=0.09"), 25),
         (lambda: trainer("7dgs", *ROUNDS, "train.penalties.strain.weight=1.0", "train.batch_size=2"), 25),
         (lambda: with_val({60: 50.0}, "effects.gate=off"), 67),
-        (deformed, 30),
     ],
-    ids=["relocation and average", "several views", "neighbours", "patience", "a model's own network"],
+    ids=["relocation and average", "several views", "neighbours", "patience"],
 )  # fmt: skip
 def test_a_training_continues_from_its_state(start: Callable[[], Trainer], step: int) -> None:
     """Catches random numbers, sums, scores, counts or neighbours of a rule or a hook that a checkpoint does not have,

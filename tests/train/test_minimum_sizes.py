@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from tiny_training import moving_square, trainer
+from torch import Tensor
 
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import render
@@ -24,22 +25,21 @@ def camera(distance: float, focal: tuple[float, float] = (50.0, 50.0)) -> Camera
     return Camera(viewmat, torch.tensor([[focal[0], 0, 24], [0, focal[1], 24], [0, 0, 1]]), 48, 48)
 
 
-def training_of(model: GaussianModel, views: list[Any]) -> Any:
+def training_of(model: GaussianModel, **of_views: list[Any]) -> Any:
+    """What the hooks read of a training: its model, and views that have the attributes given."""
+    views = [
+        SimpleNamespace(**dict(zip(of_views, values, strict=True))) for values in zip(*of_views.values(), strict=True)
+    ]
     return SimpleNamespace(model=model, scene=SimpleNamespace(train=views))
 
 
-def scale_of(model: GaussianModel, cameras: list[Camera]) -> MinimumScale:
-    return MinimumScale(training_of(model, [SimpleNamespace(camera=camera) for camera in cameras]))
-
-
-def flat(name: str) -> GaussianModel:
-    """A model whose Gaussians are flatter than 1e6 : 1 along one axis."""
-    model = build(name, **OPTIONS[name])
-    generator = torch.Generator().manual_seed(0)
-    model.initialise(random_points(200, 1.0, generator), 4.0, generator)
-    column = model.rows["p"][2] if name in ("6dgs", "7dgs") else 2
-    model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data[:, column] = math.log(1e-7)
-    return model
+def flat(name: str) -> tuple[GaussianModel, Tensor, list[int]]:
+    """A model whose Gaussians are flatter than 1e6 : 1 along one axis, its sizes, and their columns in space."""
+    model, random = build(name, **OPTIONS[name]), torch.Generator().manual_seed(0)
+    model.initialise(random_points(200, 1.0, random), 4.0, random)
+    sizes, space = ("log_diagonal", model.rows["p"]) if name in ("6dgs", "7dgs") else ("scales", [0, 1, 2])
+    model.splats[sizes].data[:, space[2]] = math.log(1e-7)
+    return model, model.splats[sizes].data, [*space]
 
 
 @pytest.mark.parametrize(
@@ -52,40 +52,31 @@ def flat(name: str) -> GaussianModel:
 )
 def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras: list[Camera], pixel: float) -> None:
     """Catches the farthest camera, a mean over cameras, and a focal length that is left out, or the smaller of two."""
-    model = flat("3dgs")
+    model = flat("3dgs")[0]
     model.splats["means"].data.zero_()
-    torch.testing.assert_close(scale_of(model, cameras).least, torch.full((200,), LEAST_PIXELS * pixel))
+    least = MinimumScale(training_of(model, camera=cameras)).least
+    torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * pixel))
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_no_camera_sees_the_floor(name: str) -> None:
-    """Catches a bound that touches the image, one on another axis or on time, and one that is not held."""
-    model, eye = flat(name), camera(4.0)
-    background = torch.zeros(3)
-    before = render(model, eye, 0.5, background)
-    others = {n: p.detach().clone() for n, p in model.splats.items() if n not in ("scales", "log_diagonal")}
-    minimum_scale = scale_of(model, [eye])
+def test_no_camera_sees_the_floor_and_only_sizes_in_space_are_held(name: str) -> None:
+    """Catches a bound that touches the image, one on another axis, and one that is not held, that lengthens what is
+    short in time, or that widens what is narrow in direction."""
+    (model, sizes, space), eye = flat(name), camera(4.0)
+    before, others = render(model, eye, 0.5, torch.zeros(3)), sizes.clone()
+    hook = MinimumScale(training_of(model, camera=[eye]))
     with torch.no_grad():
-        minimum_scale.after_update(0)
-    after = render(model, eye, 0.5, background)
+        hook.after_update(0)
+    after = render(model, eye, 0.5, torch.zeros(3))
     assert 0 < (after - before).abs().max() < 1 / 255
+    assert torch.equal(sizes != others, torch.arange(sizes.shape[1]).expand_as(sizes) == space[2])
     factors = model.slice(CameraTime.at(eye.center, 0.5)).factors
-    assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * minimum_scale.least).all()
-    assert all(torch.equal(model.splats[n], p) for n, p in others.items())
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_only_sizes_in_space_are_held(name: str) -> None:
-    """Catches a minimum scale that lengthens what is short in time, or widens what is narrow in direction."""
-    model = flat(name)
-    space = model.rows["p"] if name in ("6dgs", "7dgs") else [0, 1, 2]
-    sizes = model.splats["log_diagonal" if name in ("6dgs", "7dgs") else "scales"].data
+    assert (torch.linalg.svdvals(factors)[:, 2] >= 0.99 * hook.least).all()
     sizes.fill_(math.log(1e-7))
-    minimum_scale = scale_of(model, [camera(4.0)])
     with torch.no_grad():
-        minimum_scale.after_update(0)
+        hook.after_update(0)
     for column in range(sizes.shape[1]):
-        expected = minimum_scale.least if column in space else torch.full((200,), 1e-7)
+        expected = hook.least if column in space else torch.full((200,), 1e-7)
         torch.testing.assert_close(sizes[:, column].exp(), expected, rtol=1e-4, atol=0)
 
 
@@ -100,17 +91,24 @@ def test_only_sizes_in_space_are_held(name: str) -> None:
 )
 def test_it_is_half_the_gap_between_the_times_of_training(times: tuple[Any, ...], least: float | None) -> None:
     """Catches the gap between views of the same time, the mean or longest gap, and a static scene or model with one."""
-    views = [SimpleNamespace(time=time) for time in times]
-    assert MinimumLifetime(training_of(build("4dgs"), views)).least == (least and pytest.approx(least))
+    assert MinimumLifetime(training_of(build("4dgs"), time=[*times])).least == (least and pytest.approx(least))
     for name in ("3dgs", "dbs_static", "ubs_static"):
-        assert MinimumLifetime(training_of(build(name), views)).least is None
+        assert MinimumLifetime(training_of(build(name), time=[*times])).least is None
 
 
-def test_every_step_of_a_training_holds_it() -> None:
-    """Catches a training that never calls it, or computes the gap from views of val or test."""
+def test_every_step_of_a_training_holds_them() -> None:
+    """Catches a training that never holds a minimum, computes the gap from views of val or test, or has the minimum
+    scale of other Gaussians once rows were moved."""
     square = moving_square()
     scene = replace(square, train=[replace(v, time=t) for v, t in zip(square.train, (0.0, 1.0) * 50, strict=False)])
-    fitted = trainer("freetime", "effects.gate=off", scene=scene)
-    fitted.model.splats["durations"].data.fill_(-9.0)
-    fitted.train_step()
-    assert fitted.model.splats["durations"].detach().exp().min() == pytest.approx(0.5)
+    fitted = trainer("freetime", "effects.gate=off", "train.densify.every=1", scene=scene)
+    splats, hook = fitted.model.splats, fitted.hook(MinimumScale)
+    for fitted.step in (0, 60):
+        splats["durations"].data.fill_(-9.0)
+        splats["scales"].data.fill_(-20.0)
+        least = hook.least
+        fitted.train_step()
+        assert splats["durations"].detach().exp().min() == pytest.approx(0.5)
+        assert len(hook.least) == len(fitted.model)
+        if fitted.step == 0:
+            torch.testing.assert_close(splats["scales"].detach()[:, 0], least.log(), rtol=1e-2, atol=0)

@@ -16,7 +16,7 @@ from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.scenes.scene import Points, View
 from gsbench.train.batches import generator
-from gsbench.train.density.multiview import LEAST_IMPORTANCE, VIEWS, ErrorScore, MultiviewDensification, drawn_once
+from gsbench.train.density.multiview import LEAST_IMPORTANCE, ErrorScore, MultiviewDensification
 from gsbench.train.density.rule import Scores
 from gsbench.train.hooks.minimum_sizes import MinimumScale
 from gsbench.train.losses import photometric
@@ -35,9 +35,8 @@ def four_gaussians() -> GaussianModel:
     model = build("3dgs")
     means = torch.tensor([[-0.5, 0.0, 0.0], [-0.4, 0.1, 0.3], [0.5, 0.2, 0.0], [0.4, -0.2, -0.3]])
     model.initialise(Points(means, torch.rand(4, 3, generator=generator(3))), 4.4, generator(0))
-    with torch.no_grad():
-        model.splats["scales"].fill_(math.log(0.15))
-        model.splats["opacities"].copy_(torch.tensor([2.0, 1.0, 0.5, -1.0]))
+    model.splats["scales"].data.fill_(math.log(0.15))
+    model.splats["opacities"].data.copy_(torch.tensor([2.0, 1.0, 0.5, -1.0]))
     return model
 
 
@@ -83,19 +82,15 @@ def test_scores_are_the_sums_by_hand() -> None:
     assert 0.05 < badness.sort().values[-2] < 0.95
 
 
-def test_a_perfect_image_flags_nothing() -> None:
-    """Catches a division by the range of errors that are all equal."""
+def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
+    """Catches a division by the range of errors that are all equal, and the least of no numbers: all Gaussians of a
+    training may have been pruned."""
     model = four_gaussians()
     exact = [replace(view, pixels=render(model, view.camera, view.time, GREY).detach())
              for view in moving_square().train[:2]]  # fmt: skip
     importance, badness = scores_of(model, exact)(generator(0))
     assert not importance.any()
     assert not badness.any()
-
-
-def test_a_model_without_gaussians_is_scored() -> None:
-    """Catches the least of no numbers: all Gaussians of a training may have been pruned."""
-    model = four_gaussians()
     Rows(model, Moments()).select(torch.arange(0))
     score = scores_of(model, moving_square().train)
     density = MultiviewDensification(Rows(model, Moments()), DensifyConfig(), 0.005, 10, score)
@@ -103,33 +98,15 @@ def test_a_model_without_gaussians_is_scored() -> None:
     assert len(model) == 0
 
 
-def test_ten_different_views_are_drawn_anew() -> None:
-    """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
-    score = scores_of(four_gaussians(), moving_square().train)
-    see, drawn = score._of_view, []
-    score._of_view = lambda view: drawn.append(view.name) or see(view)  # type: ignore[assignment,func-returns-value]
-    for seed in (0, 1, 0):
-        score(generator(seed))
-    rounds = [sorted(drawn[i * VIEWS : (i + 1) * VIEWS]) for i in range(3)]
-    assert len(drawn) == 30
-    assert all(len(set(names)) == 10 for names in rounds)
-    assert rounds[0] == rounds[2] != rounds[1]
-
-
-def rule(model: GaussianModel, importance: torch.Tensor, badness: torch.Tensor) -> MultiviewDensification:
-    """The rule with scores that are given, views that saw every Gaussian, and no gradients."""
-    config = DensifyConfig(grad_threshold=1.0)
-    return MultiviewDensification(Rows(model, Moments()), config, 0.005, 10, lambda _: Scores(importance, badness))
-
-
 def of_eight(name: str, opacities: list[float], badness: list[float]) -> tuple[MultiviewDensification, torch.Tensor]:
-    """The rule for a model of eight Gaussians, of which 2 to 5 are important; and their means."""
+    """The rule with scores that are given for eight Gaussians, of which 2 to 5 are important; and their means."""
     model = started(build(name, **OPTIONS[name]), 8)
-    with torch.no_grad():
-        model.splats["opacities"].copy_(torch.tensor(opacities))
+    model.splats["opacities"].data.copy_(torch.tensor(opacities))
     importance = torch.full((8,), LEAST_IMPORTANCE)
     importance[2:6] = 10.0
-    return rule(model, importance, torch.tensor(badness)), model.splats["means"].detach().clone()
+    scores, config = Scores(importance, torch.tensor(badness)), DensifyConfig(grad_threshold=1.0)
+    rule = MultiviewDensification(Rows(model, Moments()), config, 0.005, 10, lambda _: scores)
+    return rule, model.splats["means"].detach().clone()
 
 
 def copies(model: GaussianModel, means: torch.Tensor) -> list[int]:
@@ -175,13 +152,6 @@ def test_children_are_drawn_as_their_parent() -> None:
     density.densify(generator(1), has_reset=False, most=100)  # three are faint, so one is drawn: a child
     assert copies(density.model, means) == [1, 1, 0, 1, 1, 1, 1, 1]
     assert len(density.model) == 8
-
-
-def test_rows_are_drawn_once_in_proportion() -> None:
-    """Catches a row that is drawn twice, and weights that are not proportions."""
-    assert sorted(drawn_once(torch.tensor([1.0, 1e6, 1e-6]), 3, generator(0)).tolist()) == [0, 1, 2]
-    firsts = [int(drawn_once(torch.tensor([1.0, 3.0]), 1, generator(seed))) for seed in range(1000)]
-    assert 0.71 < sum(firsts) / 1000 < 0.79
 
 
 @pytest.mark.usefixtures("threads")

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes, assert_same_bits
+from interrupted import assert_same_bits
 from models.small import seeded
 from tiny_training import compose, trainer
 
@@ -24,13 +24,8 @@ QUERY = CameraTime.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
 VIEWMAT = torch.eye(4, dtype=torch.float64)
 VIEWMAT[2, 3] = 4.0
 VIEW = View("of QUERY", Camera(VIEWMAT, torch.eye(3, dtype=torch.float64), 16, 16), 0.5, torch.zeros(16, 16, 3))
-TIMED: dict[str, dict[str, Any]] = {
-    "4dgs": {},
-    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
-    "7dgs_nodir": {"lambda_t": 0.5},
-    "dgs": {},
-    "freetime": {},
-}
+TIMED: dict[str, dict[str, Any]] = {"4dgs": {}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+                                    "7dgs_nodir": {"lambda_t": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip
 WEIGHT = ("train.penalties.strain.weight=1.0", "train.batch_size=2")
 
 
@@ -57,10 +52,10 @@ def grid(count: int = 12) -> torch.Tensor:
 def test_only_a_translation_has_no_strain() -> None:
     """Catches a penalty of motion itself, which holds a moving object still, or one that a rotation escapes."""
     x = grid()
-    still = prepared(moving(x, torch.tensor([[0.3, -0.2, 0.9]], dtype=torch.float64).expand_as(x)))
-    assert still(QUERY, 0).detach() < 1e-25
     turn = torch.stack([-x[:, 1], x[:, 0], torch.zeros_like(x[:, 0])], -1)
-    assert prepared(moving(x, turn))(QUERY, 0).detach() > 0.1
+    for velocities, is_strained in ((torch.tensor([[0.3, -0.2, 0.9]]).double().expand_as(x), False), (turn, True)):
+        strain = float(prepared(moving(x, velocities))(QUERY, 0).detach())
+        assert strain > 0.1 if is_strained else strain < 1e-25
 
 
 def test_two_points_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,19 +72,13 @@ def test_two_points_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(float(prepared(model)(QUERY, index).detach()), expected)
 
 
-def started(name: str, agr: bool) -> GaussianModel:
-    """A model at its start, in float64."""
-    model, points = build(name, agr=agr, **TIMED[name]), grid(14).float()
+def lively(name: str, agr: bool, noise: float = 0.05) -> GaussianModel:
+    """A model in mid-training, all of whose Gaussians can be seen, in float64."""
+    model, points, g = build(name, agr=agr, **TIMED[name]), grid(14).float(), seeded(2)
     model.initialise(Points(points, points), 2.0, seeded(0))
-    return model.double()
-
-
-def lively(name: str, agr: bool) -> GaussianModel:
-    """A model in mid-training, all of whose Gaussians can be seen."""
-    model, g = started(name, agr), seeded(2)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
+    model.double()
+    for parameter in model.parameters():
+        parameter.data += noise * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
     model.splats["times"].data.fill_(0.1 if name == "dgs" else 0.55)
     model.set_active(ActiveComponents(3, agr, True))
     return model
@@ -135,7 +124,7 @@ def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
 
 def test_what_is_culled_later_does_not_count() -> None:
     """Catches the jump of a mean that is culled at t1, and so stays at mu_p, taken for a very large velocity."""
-    model = started("7dgs_nodir", False)
+    model = lively("7dgs_nodir", agr=False, noise=0.0)
     splats = {name: x.data for name, x in model.splats.items()}
     splats["times"].fill_(0.5)
     splats["times"][:3] -= 5e-5
@@ -198,31 +187,26 @@ def test_neighbours_at_the_edge(place: str) -> None:
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["7dgs", "4dgs", "dgs"])
 def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
-    """Catches draws that depend on the order of threads, and gradients that threads add in any order."""
+    """Catches draws that depend on the order of threads, gradients that threads add in any order, and no penalty."""
     ends = []
-    for count in (1, 2):
+    for count, words in ((1, WEIGHT), (2, WEIGHT), (1, ())):
         torch.set_num_threads(count)
-        fitted = trainer(name, *WEIGHT, "train.refine_from=0", "train.batch_size=3")
+        fitted = trainer(name, *words, "train.refine_from=0", "train.batch_size=3")
         for fitted.step in range(6):
             fitted.train_step()
-        ends.append((fitted.finite_check.loss, fitted.model.pack()))
-    assert_same_bits([*ends[0]], [*ends[1]])
-    plain = trainer(name, "train.batch_size=3", "train.refine_from=0")
-    for plain.step in range(6):
-        plain.train_step()
-    assert plain.finite_check.loss != ends[0][0]
+        ends.append({"loss": fitted.finite_check.loss, **fitted.model.state_dict()})
+    assert_same_bits(*ends[:2])
+    assert ends[2]["loss"] != ends[0]["loss"]
 
 
-def test_neighbours_continue_from_a_checkpoint() -> None:
-    """Catches neighbours that a resumed training searches anew, and gets others."""
-    words = (*WEIGHT, "train.densify.start=0", "train.densify.stop=20", "train.densify.every=10",
-             "train.iterations=40", "train.recipe_iterations=40")  # fmt: skip
-    stopped = assert_resumes(lambda: trainer("7dgs", *words), 25)[1]
-    state = stopped.state_dict()
-    assert state["hooks"]["penalties"]["strain"]["searched"] == 20
-    state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(stopped.model)
+def test_damaged_neighbours_are_refused() -> None:
+    """Catches an index beyond the Gaussians that a checkpoint brings."""
+    fitted = trainer("7dgs", *WEIGHT)
+    fitted.train_step()
+    state = fitted.state_dict()
+    state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(fitted.model)
     with pytest.raises(InputError, match="neighbours"):
-        trainer("7dgs", *words).load_state_dict(state)
+        trainer("7dgs", *WEIGHT).load_state_dict(state)
 
 
 @pytest.mark.parametrize("name", ["3dgs", "6dgs"])

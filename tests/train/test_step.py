@@ -1,6 +1,5 @@
-"""The gradients of a step: a mean over views, sums of any number of threads, images in bytes, penalties."""
+"""A step: which views it sees, the gradients as a mean over them for any number of threads, and penalties."""
 
-import itertools
 from dataclasses import fields, replace
 
 import pytest
@@ -9,6 +8,7 @@ from tiny_training import moving_square, trainer
 
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.scenes.scene import View
+from gsbench.train.batches import batch, generator
 from gsbench.train.hooks.penalties import Penalties, PenaltiesConfig
 from gsbench.train.regularisers import PENALTIES
 from gsbench.train.step import Sums, ViewResult, add_up, deal
@@ -54,21 +54,17 @@ def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPa
     assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
-def summed(views: int, workers: int) -> torch.Tensor:
-    """The gradient of a batch of views; many numbers, since each order of sums rounds some of them its added way."""
-    bounds = [views * worker // workers for worker in range(workers + 1)]
-    each = torch.randn(views, 1000, generator=torch.Generator().manual_seed(views))
-    sums: list[Sums] = deal(views, bounds)
-    for added, value in zip(sums, each, strict=True):
-        added[0] = added[0] + value if 0 in added else value.clone()
-    return add_up(sums)[0]
-
-
 @pytest.mark.parametrize("views", range(1, 10))
 def test_any_number_of_workers_gives_the_same_bits(views: int) -> None:
     """Catches views of one worker that are added to each other before those in front of them."""
-    sums = [summed(views, workers) for workers in range(1, views + 1)]
-    assert all(torch.equal(a, b) for a, b in itertools.pairwise(sums))
+    each = torch.randn(views, 1000, generator=torch.Generator().manual_seed(views))  # some sums round with the order
+    totals = []
+    for workers in range(1, views + 1):
+        sums: list[Sums] = deal(views, [views * worker // workers for worker in range(workers + 1)])
+        for added, value in zip(sums, each, strict=True):
+            added[0] = added[0] + value if 0 in added else value.clone()
+        totals.append(add_up(sums)[0])
+    assert all(torch.equal(total, totals[0]) for total in totals)
 
 
 def test_two_workers_hold_two_sums_and_one_view_has_one() -> None:
@@ -137,3 +133,19 @@ def test_penalties_act_in_their_window_and_reach_the_gradient() -> None:
 def test_every_penalty_has_its_settings() -> None:
     """Catches a penalty without a weight in the config, and a weight that nothing reads."""
     assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
+
+
+def test_every_view_is_seen_once_an_epoch() -> None:
+    """Catches sampling with replacement, and batches that lose views where an epoch ends within them."""
+    order = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
+    for epoch in range(15):
+        assert sorted(order[7 * epoch : 7 * epoch + 7]) == list(range(7))
+    assert order[:7] != order[7:14]
+
+
+def test_batches_depend_on_seed_and_step_alone() -> None:
+    """Catches hidden state in the order of views, which a resumed run would not have, and seeds that collide: (0, 1)
+    and (1, 0), or a stream that is used again for another purpose."""
+    assert batch(12, 60, 4, seed=3) == batch(12, 60, 4, seed=3)
+    assert any(batch(k, 60, 4, seed=3) != batch(k, 60, 4, seed=4) for k in range(3))
+    assert len({generator(*key).initial_seed() for key in [(0,), (1,), (0, 0), (0, 1), (1, 0), (0, 1, 0)]}) == 6
