@@ -105,7 +105,7 @@ gpu-check:  ## on a machine with a GPU, offline: build, test, train, sanitize an
 	$(PYTHON) benchmarks/gpu_check.py $(ARGS)
 
 slurm-check: setup  ## as root, with Slurm from Debian's packages: sweep on a real Slurm, break it, compare with this machine's numbers
-	$(BIN)/python tests/slurm/check.py $(ARGS)
+	PYTHONPATH=tests $(BIN)/python tests/slurm/check.py $(ARGS)
 
 sanitize: setup  ## build the kernels with the address and undefined-behaviour sanitizers and run their tests
 	tests/kernels/sanitize.sh $(BIN)/python

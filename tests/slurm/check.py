@@ -3,9 +3,9 @@
     make slurm-check
 
 A sweep of 2 scenes x 2 models x 2 seeds is done on this machine without Slurm; that is what every number is compared
-with. Then it is done on the Slurm of cluster.py while jobs, nodes, memory, disk and data fail under it. What fails must
-be named by `python -m gsbench.launch status` with its reason, `... retry` must complete it, and every record that comes
-out must equal the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint's tensors.
+with. Then it is done on the Slurm of cluster.py while jobs, nodes, memory and the disk fail under it. What fails is
+named by `python -m gsbench.launch status` with its reason, `... retry` completes it, and every record that comes out
+equals the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint.
 """
 
 import contextlib
@@ -18,12 +18,11 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
 from cluster import Cluster, missing, send, wait_until
+from interrupted import assert_same_bits, bits
 
 from gsbench.errors import InputError
 from gsbench.run.progress import FILE_NAME as PROGRESS
@@ -63,7 +62,10 @@ class Sweep:
 
     def status(self) -> list[dict[str, Any]]:
         """What `python -m gsbench.launch status` says of each run."""
-        done = self._run("gsbench.launch", "status", str(self.results / "mini"), "--json")
+        command = [sys.executable, "-m", "gsbench.launch", "status", str(self.results / "mini"), "--json"]
+        done = subprocess.run(
+            command, env=self.cluster.environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+        )
         return json.loads(done.stdout) if done.stdout else []
 
     def states(self) -> list[str]:
@@ -104,12 +106,6 @@ class Sweep:
                 [sys.executable, "-m", *module], env=self.cluster.environment, cwd=ROOT, stdout=log, stderr=log
             )
 
-    def _run(self, *module: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", *module], env=self.cluster.environment, cwd=ROOT, capture_output=True, text=True,
-            timeout=120, check=False,
-        )  # fmt: skip
-
 
 class Check:
     """The injections, each with a line of what came of it; `reference` holds the results of this machine."""
@@ -119,30 +115,30 @@ class Check:
         self.cluster = cluster
         self.reference = folder / "reference"
         self.faults: list[str] = []
+        self.since = time.monotonic()  # the last line
 
     def sweep(self, name: str, *overrides: str) -> Sweep:
         """Submit a sweep into the results folder `name`."""
         return Sweep(self.cluster, self.folder / name, *overrides)
 
-    def say(self, name: str, wanted: str, holds: bool, got: object, since: float) -> None:
-        """Print a line of an injection, and remember it if what is wanted does not hold."""
-        shown = str(got).replace(f"{self.folder}/", "")
-        line = f"{name}: {wanted}: {'yes' if holds else 'NO'} ({shown}; {time.monotonic() - since:.0f} s)"
+    def say(self, name: str, wanted: str, holds: bool, got: object) -> None:
+        """Print a line of an injection with its seconds, and remember it if what is wanted does not hold."""
+        shown, since, self.since = str(got).replace(f"{self.folder}/", ""), self.since, time.monotonic()
+        line = f"{name}: {wanted}: {'yes' if holds else 'NO'} ({shown}; {self.since - since:.0f} s)"
         print(("ok    " if holds else "FAULT ") + line, flush=True)
         if not holds:
             self.faults.append(line)
 
-    def completed(self, name: str, sweep: Sweep, runs: int, since: float) -> None:
+    def completed(self, name: str, sweep: Sweep, runs: int) -> None:
         """Say whether every run of a sweep is done and equals that of this machine."""
         states = sweep.states()
         differing = differences(self.reference, sweep.results)
         self.say(name, f"{runs} of {runs} done, equal to this machine's", states == ["done"] * runs and not differing,
-                 differing or f"{states.count('done')} done", since)  # fmt: skip
+                 differing or f"{states.count('done')} done")  # fmt: skip
 
 
 def killed_jobs_and_nodes(check: Check) -> None:
     """SIGKILL of a job's process, requeue of a job, loss of a node, in one sweep of eight runs."""
-    begin = time.monotonic()
     sweep = check.sweep("killed", *ALL)
 
     killed = sweep.one_training()
@@ -150,35 +146,28 @@ def killed_jobs_and_nodes(check: Check) -> None:
     wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
     reasons = sweep.broken()
     check.say("SIGKILL of a job's process", "named with its job and its end",
-              len(reasons) == 1 and f"job {killed.job} ended: FAILED" in reasons[0], reasons[0], begin)  # fmt: skip
+              len(reasons) == 1 and f"job {killed.job} ended: FAILED" in reasons[0], reasons[0])  # fmt: skip
 
-    begin = time.monotonic()
     job = str(sweep.one_training().job)
     check.cluster.run("scontrol", "requeue", job)
-    wait_until(
-        "the requeued run waits",
-        lambda: "PENDING" in check.cluster.run("squeue", "-h", "--array", "-o", "%T", "-j", job),
-        60,
-    )
+    in_queue = ("squeue", "-h", "--array", "-o", "%T", "-j", job)
+    wait_until("the requeued run waits", lambda: "PENDING" in check.cluster.run(*in_queue), 60)
     requeued = [run for run in sweep.status() if run["job"] == job]
     check.say("requeue of a running job", "queued, not lost", [run["state"] for run in requeued] == ["queued"],
-              f"{requeued[0]['state']} at step {requeued[0]['step']}: {requeued[0]['reason']}", begin)  # fmt: skip
+              f"{requeued[0]['state']} at step {requeued[0]['step']}: {requeued[0]['reason']}")  # fmt: skip
 
-    begin = time.monotonic()
     sweep.one_training("n2")
     check.cluster.kill_node("n2")
     wait_until("n2 is down", lambda: check.cluster.states()["n2"].startswith("down"), 120)
     check.cluster.start_node("n2")
     check.say("SIGKILL of a slurmd and its jobs", "only the first injection is lost", len(sweep.broken()) == 1,
-              ", ".join(sweep.states()), begin)  # fmt: skip
+              ", ".join(sweep.states()))  # fmt: skip
 
-    begin = time.monotonic()
     sweep.wait(400)
-    check.say("the other seven", "done", sweep.states() == ["done"] * 7 + ["lost"], ", ".join(sweep.states()), begin)
+    check.say("the other seven", "done", sweep.states() == ["done"] * 7 + ["lost"], ", ".join(sweep.states()))
 
-    begin = time.monotonic()
     sweep.retry()
-    check.completed("retry after the kills", sweep, 8, begin)
+    check.completed("retry after the kills", sweep, 8)
 
 
 def time_limit(check: Check) -> None:
@@ -187,7 +176,6 @@ def time_limit(check: Check) -> None:
     image.touch()
     in_image = (f"launch.container={image}", f"launch.container_command={apptainer(check.folder)} exec")
     for name, launch in ("time limit", ()), ("time limit in a container image", in_image):
-        begin = time.monotonic()
         # Without growth all steps take equally long, so that a short run just before says how many fill the time.
         fixed = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000")
         rate = check.folder / f"rate_{name.replace(' ', '_')}"
@@ -200,8 +188,8 @@ def time_limit(check: Check) -> None:
         sweep.wait(600)
         log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
         check.say(name, "saved and requeued at Slurm's signal", "continues from step" in log,
-                  f"{log.count('continues from step')} times", begin)  # fmt: skip
-        check.completed(name, sweep, 1, begin)
+                  f"{log.count('continues from step')} times")  # fmt: skip
+        check.completed(name, sweep, 1)
 
 
 def apptainer(folder: Path) -> Path:
@@ -215,18 +203,16 @@ def apptainer(folder: Path) -> Path:
 
 def out_of_memory(check: Check) -> None:
     """A job that takes more memory than it asked for is killed by Slurm."""
-    begin = time.monotonic()
     sweep = check.sweep("memory", *ONE, "launch.memory=100M")
     sweep.wait()
     reasons = sweep.broken()
-    check.say("out of memory", "named", "memory limit" in reasons[0], reasons[0], begin)
+    check.say("out of memory", "named", "memory limit" in reasons[0], reasons[0])
     sweep.retry("launch.memory=2G")
-    check.completed("retry with more memory", sweep, 1, begin)
+    check.completed("retry with more memory", sweep, 1)
 
 
 def full_disk(check: Check) -> None:
     """The disk of the results, a tmpfs of 64 MiB, fills up while a run trains."""
-    begin = time.monotonic()
     disk = check.folder / "disk"
     disk.mkdir()
     if not check.cluster.ok("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk)):
@@ -244,78 +230,31 @@ def full_disk(check: Check) -> None:
                     break
         wait_until("the run has ended", lambda: sweep.broken() != [], 120)
         reasons = sweep.broken()
-        check.say("full disk", "named", "No space left" in reasons[0], reasons[0], begin)
+        check.say("full disk", "named", "No space left" in reasons[0], reasons[0])
         fill.unlink()
         sweep.wait()
         sweep.retry()
-        check.completed("retry with room", sweep, 1, begin)
+        check.completed("retry with room", sweep, 1)
     finally:
         check.cluster.ok("umount", "--lazy", str(disk))  # a log may still be open
 
 
-def corrupt_scene(check: Check) -> None:
-    """One of two scenes has a broken image."""
-    begin = time.monotonic()
-    data = check.folder / "data"
-    shutil.copytree(ROOT / "gsbench" / "scenes" / "sample", data)
-    image = sorted((data / "suzanne").rglob("*.png"))[0]
-    whole = image.read_bytes()
-    image.write_bytes(whole[: len(whole) // 2])
-    sweep = check.sweep("corrupt", *SHORT, "model=3dgs", "seed=0", f"scene={','.join(SCENES)}", f"data.root={data}")
-    sweep.wait()
-    reasons = sweep.broken()
-    check.say("corrupt scene", "the image is named, the other scene is done",
-              sweep.states() == ["done", "failed"] and image.name in reasons[0], reasons[0], begin)  # fmt: skip
-    image.write_bytes(whole)
-    sweep.retry()
-    check.completed("retry with the scene repaired", sweep, 2, begin)
-
-
-def two_sweeps(check: Check) -> None:
-    """Two commands ask for the same runs in the same folder at the same time."""
-    begin = time.monotonic()
-    words = [*SHORT, "scene=suzanne", "model=3dgs", "seed=0,1"]
-    sweeps = [check.sweep("twice", *words), check.sweep("twice", *words)]
-    for sweep in sweeps:
-        sweep.wait()
-    check.completed("two sweeps on one folder", sweeps[0], 2, begin)
-
-
-INJECTIONS: tuple[Callable[[Check], None], ...] = (
-    killed_jobs_and_nodes, time_limit, out_of_memory, full_disk, corrupt_scene, two_sweeps,
-)  # fmt: skip
+INJECTIONS = (killed_jobs_and_nodes, time_limit, out_of_memory, full_disk)
 
 
 def differences(reference: Path, results: Path) -> list[str]:
-    """What differs between the finished runs of a folder and the same runs of the reference."""
+    """How the finished runs of a folder differ from the same runs of the reference: status, metrics, curve, or bits."""
     differing = []
-    for path in sorted(results.rglob("record.json")):
-        run = path.parent.relative_to(results)
-        here, there = (measured(root / run) for root in (reference, results))
-        if there["status"] == "ok":
-            differing += [f"{run}: {part}" for part, value in there.items() if not equal(value, here[part])]
+    for run in (path.parent.relative_to(results) for path in sorted(results.rglob("record.json"))):
+        records = [json.loads((root / run / "record.json").read_text()) for root in (reference, results)]
+        here, there = ([record["status"], record["metrics"], [point[::2] for point in record["curve"] or []]]
+                       for record in records)  # fmt: skip
+        try:
+            assert_same_bits(here, there, "record")
+            assert_same_bits(bits(reference / run), bits(results / run))
+        except (AssertionError, InputError) as error:
+            differing.append(f"{run}: {error}")
     return differing
-
-
-def measured(run: Path) -> dict[str, Any]:
-    """The status of a finished run, its metrics, and its curve and the state in its checkpoint less their times."""
-    from gsbench.train.checkpoint import read, without_times
-
-    record = json.loads((run / "record.json").read_text())
-    state = without_times(read(run / "checkpoint.pt").state) if record["status"] == "ok" else None
-    curve = [[step, psnr] for step, _, psnr in record["curve"] or []]
-    return {"status": record["status"], "metrics": record["metrics"], "curve": curve, "checkpoint": state}
-
-
-def equal(a: Any, b: Any) -> bool:
-    """Whether two states are equal to the bit."""
-    if isinstance(a, torch.Tensor):
-        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
-    if isinstance(a, list):
-        return len(a) == len(b) and all(map(equal, a, b))
-    return bool(a == b)
 
 
 def do_here(folder: Path, overrides: tuple[str, ...]) -> None:

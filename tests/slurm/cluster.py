@@ -192,22 +192,15 @@ class Cluster:
         key = self.folder / "munge.key"
         key.write_bytes(secrets.token_bytes(128))
         key.chmod(0o400)
-        at = [
-            f"--{what}={self.folder}/munge.{what.removesuffix('-file')}"
-            for what in ("key-file", "socket", "pid-file", "log-file", "seed-file")
-        ]
+        at = [f"--{what}={self.folder}/munge.{what.removesuffix('-file')}" for what in (
+            "key-file", "socket", "pid-file", "log-file", "seed-file")]  # fmt: skip
         self.start("munged", "munged", "--foreground", "--force", *at)
         self._until("munged answers", (self.folder / "munge.socket").exists)
 
     def _database(self) -> None:
         data, sock = self.folder / "sql", self.folder / "sql.socket"
-        self.run(
-            "mariadb-install-db",
-            "--no-defaults",
-            "--user=root",
-            f"--datadir={data}",
-            "--auth-root-authentication-method=socket",
-        )
+        self.run("mariadb-install-db", "--no-defaults", "--user=root", f"--datadir={data}",
+                 "--auth-root-authentication-method=socket")  # fmt: skip
         self.start("mariadbd", "mariadbd", "--no-defaults", "--user=root", f"--datadir={data}", f"--socket={sock}",
                    "--bind-address=127.0.0.1", f"--port={self.sql['sql_port']}", f"--pid-file={self.folder}/sql.pid",
                    "--innodb-buffer-pool-size=64M", "--innodb-lock-wait-timeout=900")  # fmt: skip

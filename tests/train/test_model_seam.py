@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import torch
 from interrupted import assert_resumes
-from tiny_training import compose, moving_square, train, trainer
+from tiny_training import compose, moving_square, train
 from torch import Tensor, nn
 
 from gsbench.config import LearningRate
@@ -14,9 +14,7 @@ from gsbench.models.base import Raw
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.scenes import Points
-from gsbench.schedule import Schedule
 from gsbench.train.batches import generator
-from gsbench.train.hooks.average import Average
 from gsbench.train.loop import Trainer
 
 
@@ -72,10 +70,3 @@ def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times() ->
     model = assert_resumes(deformed, 30)[0].model
     assert not model.active.warms_up
     assert model.field.weight.any()
-
-
-def test_a_warm_up_is_not_an_end() -> None:
-    """Catches an early stop that keeps a static first stage."""
-    schedule = Schedule(compose("3dgs", 100, "train.sh_every=1").train, 0, False, warm_up=9_000)
-    assert [step for step in range(100) if not schedule.is_complete(step)] == list(range(30))
-    assert trainer("3dgs").hook(Average).results() == {"averaged": 0}

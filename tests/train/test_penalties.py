@@ -200,10 +200,12 @@ def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
 
 
 def test_damaged_neighbours_are_refused() -> None:
-    """Catches an index beyond the Gaussians that a checkpoint brings."""
+    """Catches an index beyond the Gaussians that a checkpoint brings, and one that forgets when they were searched."""
     fitted = trainer("7dgs", *WEIGHT)
+    fitted.step = 7
     fitted.train_step()
     state = fitted.state_dict()
+    assert state["hooks"]["penalties"]["strain"]["searched"] == 7
     state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(fitted.model)
     with pytest.raises(InputError, match="neighbours"):
         trainer("7dgs", *WEIGHT).load_state_dict(state)

@@ -53,20 +53,20 @@ def test_intervals_never_fall_below_what_they_wait_for() -> None:
     assert all(step + 1 + s.reset_every // 2 <= s.densify_stop for step in resets)
 
 
-def test_agr_never_acts_where_it_is_off() -> None:
-    """Catches a schedule that refines a model without AGR."""
-    s = Schedule(TrainConfig(iterations=100), sh_degree=3, agr=False)
-    assert not any(s.active(step).refine for step in range(100))
-
-
 def test_growth_follows_the_resolution() -> None:
     """Catches a limit that a quarter of the width fills with Gaussians, and one that full resolution does not have."""
-    config = TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig())
-    s = Schedule(config, sh_degree=3, agr=True)
+    s = Schedule(TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig()), sh_degree=3, agr=True)
     assert s.most_gaussians(0, 48_000) == 3_000  # 48,000 / 4^2
     assert s.most_gaussians(7_500, 48_000) == 16_971  # 48,000 / 2^1.5
     assert s.most_gaussians(14_999, 48_000) == 48_000
     assert schedule(30_000).most_gaussians(0, 48_000) == 48_000
+
+
+def test_parts_act_only_where_they_are() -> None:
+    """Catches a schedule that refines a model without AGR, and an early stop that keeps a static first stage."""
+    plain, warmed = (Schedule(TrainConfig(iterations=100, sh_every=1), 0, False, warm_up=at) for at in (0, 9_000))
+    assert not any(plain.active(step).refine for step in range(100))
+    assert [step for step in range(100) if not warmed.is_complete(step)] == list(range(30))
 
 
 @pytest.mark.parametrize(("iterations", "points"), [(1_000, 10), (7, 3), (5, 20), (100, 1)])
@@ -76,3 +76,17 @@ def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points:
     steps = [step for step in range(iterations) if s.measures(step)]
     assert steps[-1] == iterations - 1
     assert len(steps) == min(points, iterations)
+
+
+@pytest.mark.parametrize(("points", "stop", "after"), [(20, 15_000, 700), (10, 15_000, 700), (3, 15_000, 1000),
+                                                       (1, 15_000, 1000), (20, 25_000, 850)])  # fmt: skip
+def test_models_are_compared_at_a_point_of_the_curve_after_densification(points: int, stop: int, after: int) -> None:
+    """Catches a comparison before 70 % of the steps, where PSNR is not measured, or of models that still grow."""
+    config = TrainConfig(iterations=1000, curve_points=points, densify=DensifyConfig(stop=stop))
+    assert Schedule(config, sh_degree=3, agr=True).compares_after == after
+
+
+def test_gaussians_are_thinned_once_after_densification() -> None:
+    """Catches thinning that is never done, or while Gaussians still grow."""
+    s = Schedule(TrainConfig(iterations=1000, densify=DensifyConfig(thin_to=0.5)), sh_degree=3, agr=False)
+    assert [step + 1 for step in range(1000) if s.thins(step)] == [520]  # 15,600 of 30,000
