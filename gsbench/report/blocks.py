@@ -415,15 +415,6 @@ def trex400(published: Path) -> str:
     return block(rows, list(rows[0])[1:])
 
 
-def trex200(published: Path) -> str:
-    """Return the table of trex at 200 x 200 pixels."""
-    names = ["psnr_db", "psnr_db ±", "psnr_train_db", "ssim", "lpips_alex", "gaussians"]
-    of = mean(only(published, "dnerf"), *(name for name in names if "±" not in name))
-    table = of.xs("downscale=4,iterations=7000", level="variant").sort_values("psnr_db", ascending=False)[names]
-    rank = (table.psnr_db == table.psnr_db.max()).astype(int)
-    return markdown(Section("", "", "", table.assign(**{"psnr_db rank": rank}).reset_index()))
-
-
 def on_demand(published: Path) -> str:
     """Return what the removal of effects from Gaussians changes, as a range over scenes."""
     quantities = {
@@ -472,7 +463,6 @@ RESULTS: dict[str, Callable[[Path], str]] = {
     "suite_choices": suite_choices,
     "lengths": lengths,
     "ablation": ablation,
-    "trex200": trex200,
     "trex400": trex400,
     "on_demand": on_demand,
 }
