@@ -19,7 +19,7 @@ from gsbench.gates.gate import effect_sets_of, gate_within
 from gsbench.gates.sensitivity import MOST_VIEWS, probe, share_asleep, visible_times
 from gsbench.measure.exact_views import decides
 from gsbench.measure.quality import evenly
-from gsbench.measure.record import Direction, Gate
+from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import DIRECTION, EffectSets
@@ -28,6 +28,7 @@ from gsbench.models.simplifications import STATIC, shares_of
 from gsbench.reading import parse
 from gsbench.scenes import View
 from gsbench.train.hooks import Hook, Training
+from gsbench.train.hooks.choices import Choices
 
 # Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
 # largest losses from which the rest of the training recovers on every scene tried (docs/effects.md).
@@ -70,6 +71,7 @@ class Gating(Hook):
         self.gates: list[Gate] = []
         self.notes: list[str] = []
         self.direction: Direction | None = None
+        self.screen: TimeScreen | None = None  # by which model=auto chose the model
         scene = training.scene
         self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
         if scene.val and self.config.scene.eval_split != "val":
@@ -201,6 +203,12 @@ class Gating(Hook):
         self.gates = [parse(Gate, gate, "checkpoint: gate") for gate in gates]
         self.notes = notes
         self.direction = parse(Direction, direction, "checkpoint: direction") if direction is not None else None
+
+    def results(self) -> dict[str, Any]:
+        if self.screen is None and self.config.effects.gate == "off":
+            return {}
+        comparison = self.training.hook(Choices).chosen.comparison
+        return {"on_demand": OnDemand(self.screen, self.gates, self.notes, self.direction, comparison)}
 
 
 @torch.no_grad()

@@ -128,10 +128,6 @@ class GaussianModel(nn.Module, ABC):
         """
         return torch.diag_embed(self.scales()[rows, None].expand(-1, 3))
 
-    def log_sizes(self, index: int) -> Tensor:
-        """Return the log sizes of one Gaussian in its n dimensions, [n]; by default only the largest size, [1]."""
-        return self.scales()[index : index + 1].log()
-
     def durations(self) -> Tensor | None:
         """Return each Gaussian's standard deviation in time, [N] (1 = the length of the scene); None without time."""
         return None

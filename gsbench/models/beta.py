@@ -64,10 +64,6 @@ class BetaModel(GaussianModel):
         raw = dict(self.splats.items())
         return positive(raw["scales"][:, :3]) / reach(profiles(raw)).detach()[:, None]
 
-    def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the sizes of the Gaussian `index`, in position and then in other variables."""
-        return positive(self.splats["scales"].detach()[index]).log()
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the sizes such that the Gaussians that look like the profiles are at least `least` [N] large."""
         raw = {name: value.data for name, value in self.splats.items()}

@@ -147,10 +147,6 @@ class CholeskyModel(JointModel):
         T_pp = reduce(self.factors(dict(self.splats.items())).detach()).T_pp
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
-    def log_sizes(self, index: int) -> Tensor:
-        """Return the logarithms of the diagonal entries of the Cholesky factor of the Gaussian `index`."""
-        return self.splats["log_diagonal"].detach()[index]
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]

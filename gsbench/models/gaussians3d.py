@@ -52,10 +52,6 @@ class Gaussians3DModel(GatedModel, gates=True):
         """Return the three scales of each Gaussian, [N, 3]."""
         return sizes(self.splats["scales"])
 
-    def log_sizes(self, index: int) -> Tensor:
-        """Return the three log scales of the Gaussian `index`, [3]."""
-        return self.splats["scales"].detach()[index]
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise all three scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data.clamp_(min=log(least)[:, None])

@@ -198,10 +198,6 @@ class Gaussians4DModel(JointModel, gates=True):
         """Return the three spatial scales of each Gaussian, [N, 3]; density control uses the largest one, as 4DGS."""
         return sizes(self.splats["scales"][:, :3])
 
-    def log_sizes(self, index: int) -> Tensor:
-        """Return the four log scales of the Gaussian `index`, [4]."""
-        return self.splats["scales"].detach()[index]
-
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=log(least)[:, None])

@@ -24,7 +24,7 @@ from gsbench.measure.exact_views import sentence
 from gsbench.measure.images import Pixels, write_png
 from gsbench.measure.machine import hardware, named
 from gsbench.measure.provenance import provenance
-from gsbench.measure.record import Effects, OnDemand, Record, Status
+from gsbench.measure.record import Effects, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.process.memory import is_out_of_memory
@@ -34,14 +34,13 @@ from gsbench.run.identity import RunSpec
 from gsbench.run.log import RunLog, check_tracker
 from gsbench.run.progress import Progress
 from gsbench.run.selection import (
-    Resolved,
-    before_scene,
+    ChosenModel,
     best_length,
     best_of,
     check_candidates,
+    choose_model,
     plain,
     reporter,
-    resolve,
 )
 from gsbench.run.settings import check_settings, is_auto, lpips_weights, with_candidate
 from gsbench.run.setup import build, check_start, load_scene, trained_start
@@ -51,7 +50,7 @@ from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.placement import gaussians_to_standard
 from gsbench.train import checkpoint
 from gsbench.train.divergence import DivergedError, explain
-from gsbench.train.hooks.choices import Choices, choices_in, lengths_of
+from gsbench.train.hooks.choices import choices_in, lengths_of
 from gsbench.train.loop import Trainer
 
 TRACEBACK = "traceback.txt"
@@ -69,7 +68,8 @@ class Execution:
     def __init__(self, spec: RunSpec) -> None:
         """Store the run; no file is read and no setting is checked yet."""
         self.spec = spec
-        self.resolved = Resolved(before_scene(spec.config))
+        before_scene = with_candidate(spec.config, "moving") if is_auto(spec.config) else spec.config
+        self.chosen = ChosenModel(before_scene)
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None to start from points
@@ -82,14 +82,14 @@ class Execution:
         Raises:
             InputError: the settings, the device or the data are invalid.
         """
-        config = self.resolved.config
+        config = self.chosen.config
         check_settings(self.spec.config)
         check_machine(config)
         self.model = build(config)
         start = trained_start(config)
         self.scene = scene = load_scene(config)
         if is_auto(self.spec.config) and not scene.has_time:
-            self.resolved = Resolved(config := with_candidate(self.spec.config, "static"))
+            self.chosen = ChosenModel(config := with_candidate(self.spec.config, "static"))
             self.model = build(config)
         elif config.effects.compare:
             check_candidates(self.spec.config, scene)
@@ -108,51 +108,43 @@ class Execution:
         """
         spec = self.spec
         if is_auto(spec.config):
-            self.resolved = resolve(spec, scene)
-            self.model = model = build(self.resolved.config)
-        screen, device = self.resolved.screen, spec.config.device
-        if self.resolved.compares or lengths_of(spec.config) is not None:
+            self.chosen = choose_model(spec, scene)
+            self.model = model = build(self.chosen.config)
+        screen, device = self.chosen.screen, spec.config.device
+        if self.chosen.compares or lengths_of(spec.config) is not None:
             reset_peak_memory(device)
-            choose = best_of if self.resolved.compares else best_length
-            trainer = choose(spec, scene, self.start, self.resolved)
-            self.resolved, self.model = replace(self.resolved, config=trainer.config), trainer.model
+            choose = best_of if self.chosen.compares else best_length
+            trainer = choose(spec, scene, self.start, self.chosen)
+            self.chosen, self.model = replace(self.chosen, config=trainer.config), trainer.model
         else:
             trainer = self.trainer(model, scene)
             reset_peak_memory(device)
             if not fitting.resume(trainer, spec, fitting.saved_state(spec, scene)) and screen is not None:
                 trainer.stages.add("screen", screen.seconds)
-                trainer.effort.add(self.resolved.effort)
+                trainer.effort.add(self.chosen.effort)
+        trainer.hook(Gating).screen = screen
         self.log = RunLog(spec, trainer)
         fitting.fit(trainer, spec, plain(spec, trainer.config), lambda: reporter(spec, trainer), self.log.follow)
         return trainer
 
     def trainer(self, model: GaussianModel, scene: Scene) -> Trainer:
         """Initialise the Gaussians from the scene's points or from trained Gaussians; return the trainer at step 0."""
-        return fitting.trainer_of(model, scene, self.resolved.config, self.start)
+        return fitting.trainer_of(model, scene, self.chosen.config, self.start)
 
     def measure(self, trainer: Trainer) -> Record:
         """Measure image quality, speed and size of the trained model, and return the record."""
-        on_demand = self._on_demand(trainer)
-        measured = measuring.measure(trainer, self.resolved.config, on_demand is not None)
+        results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
+        measured = measuring.measure(trainer, self.chosen.config, "on_demand" in results)
         self._images = measured.images
         record = self.describe("ok", None)
-        results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
         known = {name: value for name, value in results.items() if hasattr(record, name)}
         parts = {name: value for name, value in results.items() if name not in known}
         return replace(
-            record, protocol=record.protocol | measured.frames, on_demand=on_demand, metrics=measured.metrics,
+            record, protocol=record.protocol | measured.frames, metrics=measured.metrics,
             missing=measured.missing, per_view=measured.per_view, regions=measured.regions,
             cost=measured.cost, curve=trainer.curve.points, **known, parts=parts,
             exact=sorted(trainer.exact.union(*(view.exact for view in measured.per_view))),
         )  # fmt: skip
-
-    def _on_demand(self, trainer: Trainer) -> OnDemand | None:
-        """Return the decisions on removing time, direction or AGR (a network); None if the settings ask for none."""
-        screen, gating = self.resolved.screen, trainer.hook(Gating)
-        if screen is None and self.resolved.config.effects.gate == "off":
-            return None
-        return OnDemand(screen, gating.gates, gating.notes, gating.direction,
-                        trainer.hook(Choices).chosen.comparison)  # fmt: skip
 
     def draw(self) -> None:
         """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.
@@ -168,7 +160,7 @@ class Execution:
 
     def describe(self, status: Status, reason: str | None) -> Record:
         """Return a record of the run without measurements; `reason` says why it failed or diverged."""
-        config, scene, spec = self.resolved.config, self.scene, self.spec
+        config, scene, spec = self.chosen.config, self.scene, self.spec
         observes = models.find(config.model.name, config.model.module).observes
         camera = scene.train[0].camera if scene else None
         on_gpu = config.device.startswith("cuda") and self.model is not None

@@ -193,7 +193,7 @@ def check_candidates(config: Config, scene: Scene) -> None:
 
 
 @dataclass(frozen=True)
-class Resolved:
+class ChosenModel:
     """The settings of a training after model=auto was replaced by a model, and the test that chose it."""
 
     config: Config
@@ -206,12 +206,7 @@ class Resolved:
         return self.config.effects.compare and self.screen is not None and self.screen.decision != "off"
 
 
-def before_scene(config: Config) -> Config:
-    """Return settings to check before the scene is loaded: model=auto is replaced by its candidate with time."""
-    return with_candidate(config, "moving") if is_auto(config) else config
-
-
-def resolve(spec: RunSpec, scene: Scene) -> Resolved:
+def choose_model(spec: RunSpec, scene: Scene) -> ChosenModel:
     """Replace model=auto by a model with or without time, after a test whether the training views change with time.
 
     The reason is printed. If the test is undecided, the model has time: training 7DGS on a static scene costs a few
@@ -221,20 +216,20 @@ def resolve(spec: RunSpec, scene: Scene) -> Resolved:
         InputError: the settings lack a candidate of model=auto.
     """
     if not is_auto(spec.config):
-        return Resolved(spec.config)
+        return ChosenModel(spec.config)
     import_compiler()
     effort = Effort()
     with effort:
         screen = screen_time(scene, spec.config.seed, spec.config.raster.backend)
         config = with_candidate(spec.config, "static" if screen.decision == "off" else "moving")
-    resolved = Resolved(config, screen, effort)
-    model = f"{config.model.name}{' with AGR' if config.agr else ''}"
+    chosen = ChosenModel(config, screen, effort)
+    name = f"{config.model.name}{' with AGR' if config.agr else ''}"
     print(f"{spec.name}: time is {screen.decision}: {screen.reason}; "
-          f"{'models are compared on val' if resolved.compares else model}", file=sys.stderr)  # fmt: skip
-    return resolved
+          f"{'models are compared on val' if chosen.compares else name}", file=sys.stderr)  # fmt: skip
+    return chosen
 
 
-def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, resolved: Resolved) -> Trainer:
+def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: ChosenModel) -> Trainer:
     """Return the trainer of the candidate with the highest PSNR on val, from which the run continues.
 
     The candidates are trained one after another, each with the settings and the seed of the run, so that the result is
@@ -252,10 +247,10 @@ def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, resolve
         return None if comparison is None else comparison.chosen
 
     parts = Candidates(spec, scene, start, candidates(spec.config))
-    return parts.chosen(chosen_in, lambda: _trained_models(parts, resolved))
+    return parts.chosen(chosen_in, lambda: _trained_models(parts, model))
 
 
-def _trained_models(parts: Candidates, resolved: Resolved) -> Trainer:
+def _trained_models(parts: Candidates, model: ChosenModel) -> Trainer:
     """Train all candidates, print which is the best, and return its trainer with the costs of all."""
     results: list[Result] = []
     for name, config in parts.settings.items():
@@ -265,7 +260,7 @@ def _trained_models(parts: Candidates, resolved: Resolved) -> Trainer:
     chosen = best(results)
     comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
     print(f"{parts.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
-    trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
+    trainer = parts.trained(chosen, results, model.screen, model.effort)
     trainer.hook(Choices).chosen.comparison = comparison
     return trainer
 
@@ -295,7 +290,7 @@ def length_name(iterations: int) -> str:
     return f"iterations={iterations}"
 
 
-def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, resolved: Resolved) -> Trainer:
+def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: ChosenModel) -> Trainer:
     """Return the trainer of the length with the highest PSNR on val, at its last step.
 
     The lengths are trained from the shortest on. They end with the first that is not better on val than all before it.
@@ -307,8 +302,8 @@ def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, res
         DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.
         Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
     """
-    parts = Candidates(spec, scene, start, lengths(resolved.config))
-    return parts.chosen(_kept_length, lambda: _trained_lengths(parts, resolved))
+    parts = Candidates(spec, scene, start, lengths(model.config))
+    return parts.chosen(_kept_length, lambda: _trained_lengths(parts, model))
 
 
 def _kept_length(state: dict[str, Any]) -> str | None:
@@ -316,7 +311,7 @@ def _kept_length(state: dict[str, Any]) -> str | None:
     return None if length is None else length_name(length.kept)
 
 
-def _trained_lengths(parts: Candidates, resolved: Resolved) -> Trainer:
+def _trained_lengths(parts: Candidates, model: ChosenModel) -> Trainer:
     """Train one length after the other, print which is the best, and return its trainer with the costs of all."""
     results: list[Result] = []
     steps = sum(config.train.iterations for config in parts.settings.values())
@@ -328,6 +323,6 @@ def _trained_lengths(parts: Candidates, resolved: Resolved) -> Trainer:
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [result.candidate for result in results])
     print(f"{parts.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = parts.trained(chosen, results, resolved.screen, resolved.effort)
+    trainer = parts.trained(chosen, results, model.screen, model.effort)
     trainer.hook(Choices).chosen.length = choice
     return trainer

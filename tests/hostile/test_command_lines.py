@@ -102,7 +102,7 @@ def test_a_training_that_diverges_without_harmonics_has_a_record(
     (path,) = record.find(tmp_path)
     written = record.read(path)
     assert written.status == "diverged"
-    assert "it resembles" in str(written.reason) or "no Gaussian's gradient" in str(written.reason)
+    assert "the first is Gaussian " in str(written.reason) or "no Gaussian's gradient" in str(written.reason)
     capsys.readouterr()
 
 

@@ -18,7 +18,7 @@ from gsbench.measure.record import FILE_NAME, Candidate, Record, TimeScreen
 from gsbench.report.sections.curves import events
 from gsbench.run import checks, load, log, selection
 from gsbench.run.identity import RunSpec
-from gsbench.run.selection import FOLDER, check_candidates, length_name, lengths, resolve
+from gsbench.run.selection import FOLDER, check_candidates, choose_model, length_name, lengths
 from gsbench.run.settings import candidates, check_settings, label_of
 from gsbench.run.setup import build
 from gsbench.scenes import View
@@ -272,9 +272,9 @@ def test_a_scene_that_may_move_has_a_model_with_time(
     """Catches an undecided scene that loses its motion, AGR in a static model, and a screen for a model with a name."""
     monkeypatch.setattr(selection, "screen_time", lambda *_: screen(str(decision)))
     config = compose(words[0], 10, *words[1:])
-    resolved = resolve(RunSpec(config, {}, Path("nowhere"), config.model.name), moving_square())
-    screened = resolved.screen.decision if resolved.screen else None
-    assert (resolved.config.model.name, resolved.config.agr, screened) == (model, agr, decision)
+    chosen = choose_model(RunSpec(config, {}, Path("nowhere"), config.model.name), moving_square())
+    screened = chosen.screen.decision if chosen.screen else None
+    assert (chosen.config.model.name, chosen.config.agr, screened) == (model, agr, decision)
 
 
 def test_a_scene_without_times_is_static_and_not_compared(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from numerics import audit
 from tiny_training import moving_square, trainer
 from torch import nn
 
@@ -85,10 +84,9 @@ def test_one_bad_number_among_many_arrays_is_found(array: int, place: int) -> No
 POISONED = 7
 
 
-def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> None:
+def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
     """Catches a NaN that is noticed steps later, is blamed on something else, or reaches a parameter or checkpoint."""
     run = trainer("7dgs", "train.curve_points=1", "train.checkpoint_minutes=0")
-    run.model.splats["log_diagonal"].data[POISONED, 3] = 12.0  # e^12 clips: static
     real = run.gradients
 
     def poisoned(batch: Sequence[View], *penalties: object) -> list[ViewResult]:
@@ -101,49 +99,12 @@ def test_the_step_the_parameter_the_gaussian_and_the_case(tmp_path: Path) -> Non
     path = tmp_path / "checkpoint.pt"
     with pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
         run.run(lambda state: checkpoint.save(path, Checkpoint("training", "data", state)), "poisoned")
-    assert divergence.explain(run.model) == (
-        "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all): it resembles the stability case 'static'"
-    )
+    assert divergence.explain(run.model) == "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all)"
     assert all(p.isfinite().all() for p in run.model.parameters())
     state = checkpoint.load(path, "training", "data", "cpu")
     assert state is not None
     assert state["step"] == 5
     assert all(value.isfinite().all() for value in state["model"].values())
-
-
-@pytest.mark.parametrize(
-    ("name", "parameter", "at", "value"),
-    [
-        ("refinement_pushes_sizes", "log_diagonal", 4, 40.0),
-        ("instant", "log_diagonal", 3, -12.0),
-        ("static", "log_diagonal", 3, 12.0),
-        ("needle", "log_diagonal", 5, -15.0),
-        ("direction_off_the_sphere", "directions", 0, 1e3),
-        ("larger_than_the_scene", "log_diagonal", slice(4, 7), 9.0),
-        ("far_off_axis", "means", 0, 1e5),
-        ("loud_harmonics", "sh0", 0, 1e4),
-        ("oversensitive", "log_lambda", "time", 9.0),
-        ("insensitive", "log_lambda", "time", -50.0),
-        ("vanishing_quaternion", "left_quats", slice(4), 0.0),  # of 4DGS
-        *((name, "clips", slice(4), value) for value, name in (
-            (-11.0, "instant"), (-8.0, None), (3.0, None), (11.0, "static"))),
-    ],
-)  # fmt: skip
-def test_a_gaussian_resembles_its_case(name: str | None, parameter: str, at: int | slice | str, value: float) -> None:
-    """Catches a diagnosis that names a case there is none of, or another one than the Gaussian was made like, and sizes
-    in time of 4DGS that are compared in the scene's unit: a clip is as long as 100 units here."""
-    model = trainer("4dgs" if parameter in ("left_quats", "clips") else "7dgs").model
-    if parameter == "log_lambda":
-        model.log_lambda[at].data.fill_(value)  # type: ignore[index]
-    elif parameter == "clips":
-        model.clock.fill_(100.0)
-        model.splats["scales"].data[:, :3] = value / 2
-        model.splats["scales"].data[:, 3] = math.log(100.0) + value
-    else:
-        model.splats[parameter].data[POISONED, at] = value
-        assert divergence.resembles(model, POISONED + 1) is None
-    assert name is None or name in audit.CASES
-    assert divergence.resembles(model, POISONED) == name
 
 
 def test_without_harmonics() -> None:
@@ -158,4 +119,4 @@ def test_without_harmonics() -> None:
     assert "networks" in divergence.explain(trainer("7dgs").model)
     model.splats["sh0"].data[POISONED] = 1e4
     model.splats["sh0"].grad[POISONED].view(-1)[-1] = math.nan  # type: ignore[index]
-    assert "Gaussian 7 of 80 in 'sh0' (1 in all): it resembles the stability case 'loud" in divergence.explain(model)
+    assert "Gaussian 7 of 80 in 'sh0' (1 in all)" in divergence.explain(model)

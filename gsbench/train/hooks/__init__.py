@@ -11,7 +11,7 @@ import importlib
 import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from gsbench.errors import InputError
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 # A weight, and the term [] of a view of the batch by its index.
 LossTerm = tuple[float, "Callable[[CameraTime, int], Tensor]"]
+H = TypeVar("H", bound="Hook")
 ELSEWHERE = ("gsbench.gates.hook",)  # modules of hooks outside of this folder, which act last
 
 
@@ -50,6 +51,9 @@ class Training(Protocol):
     @property
     def loss(self) -> float:
         """Return the loss of the last step; on a GPU of one at most 50 steps before."""
+
+    def hook(self, kind: type[H]) -> H:
+        """Return another hook, by its class."""
 
     def report(self, text: str) -> None:
         """Print a line above the progress bar."""
