@@ -3,22 +3,17 @@
 Only one of several identical commands trains. progress.json is created by a hard link, which succeeds in only one of
 several processes, on one or more hosts. If the process of a claim has ended, another process may take the claim: the
 one that has created a file with a name of that claim, by a hard link too. So no file lock is needed, and clients of NFS
-that see another's files late, or by a stale handle, do not take one run. Where the file system has file locks but no
-hard links, such as FAT, a lock protects these steps. The module does not import torch.
+that see another's files late, or by a stale handle, do not take one run. The module does not import torch.
 """
 
 import dataclasses
 import errno
-import fcntl
 import hashlib
 import os
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 from gsbench.errors import InputError
 from gsbench.measure.atomic import create_atomically, write_atomically
@@ -30,8 +25,7 @@ STOPPED = "stopped.json"  # the progress of a run that a signal stopped; its pro
 EVERY = 5.0  # seconds between two writes
 LARGEST = 1 << 20  # bytes
 SILENT = 600.0  # seconds without a report after which a run on an unreachable host counts as lost
-CLAIM_LOCK = ".claim"
-PATIENCE = 5.0  # seconds to wait for the lock; a process that holds it longer is suspended, so go on without
+HEIR = ".claim"  # with a hash: the file of the process that removes a dead claim
 ATTEMPTS, PAUSE = 100, 0.02  # attempts to claim, and seconds between two
 READS = 3  # attempts to read a claim; without hard links it may be half written, on NFS its handle may be stale
 
@@ -136,16 +130,15 @@ def take_claim(folder: Path, claim: Progress) -> Progress | None:
         OSError: the claim cannot be read or written.
     """
     path = folder / FILE_NAME
-    with _alone(folder):
-        for _ in range(ATTEMPTS):
-            content, other = _read(path)
-            if other is not None and not _may_be_taken(other, claim):
-                return other
-            if content is not None:
-                _remove(path, content, claim)  # its process has ended, or the file is damaged
-            if create_atomically(path, encode(claim)):
-                return None
-            time.sleep(PAUSE)
+    for _ in range(ATTEMPTS):
+        content, other = _read(path)
+        if other is not None and not _may_be_taken(other, claim):
+            return other
+        if content is not None:
+            _remove(path, content, claim)  # its process has ended, or the file is damaged
+        if create_atomically(path, encode(claim)):
+            return None
+        time.sleep(PAUSE)
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
 
 
@@ -155,7 +148,7 @@ def _remove(path: Path, content: bytes, claim: Progress) -> None:
     Only the process whose progress is in the file `heir` removes the claim, and only if the claim is still the one that
     was read. An heir that was killed leaves this file. It is a claim too, and is removed in the same way.
     """
-    heir = path.with_name(f"{CLAIM_LOCK}.{hashlib.sha256(content).hexdigest()[:16]}")
+    heir = path.with_name(f"{HEIR}.{hashlib.sha256(content).hexdigest()[:16]}")
     if not create_atomically(heir, encode(claim)):
         left, other = _read(heir)
         if left is not None and (other is None or _may_be_taken(other, claim)):
@@ -175,13 +168,12 @@ def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) ->
     """
     path = folder / FILE_NAME
     try:
-        with _alone(folder):
-            _, other = _read(path)
-            if other is not None and _is_same_process(other, claim):
-                if is_stopped:
-                    stopped = dataclasses.replace(other, updated=time.time())
-                    write_atomically(folder / STOPPED, encode(stopped), lasting=False)
-                path.unlink(missing_ok=True)
+        _, other = _read(path)
+        if other is not None and _is_same_process(other, claim):
+            if is_stopped:
+                stopped = dataclasses.replace(other, updated=time.time())
+                write_atomically(folder / STOPPED, encode(stopped), lasting=False)
+            path.unlink(missing_ok=True)
     except OSError:  # the folder cannot be written any more; the claim expires with this process
         return
 
@@ -230,44 +222,3 @@ def _may_be_taken(other: Progress, claim: Progress) -> bool:
     """
     requeued = other.job is not None and other.job == claim.job and other.host != claim.host
     return _is_same_process(other, claim) or requeued or not is_alive(other)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold a file lock while the block reads and replaces a claim; skip the lock if the file system has none."""
-    path = folder / CLAIM_LOCK
-    until = time.monotonic() + PATIENCE
-    file: IO[bytes] | None = None
-    try:
-        while file is None and time.monotonic() < until:
-            try:
-                file = _locked(path)
-            except BlockingIOError:
-                time.sleep(0.01)
-            except OSError:  # a file system without locks
-                break
-        yield
-    finally:
-        if file is not None:
-            path.unlink(missing_ok=True)
-            file.close()
-
-
-def _locked(path: Path) -> IO[bytes] | None:
-    """Open and lock `path`; return None if the file was removed in the meantime, so that the caller must try again.
-
-    Raises:
-        BlockingIOError: another process holds the lock.
-    """
-    file = path.open("ab")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
-            return file
-    except FileNotFoundError:
-        pass
-    except OSError:
-        file.close()
-        raise
-    file.close()
-    return None

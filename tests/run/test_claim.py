@@ -27,13 +27,9 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def without_locks(_: Path) -> None:
-    raise OSError(errno.ENOLCK, "No locks available")
-
-
 @pytest.fixture
 def mounts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Path]]:
-    """Where processes see the folder `disk`: there, or on two mounts that share no locks and cache as NFS does."""
+    """Where processes see the folder `disk`: there, or on two mounts that cache as NFS does."""
     disk, mounted = tmp_path / "disk", list[Path]()
     disk.mkdir()
     if request.param != "two mounts":
@@ -65,14 +61,10 @@ def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
 
 
 @pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
-@pytest.mark.parametrize("mounts", ["locks", "no locks", "two mounts"], indirect=True)
-def test_of_many_processes_one_has_the_run(
-    left: str, mounts: list[Path], request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("mounts", ["one folder", "two mounts"], indirect=True)
+def test_of_many_processes_one_has_the_run(left: str, mounts: list[Path], tmp_path: Path) -> None:
     """Catches a claim that is looked for and then made, so that several make it, one that nobody takes over, and a run
-    that two hosts do, as their mounts share no locks and show each other's files late."""
-    if "no locks" in request.node.name:
-        monkeypatch.setattr(progress, "_locked", without_locks)
+    that two hosts do, as their mounts show each other's files late."""
     folders = [tmp_path / "disk" / str(number) for number in range(ROUNDS)]
     for folder in folders:
         folder.mkdir()
@@ -162,15 +154,6 @@ def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, mon
         assert [name for name in names(tmp_path) if not name.endswith(".tmp")] == [FILE_NAME]
 
 
-def test_a_lock_that_is_held_for_ever_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a command that hangs beside a process that was suspended while it claimed."""
-    monkeypatch.setattr(progress, "PATIENCE", 0.1)
-    held = progress._locked(tmp_path / progress.CLAIM_LOCK)
-    assert held is not None
-    assert progress.take_claim(tmp_path, Progress([])) is None
-    held.close()
-
-
 @pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP])
 def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches runs that cannot be done on a FAT disk."""
@@ -201,7 +184,7 @@ def test_a_run_that_another_process_does_is_left_to_it(
     assert "left to process 12 on elsewhere, which is at step 7 of it" in capsys.readouterr().err
     assert not claims
     progress.write(spec.folder, Progress([], host="elsewhere", updated=0.0))
-    progress.write_stopped(spec.folder, Progress([]))
+    (spec.folder / progress.STOPPED).write_bytes(progress.encode(Progress([])))
     record = execution.execute(spec)
     assert record is not None
     assert record.status == "ok"
