@@ -1,6 +1,7 @@
 """Estimate how long Table 1 of the paper takes: time steps on this machine, and add up 57 trainings."""
 
 import argparse
+import heapq
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,6 @@ from benchmarks.scene import SIGMA, VISIBLE, trained
 from benchmarks.stages import MODELS
 from benchmarks.timing import Cost, measure
 from benchmarks.training import training_step
-from gsbench.launch.estimate import span
 from gsbench.measure.machine import processor_name
 from gsbench.measure.provenance import git_commit
 from gsbench.report.paper import AVERAGE, PROTOCOLS, paper_row
@@ -107,6 +107,14 @@ def estimate(runs: Sequence[Run], iterations: int, time: Callable[[Run, int, int
     yield (f"{len(work)} runs of {iterations:,} steps: {sum(work):.1f} hours of CPU; {sum(walls):.1f} hours on 2 cores "
            f"(one run at a time, on two threads); {span(walls, at_once):.1f} hours on {CORES} cores ({at_once} runs at "
            "once on two threads each, the longest first).")  # fmt: skip
+
+
+def span(seconds: Sequence[float], at_once: int) -> float:
+    """Return when all trainings are done, if `at_once` of them run at a time and the longest begin first."""
+    ends = [0.0] * min(at_once, max(1, len(seconds)))
+    for duration in sorted(seconds, reverse=True):
+        heapq.heapreplace(ends, ends[0] + duration)
+    return max(ends)
 
 
 def main() -> None:

@@ -1,7 +1,6 @@
-"""Show the state of an experiment's runs, estimate the time they need, or launch again those that did not finish.
+"""Show the state of an experiment's runs and the time that they still need, or launch again what did not finish.
 
 python -m gsbench.launch status results/EXP [--watch] [--json]
-python -m gsbench.launch estimate results/EXP [--at-once 2] [--json]
 python -m gsbench.launch retry results/EXP [launch.memory=16G ...]
 """
 
@@ -13,9 +12,10 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 
 from gsbench.errors import InputError, printable
-from gsbench.launch import estimate, plan
+from gsbench.launch import plan
 from gsbench.launch.plan import identity
 from gsbench.launch.status import BROKEN, GOING, STATES, Experiment, RunStatus, read, status
 from gsbench.process.ending import end_with
@@ -37,7 +37,6 @@ def main(arguments: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     texts = {
         "status": "show the state of each run: done, running, stopped, failed, ...",
-        "estimate": "estimate how long the runs that are not done will train",
         "retry": "launch again the runs that were stopped, failed, are lost or not started",
         "job": "do one run of a plan; a job of Slurm calls it",
     }
@@ -46,8 +45,6 @@ def main(arguments: list[str] | None = None) -> int:
         command.add_argument("folder", type=Path, metavar="FOLDER" if name == "job" else "results/EXP")
     parsers["status"].add_argument("--watch", action="store_true", help="repeat until no run is running or waiting")
     parsers["status"].add_argument("--json", action="store_true", help="print all runs as JSON, also done ones")
-    parsers["estimate"].add_argument("--at-once", type=int, default=1, metavar="N", help="runs at a time (1)")
-    parsers["estimate"].add_argument("--json", action="store_true", help="print the estimate of each run as JSON")
     parsers["retry"].add_argument("launch", nargs="*", metavar="launch.KEY=VALUE", help="launch settings to change")
     parsers["job"].add_argument("number", type=int, help="the run's place in the plan")
     options = parser.parse_args(arguments)
@@ -61,8 +58,6 @@ def main(arguments: list[str] | None = None) -> int:
             return _job(options.folder, options.number)
         if options.command == "retry":
             return _retry(options.folder, options.launch)
-        if options.command == "estimate":
-            return _estimate(options.folder, options.at_once, options.json)
         while options.watch:
             if sys.stdout.isatty():
                 print("\033[H\033[2J", end="")
@@ -93,6 +88,8 @@ def lines(experiment: Experiment, runs: Sequence[RunStatus]) -> list[str]:
     text += [f"a plan is left out: {reason}" for reason in experiment.damaged]
     if silent := experiment.queue.silent:
         text.append(f"Slurm did not answer ({silent}): a run that reported in the last 10 minutes counts as running")
+    if time_left := _time_left(runs):
+        text.append(time_left)
     common = set.intersection(*(set(run.overrides) for run in runs)) if len(runs) > 1 else set()
     named = [(run, " ".join(word for word in run.overrides if word not in common)) for run in runs]
     width = max((len(name) for run, name in named if run.state != "done"), default=0)
@@ -100,6 +97,16 @@ def lines(experiment: Experiment, runs: Sequence[RunStatus]) -> list[str]:
     for state in STATES[1:]:
         text += [f"  {state:{wide}} {name:{width}}  {_details(run)}" for run, name in named if run.state == state]
     return list(map(printable, text))
+
+
+def _time_left(runs: Sequence[RunStatus]) -> str:
+    """Return how long the runs that are not done will train, if the mean of those that are is known; else ""."""
+    trained = [run.train_s for run in runs if run.train_s is not None]
+    left = [run for run in runs if run.state != "done"]
+    if not trained or not left:
+        return ""
+    seconds = sum(fmean(trained) if run.seconds_left is None else run.seconds_left for run in left)
+    return f"  about {plan.duration(seconds)} of training left, one run after the other, each as long as those done"
 
 
 def _details(run: RunStatus) -> str:
@@ -127,14 +134,6 @@ def _show(folder: Path, in_json: bool) -> list[RunStatus]:
 
 def _verdict(runs: list[RunStatus]) -> int:
     return 1 if any(run.state in BROKEN for run in runs) else 0
-
-
-def _estimate(folder: Path, at_once: int, in_json: bool) -> int:
-    if at_once < 1:
-        raise InputError(f"--at-once: expected at least 1, got {at_once}")
-    estimated = estimate.estimate(status(read(folder)))
-    print(as_json(estimated) if in_json else "\n".join(estimate.lines(estimated, at_once)))
-    return 0
 
 
 def _retry(folder: Path, launch: list[str]) -> int:

@@ -42,6 +42,7 @@ class RunStatus:
     seconds_left: float | None = None
     psnr: float | None = None  # dB: on the evaluated split of a run that is done, else on val
     record: str | None = None
+    train_s: float | None = None  # seconds of training of a run that is done
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class RecordStatus:
     reason: str | None
     psnr: float | None
     written: float  # Unix seconds
+    train_s: float | None = None
 
 
 @dataclass
@@ -143,7 +145,7 @@ def _judge(experiment: Experiment, run: Identity) -> RunStatus:
         going = _with_progress(state, at, "running" if waits is None else "queued", waits)
         return replace(going, seconds_left=left)
     if record and record.status == "ok" and not at and not stopped:
-        return replace(state, state="done", psnr=record.psnr, record=str(record.path))
+        return replace(state, state="done", psnr=record.psnr, record=str(record.path), train_s=record.train_s)
     if planned and planned.job in experiment.queue.states:
         in_queue = experiment.queue.states[planned.job]
         waits = in_queue.partition(" ")[2] if in_queue.startswith("PENDING") else None
@@ -268,6 +270,10 @@ def _files(folder: Path) -> Iterator[Path]:
                 yield path
 
 
+class _Cost(msgspec.Struct):
+    train_s: float
+
+
 class _Outcome(msgspec.Struct):
     """The keys of a record that say how its run ended; others are not looked at."""
 
@@ -275,6 +281,7 @@ class _Outcome(msgspec.Struct):
     reason: str | None
     overrides: list[str]
     metrics: dict[str, float | None] | None
+    cost: _Cost | None
 
 
 def record_status(path: Path) -> tuple[list[str], RecordStatus]:
@@ -285,5 +292,5 @@ def record_status(path: Path) -> tuple[list[str], RecordStatus]:
     except (InputError, msgspec.MsgspecError, RecursionError) as error:
         reason = f"{path} is damaged ({one_line(error)}): delete it"
         return [], RecordStatus(path, "failed", reason, None, written)
-    psnr = (outcome.metrics or {}).get("psnr")
-    return outcome.overrides, RecordStatus(path, outcome.status, outcome.reason, psnr, written)
+    psnr, train_s = (outcome.metrics or {}).get("psnr"), outcome.cost.train_s if outcome.cost else None
+    return outcome.overrides, RecordStatus(path, outcome.status, outcome.reason, psnr, written, train_s)

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from gsbench.errors import InputError
-from gsbench.launch.estimate import span
 from gsbench.measure import atomic, record
 from gsbench.process import memory
 from gsbench.report import study
@@ -149,12 +148,6 @@ def test_a_claim_names_no_temporary_file(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(OSError, match="Read-only file system") as caught:
         atomic.create_atomically(tmp_path / "progress.json", b"")
     assert caught.value.filename == str(tmp_path / "progress.json")
-
-
-def test_an_estimate_for_a_billion_runs_at_a_time_takes_no_memory() -> None:
-    """Catches a list with an entry for each run at a time: 999,999,999 of them end in a MemoryError."""
-    assert span([3.0, 2.0], 10**9) == 3.0
-    assert span([], 10**9) == 0.0
 
 
 def test_a_limit_of_the_address_space_counts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -273,6 +273,18 @@ def test_only_what_differs_names_a_run() -> None:
     ]  # fmt: skip
 
 
+def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None:
+    """Catches a sweep of days that says nothing of them, and seconds of a record that are not read."""
+    traced(tmp_path / "crowd", record_of={})
+    (done,) = status.status(status.read(tmp_path / "crowd"))
+    assert done.train_s == crowd.record(*RUN)["cost"]["train_s"]
+    runs = [replace(done, train_s=train_s) for train_s in (3600.0, 7200.0)]
+    runs += [RunStatus(WORDS, "planned"), RunStatus(WORDS, "running", seconds_left=3600.0)]
+    assert "about 2.5 h of training left" in lines(status.Experiment(tmp_path), runs)[1]
+    for nothing_known in (runs[:2], runs[2:]):
+        assert not any("of training left" in line for line in lines(status.Experiment(tmp_path), nothing_known))
+
+
 def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path) -> None:
     """Catches a status that composes configs, validates records, or imports what it does not need."""
     experiment = crowd.write(500, tmp_path)
