@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
@@ -13,10 +14,20 @@ from matplotlib.colors import LogNorm
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ROUNDING_SCALE, STEPS, to_bytes
-from gsbench.stability.float32_error import PERCENTILES, Conditioning, Exactness, ViewExactness
+from gsbench.stability.float32_error import PERCENTILES, Exactness, ViewExactness
 
 ROUNDING = 1 / math.sqrt(12)  # RMS error of rounding to 8 bits, in steps
-ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
+VIEW_TITLES = (
+    "view",
+    "largest error",
+    "RMS",
+    "largest bound",
+    "median bound",
+    "undecided pixels",
+    "PSNR, dB",
+    "changed by float32",
+    "at most",
+)
 MEANINGS = {
     "flat": "its shortest axis is below 1/1000 of its longest",
     "far": "rounding of world coordinates moves its mean by more than 1/1000 pixel",
@@ -31,61 +42,53 @@ MEANINGS = {
 
 def text(exactness: Exactness) -> str:
     """Return the errors of all views, the ten worst Gaussians, the conditioning and the verdict as Markdown."""
-    lines = [f"{exactness.title}: {exactness.gaussians} Gaussians. Pixel values are in steps of 8 bits (1/255).", "",
-             "| view | largest error | RMS | largest bound | median bound | undecided pixels | PSNR, dB | changed by "
-             "float32 | at most |",
-             "| --- |" + " ---: |" * 8]  # fmt: skip
-    lines += [_row(view) for view in exactness.views]
+    parts = [
+        f"{exactness.title}: {exactness.gaussians} Gaussians. Pixel values are in steps of 8 bits (1/255).",
+        table(VIEW_TITLES, [_cells(view) for view in exactness.views]),
+    ]
     if exactness.worst:
-        lines += ["", "| Gaussian | view | pixels | sum of their bounds | why |", "| ---: | --- | ---: | ---: | --- |"]
-        lines += [f"| {culprit.index} | {culprit.view} | {culprit.pixels} | {culprit.bound:.2g} | "
-                  f"{', '.join(culprit.why) or '-'} |" for culprit in exactness.worst]  # fmt: skip
-        named = dict.fromkeys(word for culprit in exactness.worst for word in culprit.why)
-        lines += ["", *(f"{word}: {MEANINGS[word]}." for word in named)]
-    if exactness.conditioning:
-        lines += ["", *_conditioning(exactness.conditioning)]
-    return "\n".join([*lines, "", verdict(exactness)])
+        rows = [
+            [str(worst.index), worst.view, str(worst.pixels), f"{worst.bound:.2g}", ", ".join(worst.why) or "-"]
+            for worst in exactness.worst
+        ]
+        words = dict.fromkeys(word for worst in exactness.worst for word in worst.why)
+        parts += [table(["Gaussian", "view", "pixels", "sum of their bounds", "why"], rows)]
+        parts += ["\n".join(f"{word}: {MEANINGS[word]}." for word in words)] if words else []
+    if (hard := exactness.conditioning) is not None:
+        numbers = [[name, *(f"{x:.1e}" for x in values)] for name, values in hard.condition_numbers.items()]
+        schemes = [
+            [scheme, f"{100 * share:.2f} %", f"{hard.error[scheme]:.1e}"] for scheme, share in hard.indefinite.items()
+        ]
+        parts += [
+            table(["condition number of", *(f"{p:g} %" for p in PERCENTILES)], numbers),
+            table(["in float32", "indefinite", "99th percentile of the error"], schemes),
+        ]
+    return "\n\n".join([*parts, verdict(exactness)])
 
 
-def _row(view: ViewExactness) -> str:
-    cells = [f"{x:.1e}" for x in (view.largest, view.rms, view.bound, view.median_bound)]
+def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table whose columns after the first are aligned at the right."""
+    lines = [titles, ["---", *["---:"] * (len(titles) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _cells(view: ViewExactness) -> list[str]:
+    cells = [view.name, *(f"{x:.1e}" for x in (view.largest, view.rms, view.bound, view.median_bound))]
     cells.append(f"{100 * view.undecided:.2f} %")
-    if view.psnr is not None:
-        cells += [f"{view.psnr:.4f}", f"{view.psnr_change:+.1e}", f"{view.psnr_bound:.1e}"]
-    else:
-        cells += ["-"] * 3
-    return f"| {view.name} | {' | '.join(cells)} |"
-
-
-def _conditioning(conditioning: Conditioning) -> list[str]:
-    return [
-        f"| condition number of | {' | '.join(f'{p:g} %' for p in PERCENTILES)} |",
-        "| --- |" + " ---: |" * len(PERCENTILES),
-        *(f"| {name} | {' | '.join(f'{x:.1e}' for x in values)} |"
-          for name, values in conditioning.condition_numbers.items()),
-        "",
-        *(f"{scheme} in float32: {100 * share:.2f} % indefinite, 99th percentile of the error "
-          f"{conditioning.error[scheme]:.1e}" for scheme, share in conditioning.indefinite.items()),
-    ]  # fmt: skip
+    if view.psnr is None:
+        return [*cells, "-", "-", "-"]
+    return [*cells, f"{view.psnr:.4f}", f"{view.psnr_change:+.1e}", f"{view.psnr_bound:.1e}"]
 
 
 def verdict(exactness: Exactness) -> str:
-    """Return a sentence that compares the error of float32 with the digits of PSNR and with rounding to 8 bits."""
+    """Return a sentence that compares the error of float32 with that of rounding to 8 bits."""
     share = ROUNDING / max(max(view.rms for view in exactness.views), 1e-300)
     eight = f"Rounding to 8 bits changes an image {share:,.0f} times as much as float32 (RMS of the worst view)."
     change = exactness.psnr_change
     if change is None:
         return eight
     mean = abs(fmean(view.psnr_change or 0.0 for view in exactness.views))
-    return f"Float32 changes {_decimal(mean)} of the mean PSNR ({mean:.1e} dB; one view by {change:.1e} dB). {eight}"
-
-
-def _decimal(change: float) -> str:
-    """Name the first decimal of a number that a change of this size alters."""
-    place = math.ceil(-math.log10(change)) if change > 0 else len(ORDINALS) + 1
-    if place < 1:
-        return "the digits before the point"
-    return f"the {ORDINALS[place - 1]} decimal" if place <= len(ORDINALS) else "no decimal"
+    return f"Float32 changes the mean PSNR by {mean:.1e} dB, that of one view by {change:.1e} dB. {eight}"
 
 
 def json_of(exactness: Exactness) -> str:

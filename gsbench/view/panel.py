@@ -88,14 +88,12 @@ def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
     return _COSTS_PAGE.render(rows=rows, width=width, height=height)
 
 
-def legend(shown: Sequence[ShownImage], most_cost: float, notes: Mapping[str, Float32Error | str]) -> str:
-    """Write the legend of the colours; "" for the Gaussians' own.
-
-    Args:
-        shown: the images on the screen.
-        most_cost: the nanoseconds that the most expensive Gaussian adds to a frame; it has the brightest colour.
-        notes: the bound on the error of float32 by the name of the model, or why it is not shown.
-    """
+def legend(
+    shown: Sequence[ShownImage],
+    most_cost: float,  # ns that the most expensive Gaussian adds to a frame; it has the brightest colour
+    notes: Mapping[str, Float32Error | str],  # by model: the bound on the error of float32, or why it is not shown
+) -> str:
+    """Write the legend of the colours; "" if Gaussians have their usual colours."""
     renderers = {meaning: {image.renderer.name: image.renderer for image in shown if image.colours == meaning}
                  for meaning in (CLASS, COST, FLOAT32)}  # fmt: skip
     classes = [Row("Gaussians", list(renderers[CLASS]), is_bold=True)] if renderers[CLASS] else []

@@ -122,11 +122,7 @@ class RequestGuard:
     """The port on which the viewer listens, and the host names by which a browser may reach it."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Find a free port for the viewer.
-
-        Args:
-            host: the address or the name to listen on.
-            port: the first port to try.
+        """Find the first free port from `port` on.
 
         Raises:
             InputError: it is not possible to listen on this host, or no port is free.

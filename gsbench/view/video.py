@@ -31,14 +31,12 @@ CODEC = "vp09"  # VP9, which browsers play; the encoder comes with OpenCV's whee
 Shot = tuple[Camera, float | None]  # a frame of a video: its camera and its time
 
 
-def around(run: LoadedRun, azimuth: float, elevation: float) -> Camera:
-    """Return a camera that looks at the middle of a model from one scene extent, about as far as training cameras.
-
-    Args:
-        run: the run of the model.
-        azimuth: the angle about the up direction of the scene, radians.
-        elevation: the angle above the horizon, radians.
-    """
+def around(
+    run: LoadedRun,
+    azimuth: float,  # about the up direction of the scene, radians
+    elevation: float,  # above the horizon, radians
+) -> Camera:
+    """Return a camera that looks at the middle of a model from one scene extent, about as far as training cameras."""
     size = run.scene.width, run.scene.height
     return cameras.around(run.model, run.scene.extent, *size, azimuth, elevation, run.scene.up)
 

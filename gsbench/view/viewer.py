@@ -235,14 +235,14 @@ class Viewer:
     so a thread a browser would hold the memory of many frames for good.
     """
 
-    def __init__(self, runs: Sequence[LoadedRun], host: str, port: int, data_root: str | None = None) -> None:
+    def __init__(
+        self,
+        runs: Sequence[LoadedRun],  # at least one, all of one scene
+        host: str,
+        port: int,  # if it is in use, the next free one is taken
+        data_root: str | None = None,  # of the data set, if it has moved
+    ) -> None:
         """Start the web server.
-
-        Args:
-            runs: the runs whose models are shown, at least one, all of one scene.
-            host: the address to listen on.
-            port: the port to listen on; if it is in use, the next free one is taken.
-            data_root: the folder of the data set, if it has moved.
 
         Raises:
             InputError: the runs are of different scenes, or it is not possible to listen on this host.
