@@ -16,11 +16,10 @@ from tiny_training import compose, moving_square
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, Candidate, Record, TimeScreen
 from gsbench.report.sections.curves import events
-from gsbench.run import checks, load, log, selection
+from gsbench.run import load, log, selection
 from gsbench.run.identity import RunSpec
-from gsbench.run.selection import FOLDER, check_candidates, choose_model, length_name, lengths
-from gsbench.run.settings import candidates, check_settings, label_of
-from gsbench.run.setup import build
+from gsbench.run.selection import FOLDER, choose_model, length_name, lengths
+from gsbench.run.settings import candidates, label_of
 from gsbench.scenes import View
 from gsbench.train import checkpoint
 from gsbench.train.divergence import DivergedError
@@ -216,43 +215,6 @@ def test_a_candidate_that_fails_loses(
     assert f"candidates failed; {choice.names[0]}: all" in str(failed.reason)
 
 
-@pytest.mark.parametrize(
-    ("model", "words", "message"),
-    [
-        ("7dgs", "effects.compare=true", "expected model=auto"),
-        ("auto", "effects.compare=true scene.eval_split=val", "got scene.eval_split=val"),
-        (
-            "auto",
-            "effects.compare=true model.compared.moving_4dgs.lr.means.start=-1",
-            r"4dgs: model\.lr\.means\.start: exp",
-        ),
-        ("3dgs", "train.lengths=2 effects.compare=true", "train.lengths: expected effects.compare=false"),
-        ("3dgs", "train.lengths=2 train.patience=0.2", "train.patience: expected train.lengths=null"),
-        ("3dgs", "train.lengths=2 scene.eval_split=val", "train.lengths: expected results on test"),
-        ("3dgs", "train.lengths=2 scene.name=no_val", r"train\.lengths: expected views of val to choose the length"),
-        ("3dgs", "train.lengths=5", r"lengths=5: expected at least 16 iterations to halve 4 times, got .*=15"),
-        ("3dgs", "train.lengths=1", "expected 2 to 8, got 1"),
-        ("3dgs", "train.lengths=4", None),
-        ("auto", "effects.compare=true", None),
-        ("7dgs", "scene.eval_split=val", None),
-    ],
-)
-def test_settings_that_cannot_choose_are_refused(model: str, words: str, message: str | None) -> None:
-    """Catches a key that does nothing, a training of no step, and results on the views by which a choice was made."""
-    square, config = moving_square(), compose(model, 15, *words.split())
-
-    def check() -> None:
-        check_settings(config)
-        checks.check_scene(build(compose("3dgs", 10)), scene, config)
-
-    scene = replace(square, val=[] if config.scene.name == "no_val" else square.train[:1])
-    if message is None:
-        check()
-    else:
-        with pytest.raises(InputError, match=message):
-            check()
-
-
 # ---- model=auto
 
 
@@ -308,26 +270,6 @@ def test_resume_false_starts_every_candidate_over(
     assert chosen_in(record)[0] == MODELS.best
     assert "continues from" not in capsys.readouterr().err
     assert not (folder / FOLDER).exists()
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("seed=0", None),
-        ("scene.name=no_val", r"scene\.val_every=8 takes"),
-        ("~model.compared.moving_4dgs.lr.scales", r"candidate 4dgs: model\.lr: .* 'scales' has none"),
-        ("train.penalties.strain.weight=1", "candidate 6dgs: "),
-    ],
-)
-def test_candidates_are_checked_before_training(word: str, message: str | None) -> None:
-    """Catches models that are compared on the views on which they are trained, and candidates of which one fails."""
-    config, square = compose("auto", 10, "effects.compare=true", word), moving_square()
-    scene = replace(square, val=[] if config.scene.name == "no_val" else square.train[:2])
-    if message is None:
-        check_candidates(config, scene)
-    else:
-        with pytest.raises(InputError, match=message):
-            check_candidates(config, scene)
 
 
 def test_candidates_are_those_of_the_settings() -> None:

@@ -1,16 +1,13 @@
 """`train.patience`: the iteration with the best PSNR on val is kept, and a training that no longer gains stops."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
 from interrupted import assert_same_bits
-from tiny_training import compose, moving_square, train, trainer
+from tiny_training import train, trainer
 
 from gsbench.errors import InputError
 from gsbench.gates.hook import Gating
-from gsbench.run.checks import check_scene
-from gsbench.run.settings import check_values
 from gsbench.train.hooks.early_stop import EarlyStop
 from gsbench.train.loop import Trainer
 
@@ -71,29 +68,3 @@ def test_a_damaged_checkpoint_is_refused(changed: dict[str, Any]) -> None:
     state["hooks"]["early_stop"] = state["hooks"]["early_stop"] | changed if changed else {}
     with pytest.raises(InputError, match=r"^checkpoint: "):
         fitted.load_state_dict(state)
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("scene.name=no_val", "expected views of val"),
-        ("scene.eval_split=val", "expected results on test"),
-        ("train.average_from=15000", "expected train.average_from=null"),
-        ("effects.compare=true", "expected effects.compare=false"),
-        ("seed=0", None),
-    ],
-)
-def test_what_patience_needs_is_asked_at_the_door(word: str, message: str | None) -> None:
-    """Catches a run that watches nothing, or that is measured on what it was chosen by."""
-    fitted, config = trainer("7dgs"), compose("7dgs", 100, "train.patience=0.2", word)
-    scene = replace(moving_square(), val=[] if "no_val" in word else fitted.scene.val)
-
-    def check() -> None:
-        check_values(config)
-        check_scene(fitted.model, scene, config)
-
-    if message is None:
-        check()
-    else:
-        with pytest.raises(InputError, match=rf"^train\.patience: {message}"):
-            check()

@@ -6,13 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from tiny_training import compose, train, trainer
+from tiny_training import train, trainer
 
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam_all
 from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
-from gsbench.run.settings import check_values
 from gsbench.train.hooks import Hook
 from gsbench.train.hooks.best import Best
 from gsbench.train.optim import rate_at
@@ -120,21 +119,3 @@ def test_a_hook_has_a_name() -> None:
     """Catches a hook whose training fails at its end, when a checkpoint asks for the name."""
     with pytest.raises(InputError, match="Nameless: expected the hook's `name`"):
         type("Nameless", (Hook,), {})
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
-        ("train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
-        ("train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
-        ("train.coarse=[[2,3000],[4,15000]]", "factors falling and steps rising"),
-        ("train.coarse=[[1,3000]]", "expected pairs (factor above 1"),
-        ("train.coarse=[[]]", "expected pairs (factor above 1"),
-        ("train.coarse=[[4,3000,1]]", "expected pairs (factor above 1"),
-    ],
-)
-def test_faulty_schedules_are_refused(word: str, message: str) -> None:
-    """Catches a typo that trains by another rule than was asked for."""
-    with pytest.raises(InputError, match=re.escape(message)):
-        check_values(compose("3dgs", 100, word))

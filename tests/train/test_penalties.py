@@ -7,12 +7,11 @@ import pytest
 import torch
 from interrupted import assert_same_bits
 from models.small import seeded
-from tiny_training import compose, trainer
+from tiny_training import trainer
 
 from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.moving import FreeTimeModel
-from gsbench.run import setup
 from gsbench.scenes.scene import Camera, Points, View
 from gsbench.schedule import ActiveComponents
 from gsbench.train import regularisers
@@ -209,10 +208,3 @@ def test_damaged_neighbours_are_refused() -> None:
     state["hooks"]["penalties"]["strain"]["neighbours"][0, 0] = len(fitted.model)
     with pytest.raises(InputError, match="neighbours"):
         trainer("7dgs", *WEIGHT).load_state_dict(state)
-
-
-@pytest.mark.parametrize("name", ["3dgs", "6dgs"])
-def test_a_model_without_time_is_refused(name: str) -> None:
-    """Catches a penalty that is asked for and does nothing."""
-    with pytest.raises(InputError, match=r"train.penalties.strain: expected a model that observes time"):
-        setup.build(compose(name, 100, "train.penalties.strain.weight=0.1"))
