@@ -3,8 +3,8 @@
     make slurm-check
 
 A sweep of 2 scenes x 2 models x 2 seeds is done on this machine without Slurm; that is what every number is compared
-with. Then it is done on the Slurm of cluster.py while jobs, nodes, memory and the disk fail under it. What fails is
-named by `python -m gsbench.launch status` with its reason, `... retry` completes it, and every record that comes out
+with. Then it is done on the Slurm of cluster.py while jobs, nodes and memory fail under it. What fails is named
+by `python -m gsbench.launch status` with its reason, `... retry` completes it, and every record that comes out
 equals the one of this machine: metrics, the curve's PSNR, and the bits of the checkpoint.
 """
 
@@ -172,33 +172,19 @@ def killed_jobs_and_nodes(check: Check) -> None:
 
 def time_limit(check: Check) -> None:
     """A time limit that comes before the run's end: at 2 minutes less 60 s, Slurm's signal comes after 30 to 60 s."""
-    image = check.folder / "gsbench.sif"
-    image.touch()
-    in_image = (f"launch.container={image}", f"launch.container_command={apptainer(check.folder)} exec")
-    for name, launch in ("time limit", ()), ("time limit in a container image", in_image):
-        # Without growth all steps take equally long, so that a short run just before says how many fill the time.
-        fixed = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000")
-        rate = check.folder / f"rate_{name.replace(' ', '_')}"
-        do_here(rate, (*fixed, f"train.iterations={STEPS}"))
-        (quick,) = rate.rglob("record.json")
-        seconds = json.loads(quick.read_text())["cost"]["train_s"]
-        long = (*fixed, f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")
-        sweep = check.sweep(name.replace(" ", "_"), *long, "launch.minutes=2", "launch.signal_seconds=60", *launch)
-        do_here(check.reference, long)  # beside the job, which can only become longer by it
-        sweep.wait(600)
-        log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
-        check.say(name, "saved and requeued at Slurm's signal", "continues from step" in log,
-                  f"{log.count('continues from step')} times")  # fmt: skip
-        check.completed(name, sweep, 1)
-
-
-def apptainer(folder: Path) -> Path:
-    """Write a stand-in for Apptainer: it runs a command where Slurm's commands are not on PATH, as in an image."""
-    path = folder / "apptainer"
-    path.write_text("#!/bin/bash\n" 'while [ "${1%.sif}" = "$1" ]; do shift; done; shift\n'
-                    f'PATH={Path(sys.executable).parent} exec "$@"\n')  # fmt: skip
-    path.chmod(0o755)
-    return path
+    # Without growth all steps take equally long, so that a short run just before says how many fill the time.
+    fixed = (*TINY, "scene=suzanne", "model=7dgs", "seed=0", "train.densify.max_gaussians=1000")
+    do_here(check.folder / "rate", (*fixed, f"train.iterations={STEPS}"))
+    (quick,) = (check.folder / "rate").rglob("record.json")
+    seconds = json.loads(quick.read_text())["cost"]["train_s"]
+    long = (*fixed, f"train.iterations={round(STEPS * LONG_SECONDS / seconds)}")
+    sweep = check.sweep("time_limit", *long, "launch.minutes=2", "launch.signal_seconds=60")
+    do_here(check.reference, long)  # beside the job, which can only become longer by it
+    sweep.wait(600)
+    log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
+    check.say("time limit", "saved and requeued at Slurm's signal", "continues from step" in log,
+              f"{log.count('continues from step')} times")  # fmt: skip
+    check.completed("time limit", sweep, 1)
 
 
 def out_of_memory(check: Check) -> None:
@@ -211,35 +197,7 @@ def out_of_memory(check: Check) -> None:
     check.completed("retry with more memory", sweep, 1)
 
 
-def full_disk(check: Check) -> None:
-    """The disk of the results, a tmpfs of 64 MiB, fills up while a run trains."""
-    disk = check.folder / "disk"
-    disk.mkdir()
-    if not check.cluster.ok("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(disk)):
-        print("full disk: not checked, mount of a tmpfs is not allowed here", flush=True)
-        return
-    try:
-        sweep = check.sweep("disk/full", *ONE)
-        sweep.one_training()
-        fill = disk / "fill"
-        with fill.open("wb", buffering=0) as file:
-            while True:
-                try:
-                    file.write(bytes(1 << 16))
-                except OSError:
-                    break
-        wait_until("the run has ended", lambda: sweep.broken() != [], 120)
-        reasons = sweep.broken()
-        check.say("full disk", "named", "No space left" in reasons[0], reasons[0])
-        fill.unlink()
-        sweep.wait()
-        sweep.retry()
-        check.completed("retry with room", sweep, 1)
-    finally:
-        check.cluster.ok("umount", "--lazy", str(disk))  # a log may still be open
-
-
-INJECTIONS = (killed_jobs_and_nodes, time_limit, out_of_memory, full_disk)
+INJECTIONS = (killed_jobs_and_nodes, time_limit, out_of_memory)  # what no fake of Slurm does
 
 
 def differences(reference: Path, results: Path) -> list[str]:

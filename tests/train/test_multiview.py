@@ -143,17 +143,6 @@ def test_half_as_many_as_candidates_are_drawn_from_all(has_reset: bool, left: li
     assert copies(density.model, means) == left
 
 
-def test_children_are_drawn_as_their_parent() -> None:
-    """Catches scores of the rows before the split that are given to other rows after it."""
-    density, means = of_eight("3dgs", [0.0, 0.0, -8.0, 0.0, 0.0, 0.0, 0.0, -8.0], [0.0, 0.0, 1.0] + [0.0] * 5)
-    with torch.no_grad():
-        density.model.splats["scales"].fill_(math.log(0.1))  # large: split
-    density.gradient[2], density.times_visible[:] = 5.0, 1.0
-    density.densify(generator(1), has_reset=False, most=100)  # three are faint, so one is drawn: a child
-    assert copies(density.model, means) == [1, 1, 0, 1, 1, 1, 1, 1]
-    assert len(density.model) == 8
-
-
 @pytest.mark.usefixtures("threads")
 def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
     """Catches views whose weights are added in the order that threads come by."""

@@ -66,23 +66,6 @@ def test_all_rates_fall_to_a_tenth_in_a_cooldown() -> None:
         assert cooled[100] / plain[100] == pytest.approx(0.1)
 
 
-def test_a_copied_gaussian_does_not_inherit_momentum() -> None:
-    """Catches moments left at the wrong rows: kept rows keep theirs, in the new order, fresh ones start at zero."""
-    model, optimizer = fitted()
-    for step in range(3):
-        descend(model, optimizer, step)
-    before = copy.deepcopy({n: optimizer.moments[p]["exp_avg"] for n, p in model.splats.items()})
-    rows = torch.tensor([5, 3, 3, 19])
-    model.select(rows)
-    optimizer.reindex(rows, fresh=torch.tensor([False, False, True, False]))
-    for name, parameter in model.splats.items():
-        moments = optimizer.moments[parameter]["exp_avg"]
-        assert moments.shape == parameter.shape
-        torch.testing.assert_close(moments[[0, 1, 3]], before[name][[5, 3, 19]], rtol=0, atol=0)
-        assert not moments[2].any()
-    descend(model, optimizer, 3)  # and Adam still steps
-
-
 def test_rates_and_parameters_must_match() -> None:
     """Catches a parameter that silently never learns, and a misspelt rate that silently does nothing."""
     with pytest.raises(InputError, match="'quats' has none"):
