@@ -12,14 +12,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
-import viser
 from viser import _messages
+from visitor import CAMERA, free_port, joined, packed, until, update
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from gsbench.errors import InputError
 from gsbench.run.load import load_run
@@ -29,20 +28,6 @@ from gsbench.view.request_guard import ENTRANCE, RequestGuard, is_known
 from gsbench.view.viewer import Viewer
 
 NAN, INF = float("nan"), float("inf")
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, -4], "fov": 0.7, "near": 0.1, "far": 100,
-    "image_height": 64, "image_width": 64, "look_at": [0, 0, 0], "up_direction": [0, 0, 1],
-}  # fmt: skip
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return int(probe.getsockname()[1])
-
-
-def packed(message: dict[str, Any], **changed: Any) -> bytes:
-    return msgspec.msgpack.encode(message | changed)
 
 
 @pytest.fixture(scope="module")
@@ -50,19 +35,6 @@ def viewer(folder: Path) -> Iterator[Viewer]:
     viewer = Viewer([load_run(folder)], "localhost", free_port())
     yield viewer
     viewer.stop()
-
-
-def joined(viewer: Viewer, **more: Any) -> ClientConnection:
-    """Connect as viser's page does."""
-    port = viewer.server.get_port()
-    return connect(f"ws://localhost:{port}/", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, **more)
-
-
-def until(holds: Any) -> None:
-    deadline = time.monotonic() + 20
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def rests(viewer: Viewer) -> bool:
@@ -151,12 +123,8 @@ BAD_CAMERAS: list[dict[str, Any]] = [
 OTHERS: list[object] = [
     "text", b"", b"\xc1", b"\x91" * 3000, packed({"type": "ShareUrlRequest"}), packed({"type": "ShareUrlDisconnect"}),
     packed({"type": "GuiFormDirtyMessage", "uuid": "x"}), packed({"type": "RunJavascriptMessage", "source": "x"}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"update_cb": 1}}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": NAN}}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1]}}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1, 2, 3, 4]}}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": [1, 2, NAN]}}),
-    packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": []}),
+    *(packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": updates})
+      for updates in ({"update_cb": 1}, [], *({"value": value} for value in (NAN, [1], [1, 2, 3, 4], [1, 2, NAN])))),
 ]  # fmt: skip
 
 
@@ -173,8 +141,10 @@ def test_what_the_page_never_sends_is_not_known() -> None:
     assert is_known(packed(CAMERA))
 
 
-def test_messages_of_the_guard_are_those_of_viser() -> None:
-    """Catches a viser that has changed what its page sends, so that nothing would be known."""
+def test_viser_is_the_one_that_is_guarded() -> None:
+    """Catches a viser that has changed what its page sends, or that listens in another way, past the guard."""
+    with pytest.raises(InputError, match="viser"), RequestGuard("localhost", free_port()).active():
+        pass
     for name in ("ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"):
         fields = set(getattr(_messages, name).__dataclass_fields__) - {"_cached_redundancy_key"}
         assert set(getattr(request_guard, name).__struct_fields__) == fields
@@ -193,8 +163,7 @@ def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, cap
         for control in (shown.controls.time, shown.controls.mode, shown.controls.degree, shown.controls.wipe,
                         shown.controls.play, shown.controls.background, *shown.controls._choices[0]):  # fmt: skip
             for value in ("x" * 100, "1e9", "1" * 100, -(2**60), INF, [0, 300, -1], [2**60, 0, 0], False):
-                update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
-                browser.send(packed(update))
+                browser.send(update(control, value))
         browser.send(packed(CAMERA, position=[0, 0, -5], image_width=32))
         until(lambda: viewer.server.get_clients()[shown.client.client_id].camera.image_width == 32)
         time.sleep(0.5)
@@ -292,9 +261,3 @@ def test_a_port_that_is_taken_is_passed_over() -> None:
         assert port < RequestGuard("127.0.0.1", port).port < port + 50
     with pytest.raises(InputError, match="--port"), socket.create_server(("127.0.0.1", 65535)):
         RequestGuard("127.0.0.1", 65535)
-
-
-def test_a_viser_that_listens_in_another_way_is_refused() -> None:
-    """Catches a guard that a newer viser goes past."""
-    with pytest.raises(InputError, match="viser"), RequestGuard("localhost", free_port()).active():
-        pass
