@@ -34,28 +34,19 @@ class ViewComparison(NamedTuple):
     psnr: float  # dB, of all pixels
 
 
-class TrainingViews:
-    """The training views of a scene, which can be searched by position and view direction."""
+def nearest_view(scene: Scene, camera: Camera, time: float | None) -> Nearest:
+    """Return the training view with the smallest sum of distance (in scene extents) and angle (in radians).
 
-    def __init__(self, scene: Scene) -> None:
-        """Keep the cameras and the times; no image is read."""
-        self._views, self._extent, self._unit = scene.train, max(scene.extent, 1e-12), scene.placement.unit
-        cameras = [view.camera.to("cpu") for view in scene.train]
-        self._centers = torch.stack([camera.center for camera in cameras])  # [V, 3]
-        self._forwards = torch.stack([camera.viewmat[2, :3] for camera in cameras])  # [V, 3]
-        self._times = torch.tensor([view.time or 0.0 for view in scene.train])  # [V]
-
-    def nearest(self, camera: Camera, time: float | None) -> Nearest:
-        """Return the training view with the smallest sum of distance (in scene extents) and angle (in radians).
-
-        If several views are about equally near, the view nearest in time is returned.
-        """
-        distances = (self._centers - camera.center).norm(dim=-1)
-        angles = torch.arccos((self._forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
-        far = distances / self._extent + angles
-        away = (self._times - (time or 0.0)).abs()
-        best = int(torch.where(far <= far.min() + SAME, away, math.inf).argmin())
-        return Nearest(self._views[best], float(distances[best]) * self._unit, math.degrees(angles[best]))
+    If several views are about equally near, the view nearest in time is returned. No image is read.
+    """
+    placed = [view.camera.to("cpu") for view in scene.train]
+    distances = (torch.stack([other.center for other in placed]) - camera.center).norm(dim=-1)
+    forwards = torch.stack([other.viewmat[2, :3] for other in placed])
+    angles = torch.arccos((forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
+    far = distances / max(scene.extent, 1e-12) + angles
+    away = (torch.tensor([view.time or 0.0 for view in scene.train]) - (time or 0.0)).abs()
+    best = int(torch.where(far <= far.min() + SAME, away, math.inf).argmin())
+    return Nearest(scene.train[best], float(distances[best]) * scene.placement.unit, math.degrees(angles[best]))
 
 
 def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewComparison:

@@ -32,7 +32,7 @@ from gsbench.view.frame import (
 from gsbench.view.labels import Label, labelled
 from gsbench.view.panel import comparison, cost_table, legend
 from gsbench.view.request_guard import RequestGuard
-from gsbench.view.training_views import TrainingViews, compare
+from gsbench.view.training_views import compare, nearest_view
 
 REST_S = 0.2  # seconds without a change after which a frame is rendered with all pixels
 FRAME_S = 1 / 30  # seconds between two frames while the scene is played
@@ -82,10 +82,8 @@ class Browser:
         self._saved_at = -math.inf
         self._bound: Future[tuple[Frame, Notes]] | None = None  # on the error of float32, being computed
         self._resolution, self._float32_resolution = Resolution(MOVING_MS), Resolution(FLOAT32_MS)
-        scene = viewer.scene
-        self._views = None if isinstance(scene, str) else TrainingViews(scene)
         start = viewer.server.initial_camera
-        self.controls = Controls(client, viewer.renderers, scene, start, self.change, self._save)
+        self.controls = Controls(client, viewer.renderers, viewer.scene, start, self.change, self._save)
         client.camera.on_update(self._move)
         self.change()
 
@@ -143,8 +141,9 @@ class Browser:
         if self.controls.shows_float32:
             self._bound = self._viewer.bounds.submit(self._bounded, frame)
             self._bound.add_done_callback(lambda _: self._viewer.wake.set())
-        if self._views is not None and self.controls.compare.value:
-            nearest = self._views.nearest(self._camera(1, 1), self.controls.now)
+        scene = self._viewer.scene
+        if not isinstance(scene, str) and self.controls.compare.value:
+            nearest = nearest_view(scene, self._camera(1, 1), self.controls.now)
             request = self.controls.request_of(nearest.view)
             renderers = dict.fromkeys(renderer for renderer, _ in self.controls.shown())
             compared = [compare(renderer, nearest.view, request) for renderer in renderers]

@@ -14,7 +14,7 @@ from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
-from gsbench.view.training_views import MOST_WIDTH, TrainingViews, compare
+from gsbench.view.training_views import MOST_WIDTH, compare, nearest_view
 
 EXTENT = 4.0
 
@@ -38,10 +38,10 @@ def scene(*cameras_and_times: tuple[Camera, float | None]) -> Scene:
 
 def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
     """Catches a choice by place alone or by direction alone, a rotation that is inverted, and wrong distances."""
-    views = TrainingViews(scene((camera(0.0), 0.0), (camera(1.0), 0.0), (camera(0.0, towards=0.5), 0.0)))
-    assert views.nearest(camera(0.2), 0.0).view.name == "0"
-    assert views.nearest(camera(0.9), 0.0).view.name == "1"
-    nearest = views.nearest(camera(0.5, towards=0.6), 0.0)
+    views = scene((camera(0.0), 0.0), (camera(1.0), 0.0), (camera(0.0, towards=0.5), 0.0))
+    assert nearest_view(views, camera(0.2), 0.0).view.name == "0"
+    assert nearest_view(views, camera(0.9), 0.0).view.name == "1"
+    nearest = nearest_view(views, camera(0.5, towards=0.6), 0.0)
     assert nearest.view.name == "2"
     assert nearest.distance == pytest.approx(0.5)
     assert nearest.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
@@ -49,20 +49,20 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
 
 def test_places_count_in_extents() -> None:
     """Catches metres added to radians: 0.6 of an extent of 4 is less than the 17 degrees of the other view."""
-    views = TrainingViews(scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0)))
-    assert views.nearest(camera(0.4), 0.0).view.name == "0"
+    views = scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0))
+    assert nearest_view(views, camera(0.4), 0.0).view.name == "0"
 
 
 def test_of_views_of_one_camera_the_nearest_in_time_is_chosen() -> None:
     """Catches a rig whose first frame is always shown, and a time that outweighs the place."""
-    views = TrainingViews(scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)]))
-    assert [views.nearest(camera(0.1), time).view.name for time in (0.0, 0.4, 0.9)] == ["0", "2", "4"]
-    assert views.nearest(camera(0.9), 0.4).view.name == "3"
+    views = scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)])
+    assert [nearest_view(views, camera(0.1), time).view.name for time in (0.0, 0.4, 0.9)] == ["0", "2", "4"]
+    assert nearest_view(views, camera(0.9), 0.4).view.name == "3"
 
 
 def test_a_scene_without_times_has_a_nearest_view() -> None:
     """Catches a time that has to be there."""
-    assert TrainingViews(scene((camera(0.0), None), (camera(1.0), None))).nearest(camera(0.9), None).view.name == "1"
+    assert nearest_view(scene((camera(0.0), None), (camera(1.0), None)), camera(0.9), None).view.name == "1"
 
 
 def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:

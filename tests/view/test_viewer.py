@@ -83,8 +83,8 @@ class Steps(Browser):
 
     def __init__(self) -> None:
         self.done: list[str] = []
-        self.changed, self.rests, self._bound, self._saves, self._views = threading.Event(), True, None, False, None
-        self._viewer: Any = SimpleNamespace(wake=threading.Event())
+        self.changed, self.rests, self._bound, self._saves = threading.Event(), True, None, False
+        self._viewer: Any = SimpleNamespace(wake=threading.Event(), scene="no data set")
         self.controls: Any = SimpleNamespace(
             costs=SimpleNamespace(content=""),
             play=SimpleNamespace(value=False),
