@@ -9,7 +9,7 @@ import pytest
 import torch
 from conftest import Place
 from numerics.brute import Picture, render
-from raster.cases import assert_beta_vector, camera, case, gaussians, names
+from raster.cases import CASES, assert_beta_vector, camera, case, gaussians
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -81,7 +81,7 @@ def backward_kernels(place: Place) -> Iterator[AbstractContextManager[None]]:
         yield raster.backward_by_splat()
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", CASES)
 def test_picture(name: str, place: Place) -> None:
     """Catches any rule of the picture that differs, a bound or tile that loses a Gaussian, and radii, means or depths
     that density control would take for others."""
@@ -101,7 +101,7 @@ def test_picture(name: str, place: Place) -> None:
     assert (info.pairs == 0) == (expected.pairs == 0)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", CASES)
 def test_gradients(name: str, place: Place) -> None:
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
     for kernel in backward_kernels(place):

@@ -10,29 +10,12 @@ from torch import Tensor
 from gsbench.raster import rasterize
 
 Arguments = dict[str, Any]
-_BUILDERS: dict[str, Callable[[torch.Generator], Arguments]] = {}
 
 
-def case(name: str, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Arguments:
-    """Keyword arguments of `rasterize`; the same numbers, rounded, in every dtype."""
-    arguments = _BUILDERS[name](torch.Generator().manual_seed(zlib.crc32(name.encode())))
-    return {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
-
-
-def names() -> list[str]:
-    """Every case."""
-    return list(_BUILDERS)
-
-
-def _case(build: Callable[[torch.Generator], Arguments]) -> Callable[[torch.Generator], Arguments]:
-    _BUILDERS[build.__name__.strip("_")] = build
-    return build
-
-
-def gaussians(g: torch.Generator, N: int, size: float = 0.15, D: int = 3) -> Arguments:
-    """N Gaussians in [-1, 1]^3, of about `size`, by full 3x3 factors."""
+def gaussians(g: torch.Generator, N: int, size: float = 0.15, D: int = 3, spread: float = 1.0) -> Arguments:
+    """N Gaussians in a cube around the origin, of about `size`, by full 3x3 factors."""
     return {
-        "means": 2 * _rand(g, N, 3) - 1,
+        "means": spread * (2 * _rand(g, N, 3) - 1),
         "factors": size * torch.randn(N, 3, 3, generator=g, dtype=torch.float64),
         "opacities": 0.05 + 0.9 * _rand(g, N),
         "colors": _rand(g, N, D),
@@ -75,55 +58,29 @@ def _rotations(g: torch.Generator, N: int) -> Tensor:
     return torch.linalg.qr(torch.randn(N, 3, 3, generator=g, dtype=torch.float64))[0]
 
 
-@_case
-def random(g: torch.Generator) -> Arguments:
-    return gaussians(g, 60) | camera(33, 17)
+def _repeated(rows: list[Any], N: int) -> Tensor:
+    """N rows that are these in turn."""
+    values = torch.tensor(rows, dtype=torch.float64)
+    return values.repeat(N // len(rows), *[1] * (values.dim() - 1))
 
 
-@_case
-def needles(g: torch.Generator) -> Arguments:
-    """Axes 1e4 : 1 : 1 and 1e4 : 1e4 : 1, many times as long as the picture is wide."""
-    scene = gaussians(g, 24) | camera(33, 17)
-    axes = torch.tensor([[2.0, 2e-4, 2e-4], [2.0, 2.0, 2e-4]], dtype=torch.float64).repeat(12, 1)
-    return scene | {"factors": _rotations(g, 24) * axes[:, None]}
+# ---- the cases
 
 
-@_case
-def needles_across_a_large_picture(g: torch.Generator) -> Arguments:
-    """Half a pixel wide, hundreds long: dx^2, dx dy and dy^2 cancel to a thousandth or less of themselves."""
-    scene = gaussians(g, 16) | camera(400, 300)
-    axes = torch.tensor([2.0, 2e-4, 2e-4], dtype=torch.float64)
-    return scene | {"factors": _rotations(g, 16) * axes}
+def _flattened(g: torch.Generator, N: int, axes: list[list[float]], width: int = 33, height: int = 17) -> Arguments:
+    """N Gaussians of these axes in turn, turned at random."""
+    scene = gaussians(g, N) | camera(width, height)
+    return scene | {"factors": _rotations(g, N) * _repeated(axes, N)[:, None]}
 
 
-@_case
-def flat(g: torch.Generator) -> Arguments:
-    """Singular factors: a disc, a line, a point."""
-    scene = gaussians(g, 24) | camera(33, 17)
-    axes = torch.tensor([[0.3, 0.3, 0], [0.3, 0, 0], [0, 0, 0]], dtype=torch.float64).repeat(8, 1)
-    return scene | {"factors": _rotations(g, 24) * axes[:, None]}
-
-
-@_case
-def larger_than_picture(g: torch.Generator) -> Arguments:
-    return gaussians(g, 12, size=8.0) | camera(20, 12)
-
-
-@_case
-def near_plane(g: torch.Generator) -> Arguments:
+def _near_plane(g: torch.Generator) -> Arguments:
     """Means behind the camera, on it, within `near` of it and just beyond, with extents that cross all of that."""
     scene = gaussians(g, 40, size=0.4) | camera(24, 16, eye=(0.0, 0.0, -1e-3))
     z = torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None]
     return scene | {"means": torch.cat([0.3 * scene["means"][:, :2], z], -1), "near": 0.2}
 
 
-@_case
-def far_plane(g: torch.Generator) -> Arguments:
-    return gaussians(g, 20) | camera(16, 16) | {"far": 4.1}
-
-
-@_case
-def off_screen(g: torch.Generator) -> Arguments:
+def _off_screen(g: torch.Generator) -> Arguments:
     """Around the border on all sides: outside but reaching in, and farther than the Jacobian's clamp."""
     scene = gaussians(g, 60, size=0.6) | camera(24, 16)
     angle = 6.2832 * _rand(g, 60)
@@ -131,34 +88,7 @@ def off_screen(g: torch.Generator) -> Arguments:
     return scene | {"means": ring}
 
 
-@_case
-def nothing_in_view(g: torch.Generator) -> Arguments:
-    scene = gaussians(g, 8) | camera(16, 8)
-    return scene | {"means": scene["means"] + 50, "background": torch.tensor([0.2, 0.4, 0.6])}
-
-
-@_case
-def transparent(g: torch.Generator) -> Arguments:
-    """Opacities of zero and of just below 1/255, which are never drawn, among some just above."""
-    scene = gaussians(g, 30, size=0.3) | camera(16, 16)
-    return scene | {"opacities": torch.tensor([0.0, 0.99 / 255, 1.2 / 255], dtype=torch.float64).repeat(10)}
-
-
-@_case
-def opaque_stack(g: torch.Generator) -> Arguments:
-    """A thousand behind each other: the first few are all that is seen."""
-    scene = gaussians(g, 1000, size=0.5) | camera(9, 9)
-    return scene | {"opacities": 0.6 + 0.4 * _rand(g, 1000), "means": scene["means"] * 0.3}
-
-
-@_case
-def saturated(g: torch.Generator) -> Arguments:
-    """Opacity 1 exactly: alpha stops at 0.999."""
-    return gaussians(g, 10, size=20.0) | camera(16, 16) | {"opacities": torch.ones(10)}
-
-
-@_case
-def equal_depths(g: torch.Generator) -> Arguments:
+def _equal_depths(g: torch.Generator) -> Arguments:
     """All at the same depth to the last bit: the lower index is in front."""
     scene = gaussians(g, 30, size=0.4) | camera(16, 16)
     viewmat = torch.eye(4)
@@ -166,30 +96,7 @@ def equal_depths(g: torch.Generator) -> Arguments:
     return scene | {"means": scene["means"] * torch.tensor([1.0, 1.0, 0.0]), "viewmats": viewmat[None]}
 
 
-@_case
-def one_pixel(g: torch.Generator) -> Arguments:
-    return gaussians(g, 20, size=0.5) | camera(1, 1)
-
-
-@_case
-def tall(g: torch.Generator) -> Arguments:
-    """17 x 33: no multiple of any tile."""
-    return gaussians(g, 40) | camera(17, 33)
-
-
-@_case
-def no_gaussian(g: torch.Generator) -> Arguments:
-    return gaussians(g, 0) | camera(9, 5) | {"background": torch.tensor([0.1, 0.2, 0.3])}
-
-
-@_case
-def one_gaussian(g: torch.Generator) -> Arguments:
-    scene = gaussians(g, 1, size=0.5) | camera(19, 10)
-    return scene | {"means": torch.tensor([[0.1, 0.05, 0.0]]), "opacities": torch.tensor([0.8])}
-
-
-@_case
-def three_cameras(g: torch.Generator) -> Arguments:
+def _three_cameras(g: torch.Generator) -> Arguments:
     """Different places and focal lengths, one colour set a camera, one background for all."""
     scene = gaussians(g, 30) | camera(20, 14)
     eyes = ((0.5, -0.4, -4.0), (3.0, 1.0, -2.0), (-2.0, 0.5, 3.0))
@@ -201,98 +108,101 @@ def three_cameras(g: torch.Generator) -> Arguments:
     }
 
 
-@_case
-def oblong_pixels(g: torch.Generator) -> Arguments:
-    return gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(25.0, 50.0, 12, 8)[None]}
-
-
-@_case
-def principal_point_off_center(g: torch.Generator) -> Arguments:
-    return gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, 5.3, 12.8)[None]}
-
-
-@_case
-def principal_point_outside(g: torch.Generator) -> Arguments:
-    return gaussians(g, 40, size=0.3) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, -9.0, 21.0)[None]}
-
-
-@_case
-def one_channel(g: torch.Generator) -> Arguments:
-    return gaussians(g, 20, D=1) | camera(16, 12) | {"background": torch.tensor([0.7])}
-
-
-@_case
-def five_channels(g: torch.Generator) -> Arguments:
+def _five_channels(g: torch.Generator) -> Arguments:
     """Colours need not be in [0, 1]."""
     scene = gaussians(g, 20, D=5) | camera(16, 12)
     return scene | {"colors": 4 * scene["colors"] - 2, "background": torch.arange(5) - 2.0}
 
 
-@_case
-def antialiased(g: torch.Generator) -> Arguments:
+def _of_many_sizes(g: torch.Generator, scene: Arguments) -> Arguments:
     """Sizes from far below a pixel, where the filter dims, to large."""
-    scene = gaussians(g, 60) | camera(24, 16) | {"antialias": True}
-    return scene | {"factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
+    return scene | {"antialias": True, "factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
 
 
-@_case
-def wide_filter(g: torch.Generator) -> Arguments:
-    return gaussians(g, 30) | camera(16, 16) | {"eps2d": 2.0}
+def _with_exponents(scene: Arguments, exponents: Tensor) -> Arguments:
+    return scene | {"beta_exponents": exponents}
 
 
-@_case
-def beta(g: torch.Generator) -> Arguments:
-    """Beta profiles, from flat discs with a rim to small peaks."""
-    return gaussians(g, 60, size=0.5) | camera(33, 17) | {"beta_exponents": 0.2 * 30 ** _rand(g, 60)}
-
-
-@_case
-def beta_at_the_rim(g: torch.Generator) -> Arguments:
-    """Exponents so small that alpha drops to zero at the rim."""
-    return gaussians(g, 30, size=0.5) | camera(24, 16) | {"beta_exponents": 0.01 + 0.3 * _rand(g, 30)}
-
-
-@_case
-def beta_faint(g: torch.Generator) -> Arguments:
-    """Opacities just below and just above 1/255: culled ones, and ones that end close to their means."""
-    opacities = torch.tensor([0.99 / 255, 1.1 / 255, 2 / 255], dtype=torch.float64).repeat(10)
-    scene = gaussians(g, 30, size=2.0) | camera(16, 16) | {"beta_exponents": 0.3 * 30 ** _rand(g, 30)}
-    return scene | {"opacities": opacities}
-
-
-@_case
-def beta_of_huge_exponents(g: torch.Generator) -> Arguments:
+def _huge_exponents(g: torch.Generator) -> Arguments:
     """Exponents of 10^2 to 10^6 on Gaussians so large that a few pixels are seen of them: as good as Gaussians."""
     exponents = 10 ** (2 + 4 * _rand(g, 30))
-    scene = gaussians(g, 30) | camera(24, 16) | {"beta_exponents": exponents}
+    scene = _with_exponents(gaussians(g, 30) | camera(24, 16), exponents)
     return scene | {"factors": scene["factors"] * exponents[:, None, None].sqrt()}
 
 
-@_case
-def beta_antialiased(g: torch.Generator) -> Arguments:
-    scene = gaussians(g, 60, size=0.4) | camera(24, 16) | {"antialias": True, "beta_exponents": 0.2 + 4 * _rand(g, 60)}
-    return scene | {"factors": scene["factors"] * 10 ** (1 - 2.5 * _rand(g, 60, 1, 1))}
+CASES: dict[str, Callable[[torch.Generator], Arguments]] = {
+    "random": lambda g: gaussians(g, 60) | camera(33, 17),
+    # Axes 1e4 : 1 : 1 and 1e4 : 1e4 : 1, many times as long as the picture is wide.
+    "needles": lambda g: _flattened(g, 24, [[2.0, 2e-4, 2e-4], [2.0, 2.0, 2e-4]]),
+    # Half a pixel wide, hundreds long: dx^2, dx dy and dy^2 cancel to a thousandth or less of themselves.
+    "needles_across_a_large_picture": lambda g: _flattened(g, 16, [[2.0, 2e-4, 2e-4]], 400, 300),
+    # Singular factors: a disc, a line, a point.
+    "flat": lambda g: _flattened(g, 24, [[0.3, 0.3, 0], [0.3, 0, 0], [0, 0, 0]]),
+    "larger_than_picture": lambda g: gaussians(g, 12, size=8.0) | camera(20, 12),
+    "near_plane": _near_plane,
+    "far_plane": lambda g: gaussians(g, 20) | camera(16, 16) | {"far": 4.1},
+    "off_screen": _off_screen,
+    "nothing_in_view": lambda g: (
+        gaussians(g, 8) | camera(16, 8) | {"means": 50 + _rand(g, 8, 3), "background": torch.tensor([0.2, 0.4, 0.6])}
+    ),
+    # Opacities of zero and of just below 1/255, which are never drawn, among some just above.
+    "transparent": lambda g: (
+        gaussians(g, 30, size=0.3) | camera(16, 16) | {"opacities": _repeated([0.0, 0.99 / 255, 1.2 / 255], 30)}
+    ),
+    # A thousand behind each other: the first few are all that is seen.
+    "opaque_stack": lambda g: (
+        gaussians(g, 1000, size=0.5, spread=0.3) | camera(9, 9) | {"opacities": 0.6 + 0.4 * _rand(g, 1000)}
+    ),
+    # Opacity 1 exactly: alpha stops at 0.999.
+    "saturated": lambda g: gaussians(g, 10, size=20.0) | camera(16, 16) | {"opacities": torch.ones(10)},
+    "equal_depths": _equal_depths,
+    "one_pixel": lambda g: gaussians(g, 20, size=0.5) | camera(1, 1),
+    "tall": lambda g: gaussians(g, 40) | camera(17, 33),  # no multiple of any tile
+    "no_gaussian": lambda g: gaussians(g, 0) | camera(9, 5) | {"background": torch.tensor([0.1, 0.2, 0.3])},
+    "one_gaussian": lambda g: (
+        gaussians(g, 1, size=0.5)
+        | camera(19, 10)
+        | {"means": torch.tensor([[0.1, 0.05, 0.0]]), "opacities": torch.tensor([0.8])}
+    ),
+    "three_cameras": _three_cameras,
+    "oblong_pixels": lambda g: gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(25.0, 50.0, 12, 8)[None]},
+    "principal_point_off_center": lambda g: (
+        gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, 5.3, 12.8)[None]}
+    ),
+    "principal_point_outside": lambda g: (
+        gaussians(g, 40, size=0.3) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, -9.0, 21.0)[None]}
+    ),
+    "one_channel": lambda g: gaussians(g, 20, D=1) | camera(16, 12) | {"background": torch.tensor([0.7])},
+    "five_channels": _five_channels,
+    "antialiased": lambda g: _of_many_sizes(g, gaussians(g, 60) | camera(24, 16)),
+    "wide_filter": lambda g: gaussians(g, 30) | camera(16, 16) | {"eps2d": 2.0},
+    # Beta profiles, from flat discs with a rim to small peaks; then exponents so small that alpha drops to zero there.
+    "beta": lambda g: _with_exponents(gaussians(g, 60, size=0.5) | camera(33, 17), 0.2 * 30 ** _rand(g, 60)),
+    "beta_at_the_rim": lambda g: _with_exponents(
+        gaussians(g, 30, size=0.5) | camera(24, 16), 0.01 + 0.3 * _rand(g, 30)
+    ),
+    # Opacities just below and just above 1/255: culled ones, and ones that end close to their means.
+    "beta_faint": lambda g: (
+        _with_exponents(gaussians(g, 30, size=2.0) | camera(16, 16), 0.3 * 30 ** _rand(g, 30))
+        | {"opacities": _repeated([0.99 / 255, 1.1 / 255, 2 / 255], 30)}
+    ),
+    "beta_of_huge_exponents": _huge_exponents,
+    "beta_antialiased": lambda g: _of_many_sizes(
+        g, _with_exponents(gaussians(g, 60, size=0.4) | camera(24, 16), 0.2 + 4 * _rand(g, 60))
+    ),
+    "beta_of_three_cameras": lambda g: _with_exponents(_three_cameras(g), 0.2 + 4 * _rand(g, 30)),
+    "beta_of_five_channels": lambda g: _with_exponents(_five_channels(g), 0.2 + 4 * _rand(g, 20)),
+    # Opacity 1: alpha stops at 0.999 near the means, and there is no gradient there.
+    "beta_saturated": lambda g: (
+        _with_exponents(gaussians(g, 10, size=2.0) | camera(16, 16), 0.1 + _rand(g, 10)) | {"opacities": torch.ones(10)}
+    ),
+}
 
 
-@_case
-def beta_of_three_cameras(g: torch.Generator) -> Arguments:
-    """One exponent for all cameras, but colours for each."""
-    return three_cameras(g) | {"beta_exponents": 0.2 + 4 * _rand(g, 30)}
-
-
-@_case
-def beta_of_five_channels(g: torch.Generator) -> Arguments:
-    return five_channels(g) | {"beta_exponents": 0.2 + 4 * _rand(g, 20)}
-
-
-@_case
-def beta_saturated(g: torch.Generator) -> Arguments:
-    """Opacity 1: alpha stops at 0.999 near the means, and there is no gradient there."""
-    return (
-        gaussians(g, 10, size=2.0)
-        | camera(16, 16)
-        | {"opacities": torch.ones(10), "beta_exponents": 0.1 + _rand(g, 10)}
-    )
+def case(name: str, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Arguments:
+    """Keyword arguments of `rasterize`; the same numbers, rounded, in every dtype."""
+    arguments = CASES[name](torch.Generator().manual_seed(zlib.crc32(name.encode())))
+    return {k: v.to(device, dtype) if isinstance(v, Tensor) else v for k, v in arguments.items()}
 
 
 def assert_beta_vector(backend: str, dtype: torch.dtype, tolerance: float) -> None:
