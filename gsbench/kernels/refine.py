@@ -123,7 +123,7 @@ class _Refine(Operation):
         slots = self.match(tensors, numbers).copy()
         inputs = _Inputs.of(tensors)
         values, weights = in_rows(inputs.values), inputs.layers()
-        intervals = None if inputs.intervals is None else inputs.intervals.contiguous()
+        intervals = None if inputs.intervals is None else in_rows([inputs.intervals])[0]
         slots |= {"values": addresses(values), "intervals": address(intervals), "time": address(inputs.time),
                   "rows": values, "layers": weights, "kept": (intervals, inputs.time)}  # fmt: skip
         return slots | {key: x.data_ptr() for key, x in weights.items()}

@@ -66,29 +66,29 @@ X = torch.zeros(4, 2)
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("update", "changed", "message"),
     [
-        ({1: torch.zeros(4, 3)}, r"expected gradient of shape \[4, 2\] on cpu, got \[4, 3\]"),
-        ({4: torch.ones(3, dtype=torch.bool)}, r"expected drawn of shape \[4\]"),
+        (adam, {1: torch.zeros(4, 3)}, r"expected gradient of shape \[4, 2\] on cpu, got \[4, 3\]"),
+        (adam, {4: torch.ones(3, dtype=torch.bool)}, r"expected drawn of shape \[4\]"),
+        (
+            adam_all,
+            {1: torch.zeros(4, 3)},
+            r"expected gradient as contiguous float32 of shape \[4, 2\] on the CPU, got",
+        ),
+        (adam_all, {2: torch.zeros(4, 2, dtype=torch.float64)}, "expected mean as contiguous float32"),
+        (adam_all, {0: torch.zeros(2, 4).T}, "expected parameter as contiguous float32"),
     ],
 )
-def test_adam_refuses_what_does_not_fit(changed: dict[int, Any], message: str) -> None:
-    """Catches a mask or an array of another size that reaches the kernel."""
-    arguments = {0: X.clone(), 1: X, 2: X.clone(), 3: X.clone(), 4: torch.ones(4, dtype=torch.bool)} | changed
+def test_arrays_that_do_not_fit_are_refused(update: Any, changed: dict[int, torch.Tensor], message: str) -> None:
+    """Catches a mask or an array of another size or type, and a parameter with gaps, whose address reaches the
+    kernel."""
+    arguments: list[Any] = list(
+        ({i: X.clone() for i in range(4)} | {4: torch.ones(4, dtype=torch.bool)} | changed).values()
+    )
+    if update is adam_all:
+        arguments = [[x] for x in arguments[:4]]
+        more: list[Any] = [[torch.ones(())], [0.1], [0.9, 0.999], 1e-15]
+    else:
+        more = [0.01, [0.9, 0.999], 1e-15, torch.tensor(1.0)]
     with pytest.raises(InputError, match=message):
-        adam(*arguments.values(), 0.01, [0.9, 0.999], 1e-15, torch.tensor(1.0))
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({1: torch.zeros(4, 3)}, r"expected gradient as contiguous float32 of shape \[4, 2\] on the CPU, got"),
-        ({2: torch.zeros(4, 2, dtype=torch.float64)}, "expected mean as contiguous float32"),
-        ({0: torch.zeros(2, 4).T}, "expected parameter as contiguous float32"),
-    ],
-)
-def test_all_parameters_must_fit(changed: dict[int, torch.Tensor], message: str) -> None:
-    """Catches a gradient of another size or type, and a parameter with gaps, whose address reaches the kernel."""
-    arguments = [[x] for x in ({0: X, 1: X, 2: X, 3: X} | changed).values()]
-    with pytest.raises(InputError, match=message):
-        adam_all(*arguments, [torch.ones(())], [0.1], [0.9, 0.999], 1e-15)
+        update(*arguments, *more)

@@ -6,6 +6,7 @@ tested without being listed. Where plain numbers give no gradient, `VALUES` has 
 
 import importlib
 import pkgutil
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -15,8 +16,10 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels.operation import EVERY_ROW, Gradient, Operation, sizes_of
+from gsbench.kernels.library import library_of
+from gsbench.kernels.operation import EVERY_ROW, MOST_KNOWN, Gradient, Operation, sizes_of
 from gsbench.kernels.raster import count_tiles
+from gsbench.kernels.slices import slice_static
 
 N, C, WIDTH, HEIGHT = 5, 2, 20, 18
 TILES = count_tiles(WIDTH, HEIGHT)
@@ -36,6 +39,13 @@ VALUES: dict[str, Tensor] = {
     "ids": torch.arange(N, dtype=torch.int32).repeat(C * TILES),
     "opacities": torch.full((N,), 0.5),
     "orders": torch.full((N,), 5, dtype=torch.int32),
+}
+LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "one row for all, stride 0": lambda x: x[:1].expand(x.shape),
+    "one number a row, stride 0": lambda x: x[..., :1].expand(x.shape),
+    "every second row": lambda x: x.repeat_interleave(2, 0)[::2],
+    "transposed": lambda x: x.transpose(0, -1).contiguous().transpose(0, -1),
+    "negated, as torch notes of an imaginary part": lambda x: torch._neg_view(-x),
 }
 
 
@@ -112,7 +122,7 @@ OPERATIONS = pytest.mark.parametrize("operation", declared(), ids=lambda operati
 
 def run(operation: Operation, at: Call) -> tuple[list[Tensor], dict[str, Tensor | None]]:
     """The outputs of a call, and the gradients of a weighted sum of them by all that has one, from autograd."""
-    tensors = [torch.empty(0) if x is None else x.clone() for x in at.tensors.values()]
+    tensors = [torch.empty(0) if x is None else x.detach() for x in at.tensors.values()]
     for x, has_gradient in zip(tensors, operation.differentiable(tensors), strict=True):
         x.requires_grad_(has_gradient and x.dtype is torch.float32)
     there = {name: x for name, x in zip(at.tensors, tensors, strict=True) if at.tensors[name] is not None}
@@ -139,22 +149,37 @@ def test_shapes_and_gradients(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_v3_and_v4_have_the_same_bits(operation: Operation) -> None:
-    """Catches a product that only one build fuses with a sum, another order of a sum, an approximate instruction."""
-    levels = kernels.native().instruction_sets()
-    if "v4" not in levels or "v3" not in levels:
-        pytest.skip("needs a processor with AVX-512, and the kernels of v3 and v4: make test LEVELS=all")
-    many = 3 * 16 + 5  # some whole vectors, and a rest
-    at, results = call(operation, N if "ids" in operation.inputs else many), []  # `ids` are of N Gaussians
+@pytest.mark.usefixtures("threads")
+def test_threads_and_wider_vectors_change_no_bit(operation: Operation) -> None:
+    """Catches rows that two threads share or none computes, another order of a sum; a product that only one of v3 and
+    v4 fuses with a sum, an approximate instruction."""
+    at = call(operation, N if "ids" in operation.inputs else 1100 + 5)  # some whole vectors, and a rest; `ids` are of N
+    levels, results = kernels.native().instruction_sets(), []
     try:
-        for level in ("v3", "v4"):
+        for level in [level for level in levels if level != "v2"] or levels:
             kernels.use_instruction_set(level)
-            results.append(run(operation, at))
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                results.append(run(operation, at))
     finally:
         kernels.use_instruction_set(levels[-1])
-    (outputs, gradients), (other_outputs, other_gradients) = results
-    assert all(torch.equal(x, y) for x, y in zip(outputs, other_outputs, strict=True))
-    assert [name for name, x in gradients.items() if not torch.equal(x, other_gradients[name])] == []
+    outputs, gradients = results[0]
+    for other, other_gradients in results[1:]:
+        assert all(torch.equal(x, y) for x, y in zip(outputs, other, strict=True))
+        assert [name for name, x in gradients.items() if not torch.equal(x, other_gradients[name])] == []
+
+
+@OPERATIONS
+def test_memory_of_any_layout(operation: Operation) -> None:
+    """Catches memory read as it does not lie, a gradient that is added up in the memory that the rows of a leaf share,
+    or one that is written in another order: weights whose columns were taken for rows gave wrong results in silence."""
+    at = call(operation)
+    for name, x in at.tensors.items():
+        for layout in LAYOUTS if x is not None and x.is_floating_point() and x.dim() else ():
+            laid_out = LAYOUTS[layout](x)
+            plain = laid_out.resolve_neg().contiguous().clone()
+            results = [run(operation, at._replace(tensors=at.tensors | {name: y})) for y in (laid_out, plain)]
+            torch.testing.assert_close(*results)
 
 
 @OPERATIONS
@@ -223,10 +248,79 @@ def test_what_is_added_is_added(operation: Operation) -> None:
 
 @OPERATIONS
 def test_torch_compile_is_told_the_shapes(operation: Operation) -> None:
-    """Catches a fake whose shapes are not those of the outputs and gradients: torch.compile would allocate others."""
+    """Catches a fake whose shapes are not those of the outputs and gradients, for which torch.compile would allocate
+    others; and an operation that aliases, mutates or misdeclares its outputs."""
     at = call(operation)
     with FakeTensorMode() as mode:
         fakes = [mode.from_tensor(x) for x in at.tensors.values()]
         outputs = getattr(torch.ops.gsbench, operation.name)(fakes, *at.numbers.values())
         assert [tuple(x.shape) for x in outputs] == at.shapes
         assert [x.shape for x in operation.fake_backward(fakes)] == [x.shape for x in fakes]
+    flags = operation.differentiable(list(at.tensors.values()))
+    tensors = [x.detach().requires_grad_(flag) for x, flag in zip(at.tensors.values(), flags, strict=True)]
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    operator = getattr(torch.ops.gsbench, operation.name)
+    torch.library.opcheck(operator, (tensors, *at.numbers.values()), test_utils=checks)
+
+
+# ---- what is declared
+
+
+@OPERATIONS
+def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
+    """Catches a field that a declaration has and the kernel's structure has not: it would be dropped in silence."""
+    library = library_of("cpu")
+    names = {*operation.inputs, *operation.numbers} - {"with_gradient"}  # which is said by a null
+    for name in names if operation.inputs else ():
+        assert library.takes(operation.name, name) or library.takes(operation.name, f"out.{name}"), name
+    for name in operation.outputs:
+        assert library.takes(operation.name, f"out.{name}"), name
+    if operation.name == "l1_ssim":
+        return  # its gradient comes with its value
+    has_gradient = operation.differentiable([]) if operation.inputs else ()
+    for name, expected in zip(operation.inputs, has_gradient, strict=True):
+        assert library.takes(f"{operation.name}_backward", f"grad.{name}") == expected, name
+
+
+def test_every_kernel_is_declared() -> None:
+    """Catches a kernel that no operation calls any more."""
+    called = {operation.name for operation in declared()}
+    without_gradient = {"adam", "adam_all", "flag_values", "flag_arrays", "count_tiles", "fill_tiles", "exact_splats",
+                        "exact_image"}  # fmt: skip
+    assert {name.removesuffix("_backward") for name in kernels.native().SIGNATURES} == called | without_gradient
+
+
+def test_a_message_says_what_was_expected_and_what_came() -> None:
+    """Catches a refusal that names no shape."""
+    with pytest.raises(InputError, match=r"expected quats of shape \[4, 4\], got \[5, 4\]"):
+        slice_static(torch.zeros(4, 3), torch.zeros(5, 4), torch.zeros(4))
+    with pytest.raises(InputError, match="scales: expected float32, got int64"):
+        slice_static(torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4))
+
+
+def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
+    Gaussians that are kept for ever."""
+    matched: list[int] = []
+    match = slice_static._match
+    monkeypatch.setattr(
+        slice_static, "_match", lambda tensors, numbers: (matched.append(1), match(tensors, numbers))[1]
+    )
+    for _ in range(3):
+        for N in (1003, 1005):
+            factors, opacities = slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+            assert factors.shape == (N, 3, 3)
+            assert opacities.shape == (N,)
+    assert len(matched) <= 2
+    for N in range(2 * MOST_KNOWN):
+        slice_static(torch.zeros(N, 3), torch.ones(N, 4), torch.zeros(N))
+    assert len(slice_static._known) <= MOST_KNOWN
+
+
+def test_the_extension_counts_and_types_its_values() -> None:
+    """Catches a call that shifts every field by one: the last door looks at number and kind."""
+    native = kernels.native()
+    with pytest.raises(TypeError, match="expected 7 values"):
+        native.slice_static(1, 2, 3)
+    with pytest.raises(TypeError):
+        native.slice_static(0, "means", 0, 0, 1, 0, 0)

@@ -145,16 +145,6 @@ def test_same_bits_for_any_number_of_threads(name: str) -> None:
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
 
 
-def test_shared_colors_collect_the_gradient_of_every_camera() -> None:
-    """Catches a gradient of shared colours that keeps only one camera's part."""
-    arguments = with_background("three_cameras") | {"colors": torch.rand(30, 3)}
-    shared, separate = (
-        differentiate(arguments | {"colors": colors}, "cpu", torch.ones(()).bool())[1]["colors"]
-        for colors in (arguments["colors"], arguments["colors"].repeat(3, 1, 1))
-    )
-    torch.testing.assert_close(shared, separate.sum(0), rtol=1e-6, atol=1e-5)
-
-
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("position", [0, 15, (1 << 17) - 1, 1 << 17, -1])
 def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
@@ -238,25 +228,3 @@ def test_what_it_cannot_do_is_refused() -> None:
     cameras = {key: arguments[key].detach().repeat(2000, 1, 1) for key in ("viewmats", "Ks")}
     with pytest.raises(InputError, match="GiB"):
         rasterize(**arguments | cameras | {"width": 3840, "height": 2160}, backend="cpu")
-
-
-@pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "beta_of_three_cameras"])
-def test_operations_keep_torch_s_rules(name: str) -> None:
-    """Catches an operation that aliases, mutates or misdeclares its outputs, so that torch.compile would be wrong."""
-    a = with_background(name)
-    inputs = [a[k].requires_grad_() for k in ("means", "factors", "opacities", "viewmats")]
-    viewport = raster.Viewport(a["width"], a["height"], 0.01, 1e10, 0.3, False)
-    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    shapes = a.get("beta_exponents")
-    exponents = torch.empty(0) if shapes is None else shapes.requires_grad_()
-    torch.library.opcheck(torch.ops.gsbench.project, ([*inputs, a["Ks"], exponents], *viewport), test_utils=checks)
-    means, factors, opacities, viewmats = inputs
-    whole = raster.RasterInputs(means, factors, opacities, a["colors"], viewmats, a["Ks"], a["background"], shapes)
-    splats = raster.Splats(*(x.detach() for x in raster.project(whole, viewport)[:4]))
-    bins, _ = raster.bin_tiles(splats, viewport, torch.zeros(1, dtype=torch.int64))
-    colors = a["colors"] if a["colors"].dim() == 3 else a["colors"][None]
-    blended = [splats.means2d.requires_grad_(), splats.roots.requires_grad_(), splats.half_sizes, colors]
-    torch.library.opcheck(
-        torch.ops.gsbench.blend, ([*blended, a["background"], *bins, exponents], a["width"], a["height"]),
-        test_utils=checks,
-    )  # fmt: skip

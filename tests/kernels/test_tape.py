@@ -1,14 +1,11 @@
 """A tape's gradients against autograd's: the same bits, where operations are chained and where torch is in between."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from conftest import Place
-from test_refinement import intervals_around
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.scene import camera, model
 from gsbench.kernels.backends import AUTO, CPU, REFERENCE, Backend
@@ -234,32 +231,3 @@ def test_nothing_is_noted_where_nothing_is_wanted() -> None:
     with Tape() as tape:
         slice_static(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2))
     assert not tape._calls
-
-
-class Calls(TorchDispatchMode):
-    """Collects the operations of the kernels that are called, with their arguments."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.arguments: dict[str, tuple[Any, tuple[Any, ...]]] = {}
-
-    def __torch_dispatch__(self, operator: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if operator.namespace == "gsbench":
-            self.arguments[operator.name()] = operator, args
-        return operator(*args, **(kwargs or {}))
-
-
-@pytest.mark.parametrize("name", ["4dgs", "7dgs"])
-@pytest.mark.parametrize("classed", [False, True])
-def test_torch_is_given_the_right_shapes(name: str, classed: bool) -> None:
-    """Catches an operation with prefixes, intervals or orders whose fake has other shapes than it has."""
-    time, fitting = torch.tensor(0.4), fitted(name, 30, agr=True, classed=classed)
-    if fitting.effect_sets is not None:
-        intervals = intervals_around(time, fitting.effect_sets.refined)[1]
-        fitting.effect_sets = fitting.effect_sets._replace(intervals=intervals)
-    with Calls() as calls:
-        fitting.slice(CameraTime(torch.tensor([0.3, -0.2, -3.0]), time))
-    slicing = "slice_triangular" if name == "7dgs" else "slice_rotated"
-    assert {f"gsbench::{operation}" for operation in ("refine", slicing, "show_colors")} <= calls.arguments.keys()
-    for operator, arguments in calls.arguments.values():
-        torch.library.opcheck(operator, arguments, test_utils=("test_schema", "test_faketensor"))

@@ -165,6 +165,7 @@ CASES: dict[str, Callable[[torch.Generator], Arguments]] = {
         | {"means": torch.tensor([[0.1, 0.05, 0.0]]), "opacities": torch.tensor([0.8])}
     ),
     "three_cameras": _three_cameras,
+    "three_cameras_of_shared_colors": lambda g: _three_cameras(g) | {"colors": _rand(g, 30, 3)},
     "oblong_pixels": lambda g: gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(25.0, 50.0, 12, 8)[None]},
     "principal_point_off_center": lambda g: (
         gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, 5.3, 12.8)[None]}

@@ -73,8 +73,8 @@ def test_picture_in_single_precision(name: str) -> None:
 def test_any_scene_is_drawn_as_by_brute_force(
     seed: int, exponent: float | None, log_size: float, opacity: float
 ) -> None:
-    """Catches what no case shows: a camera that is not the inverse of its pose, a use of F other than by F F^T, a sort by
-    index, a background that is not dimmed; in float32 NaN and more light than there is, at any size."""
+    """Catches what no case shows: a camera that is not the inverse of its pose, a use of F other than by F F^T, a sort
+    by index, a background that is not dimmed; in float32 NaN and more light than there is, at any size."""
     g = torch.Generator().manual_seed(seed)
     Q, s = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0], torch.randn(3, 1, generator=g)
     scene = (
