@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from small import CAMERA, CHOLESKY, MODELS, N, covariances, fresh, joint, lively, moved, raw, seeded, started
 
 from gsbench.models import CameraTime, Gaussians3D, build
@@ -107,21 +106,6 @@ def test_cholesky_models(case: str, order: str, scheme: str, form: str) -> None:
 
 
 @pytest.mark.parametrize("name", CHOLESKY)
-def test_factor_orders_are_coordinates_of_one_family(name: str) -> None:
-    """Catches an order that is another model: the same covariance, written in either, gives the same slice."""
-    paper, first = lively(name, factor_order="paper"), lively(name, seed=3, factor_order="conditioned_first")
-    for key, value in raw(paper).items():
-        first.splats[key].data = value
-    n = joint(paper).shape[-1]
-    factor = paper.factors(raw(paper))[:, [*range(3, n), 0, 1, 2]]  # from (p, d, t) to (d, t, p)
-    for key, value in first.layout.parameters(factor).items():
-        first.splats[key].data = value
-    torch.testing.assert_close(joint(first), joint(paper))
-    a, b = paper.slice(QUERY), first.slice(QUERY)
-    agree(b, a.means.detach().numpy(), covariances(a).numpy(), a.opacities.detach().numpy())
-
-
-@pytest.mark.parametrize("name", CHOLESKY)
 @pytest.mark.parametrize("order", ORDERS)
 def test_far_from_the_query(name: str, order: str) -> None:
     """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
@@ -174,6 +158,7 @@ def test_4dgs(scheme: str) -> None:
     factor's exponent."""
     assert build("4dgs").lambda_of("time") == 1
     model = lively("4dgs", scheme=scheme)
+    model.clock.fill_(0.8)  # world units that correspond to the time range
     model.splats["times"].data[:4] += 3  # too far to be drawn
     values = {name: value.numpy() for name, value in raw(model).items()}
     means, covs, opacities = [], [], []
@@ -188,19 +173,6 @@ def test_4dgs(scheme: str) -> None:
     assert 0 < opacities.count(0) < N
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_4dgs_is_the_same_in_metres_and_centimetres(dtype: torch.dtype) -> None:
-    """Catches a rotation of space into time whose angle is a speed in one unit of length only."""
-    model, larger = lively("4dgs").to(dtype), lively("4dgs").to(dtype)
-    larger.clock *= 100
-    for name, times, plus in (("means", 100.0, 0.0), ("scales", 1.0, math.log(100.0))):
-        larger.splats[name].data.mul_(times).add_(plus)
-    a, b = model.slice(CameraTime.at(CAMERA.to(dtype), TIME)), larger.slice(CameraTime.at(100 * CAMERA.to(dtype), TIME))
-    torch.testing.assert_close(100 * a.means, b.means, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(100 * covariances(a), covariances(b) / 100, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(a.opacities, b.opacities, rtol=1e-4, atol=1e-6)
-
-
 def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     """Catches another threshold than f_temp > 0.05, and a size that is not the largest one in space."""
     model = fresh("4dgs").double()
@@ -211,22 +183,6 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     assert TIME_OPACITY_FACTOR_MIN == 0.05
     model.splats["scales"].data[:] = torch.tensor([0.0, 1.0, -1.0, 5.0])
     assert model.scales().tolist() == pytest.approx([math.e] * N)
-
-
-def test_4dgs_at_a_time_of_its_own_is_3dgs() -> None:
-    """Catches 4D rotations that do not contain the 3D ones: without any turn into t, the slice is R S in 3D."""
-    model = lively("4dgs")
-    q = model.splats["left_quats"].data
-    # v -> l v conj(r) leaves the t axis (k) alone where r = -k l k: the rotation then acts on x, y, z only.
-    model.splats["right_quats"].data = q * torch.tensor([1.0, -1, -1, 1])
-    F = model.factors(raw(model)).numpy()
-    np.testing.assert_allclose(F[:, 3, :3], 0, atol=1e-12)
-    np.testing.assert_allclose(F[:, :3, 3], 0, atol=1e-12)
-    R = F[:, :3, :3] / np.exp(raw(model)["scales"].numpy())[:, None, :3]
-    assert np.abs(Rotation.from_matrix(R).as_matrix() - R).max() < 1e-9
-    sliced = model.slice(QUERY)
-    np.testing.assert_allclose(covariances(sliced).numpy(), F[:, :3, :3] @ F[:, :3, :3].swapaxes(1, 2), atol=1e-12)
-    torch.testing.assert_close(sliced.means.data, model.splats["means"].data)
 
 
 # ---- dGS, dBS and FreeTimeGS: one Gaussian at the origin, with numbers for which the equations were evaluated by hand
