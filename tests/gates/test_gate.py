@@ -1,19 +1,18 @@
 """What a gate chooses, and what it makes of a model."""
 
 import copy
-import functools
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from test_sensitivity import BLACK, OPTIONS, SIZE, N, slice_of, trained_a_little, views_of
+from test_sensitivity import slice_of
 from torch import Tensor
-from worlds import camera
+from worlds import BLACK, MODEL_SIZE, OPTIONS, N, camera, gated, probed, trained_a_little, views_of
 
 from gsbench.gates.gate import apply, choose, gate_within
 from gsbench.gates.hook import share_with_direction
-from gsbench.gates.sensitivity import Sensitivity, probe
+from gsbench.gates.sensitivity import probe
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.measure.exact_views import capped
 from gsbench.measure.quality import psnr
@@ -23,65 +22,28 @@ from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import render
 from gsbench.models.simplifications import simplifications_of
 
-VIEWS = 10
-
-
-@functools.cache
-def probed(name: str) -> tuple[GaussianModel, Sensitivity]:
-    """A model and what its simplifications would cost; no test may change them."""
-    model = trained_a_little(name, 0)
-    return model, probe(model, views_of(model, 1)[:VIEWS], BLACK)
-
-
-@functools.cache
-def gated(name: str, share: float) -> tuple[GaussianModel, GaussianModel]:
-    """A model before and after a gate; no test may change them."""
-    model, sensitivity = probed(name)
-    after = copy.deepcopy(model)
-    apply(after, sensitivity, choose(sensitivity, after, share))
-    return model, after
-
 
 def images(model: GaussianModel) -> list[Tensor]:
-    return [render(model, camera(azimuth, 0.3, SIZE), azimuth / 6, BLACK) for azimuth in range(5)]
+    return [render(model, camera(azimuth, 0.3, MODEL_SIZE), azimuth / 6, BLACK) for azimuth in range(5)]
 
 
-@pytest.mark.parametrize("name", OPTIONS)
-def test_nothing_is_taken_for_nothing(name: str) -> None:
-    """Catches a gate that changes an image though its budget is zero."""
-    before, after = gated(name, 0.0)
-    assert len(after) <= N
-    for a, b in zip(images(before), images(after), strict=True):
-        torch.testing.assert_close(a, b, atol=2e-6, rtol=0)
+def assert_same_images(first: GaussianModel, second: GaussianModel, atol: float) -> None:
+    for a, b in zip(images(first), images(second), strict=True):
+        torch.testing.assert_close(a, b, atol=atol, rtol=0)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_more_budget_buys_more(name: str) -> None:
-    """Catches a price of error with the wrong sign, and a sum of errors that is not held."""
-    model, sensitivity = probed(name)
-    sizes = []
-    for share in (0.0, 0.1, 1.0, 10.0):
-        after = copy.deepcopy(model)
-        choice = choose(sensitivity, after, share)
-        assert choice.predicted <= share
-        apply(after, sensitivity, choice)
-        sizes.append(after.stored_bytes())
+    """Catches a gate that changes an image though its budget is zero, a price of error with the wrong sign, and a sum
+    of errors that is not held."""
+    before, free = gated(name, 0.0)
+    assert len(free) <= N
+    assert_same_images(before, free, atol=2e-6)
+    shares, sensitivity = (0.0, 0.1, 1.0, 10.0), probed(name)[1]
+    assert all(choose(sensitivity, before, share).predicted <= share for share in shares)
+    sizes = [gated(name, share)[1].stored_bytes() for share in shares]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.8 * sizes[0]
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_effect_sets_are_as_the_rows(name: str) -> None:
-    """Catches rows sorted into the wrong effect set: with the effect sets forgotten the images stay the same."""
-    _, after = gated(name, 3.0)
-    rows, effect_sets = after.count_by_effects(), after.effect_sets
-    assert effect_sets is not None
-    assert sum(rows.values()) == len(after) < N
-    assert 0 <= effect_sets.refined <= effect_sets.conditioned <= len(after)
-    plain = copy.deepcopy(after)
-    plain.effect_sets = effect_sets._replace(conditioned=len(after))
-    for a, b in zip(images(after), images(plain), strict=True):
-        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
 
 
 def test_a_frozen_variable_changes_nothing() -> None:
@@ -104,57 +66,41 @@ def test_a_frozen_variable_changes_nothing() -> None:
             assert not torch.allclose(after.slice(here).means, after.slice(different).means, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", OPTIONS)
-def test_a_second_gate_takes_no_more_for_nothing(name: str) -> None:
-    """Catches a gate that undoes or pays again for what an earlier one did."""
-    _, after = gated(name, 3.0)
-    again = copy.deepcopy(after)
-    sensitivity = probe(after, views_of(after, 1)[:VIEWS], BLACK)
-    rows, _ = apply(again, sensitivity, choose(sensitivity, again, 0.0))
-    assert again.count_by_effects()["refined"] <= after.count_by_effects()["refined"]
-    assert len(rows) <= len(after)
-    for a, b in zip(images(after), images(again), strict=True):
-        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
-
-
 def _up_to_turns(gaussians: Gaussians3D) -> Gaussians3D:
     """A slice with covariances for factors: freezing 4DGS turns a factor."""
     return gaussians._replace(factors=gaussians.factors @ gaussians.factors.mT)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_a_cut_leaves_the_rows_behind_it(name: str) -> None:
-    """Catches a simplification of a gated model that changes Gaussians whose errors the probe does not look at."""
+def test_a_gated_model_is_gated_again(name: str) -> None:
+    """Catches rows sorted into the wrong effect set: with the effect sets forgotten the images stay the same; a gate
+    that undoes or pays again for what an earlier one did; a simplification of a gated model that changes Gaussians
+    whose errors the probe does not look at."""
     _, after = gated(name, 3.0)
-    views = views_of(after, 1)[:VIEWS]
+    rows, effect_sets = after.count_by_effects(), after.effect_sets
+    assert effect_sets is not None
+    assert sum(rows.values()) == len(after) < N
+    assert 0 <= effect_sets.refined <= effect_sets.conditioned <= len(after)
+    plain, again = copy.deepcopy(after), copy.deepcopy(after)
+    plain.effect_sets = effect_sets._replace(conditioned=len(after))
+    assert_same_images(after, plain, atol=1e-5)
+    views = views_of(after, 1)[:10]
+    sensitivity = probe(after, views, BLACK)
+    remaining, _ = apply(again, sensitivity, choose(sensitivity, again, 0.0))
+    assert again.count_by_effects()["refined"] <= rows["refined"]
+    assert len(remaining) <= len(after)
+    assert_same_images(after, again, atol=1e-5)
     queries = [CameraTime.of(view.camera, view.time) for view in views]
     live = [after.slice(query) for query in queries]
-    errors = probe(after, views, BLACK).errors
     for simplification in simplifications_of(after, queries, live):
+        changing = simplification.rows
         for query, before in zip(queries, live, strict=True):
             changed = slice_of(after, simplification, before, query)
             for a, b in zip(*(tensors_of(_up_to_turns(batch)) for batch in (before, changed)), strict=True):
-                torch.testing.assert_close(a[simplification.rows :], b[simplification.rows :], atol=1e-5, rtol=1e-5)
-        assert (errors[simplification.name][simplification.rows :] == 0).all()
-        assert simplification.rows == 0 or (errors[simplification.name][: simplification.rows] > 0).any()
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_only_what_matters_is_stored(name: str) -> None:
-    """Catches a checkpoint that loses an entry, or keeps those that change no image."""
-    _, after = gated(name, 3.0)
-    state = after.pack()
-    stored = sum(x.numel() for key, x in state.items() if key.startswith("splats."))
-    whole = sum(x.numel() for x in after.splats.values())
-    assert stored < 0.9 * whole
-    other = trained_a_little(name, 1)
-    other.load_state(state)
-    assert other.effect_sets is not None
-    assert after.effect_sets is not None
-    for key, value in after.state_dict().items():
-        assert torch.equal(value, other.state_dict()[key]), key
-    assert torch.equal(other.effect_sets.orders, after.effect_sets.orders)
-    assert other.effect_sets[:2] == after.effect_sets[:2]
+                torch.testing.assert_close(a[changing:], b[changing:], atol=1e-5, rtol=1e-5)
+        errors = sensitivity.errors[simplification.name]
+        assert (errors[changing:] == 0).all()
+        assert changing == 0 or (errors[:changing] > 0).any()
 
 
 def test_the_share_with_direction_is_of_rows_that_change_with_it() -> None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from torch import Tensor
-from worlds import camera
+from worlds import BLACK, MODEL_SIZE, OPTIONS, N, camera, trained_a_little, views_of
 
 from gsbench.gates.sensitivity import probe
 from gsbench.models import CameraTime, GaussianModel, build
@@ -11,45 +11,6 @@ from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.models.simplifications import Simplification, simplifications_of
 from gsbench.scenes.scene import Points, View
-from gsbench.schedule import ActiveComponents
-
-N, SIZE, VIEWS = 60, 24, 30
-BLACK = torch.zeros(3)
-OPTIONS = {
-    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3, "agr": True},
-    "7dgs_nodir": {"lambda_t": 0.5, "agr": True},
-    "6dgs": {"lambda_d": 0.3},
-    "4dgs": {},
-    "3dgs": {},
-}
-
-
-def trained_a_little(name: str, seed: int) -> GaussianModel:
-    """A model whose Gaussians move, gleam and are refined."""
-    random = torch.Generator().manual_seed(seed)
-    model = build(name, **OPTIONS[name])
-    model.initialise(Points(torch.rand(N, 3, generator=random) * 2 - 1, torch.rand(N, 3, generator=random)), 4, random)
-    model.set_active(ActiveComponents(3, model.agr, False))
-    with torch.no_grad():
-        for key, parameter in model.splats.items():
-            size = {"means": 0.02, "motion": 0.15, "opacities": 1.5, "shN": 0.08}.get(key, 0.2)
-            parameter += size * torch.randn(parameter.shape, generator=random)
-        if model.refinement is not None:
-            weight = model.refinement.weight_out
-            weight += 0.02 * torch.randn(weight.shape, generator=random)
-    return model.requires_grad_(False)
-
-
-def views_of(model: GaussianModel, seed: int) -> list[View]:
-    """Views of what the model might have been fitted to: its own images and noise."""
-    random = torch.Generator().manual_seed(seed)
-    film = []
-    for i in range(VIEWS):
-        draws = torch.rand(3, generator=random).tolist()
-        at, time = camera(6.28 * draws[0], 1.6 * draws[1] - 0.8, SIZE), draws[2]
-        image = rasterize_slice(model.slice(CameraTime.of(at, time)), at, BLACK, model.backend).image[0]
-        film.append(View(str(i), at, time, image + 0.02 * torch.randn(image.shape, generator=random)))
-    return film
 
 
 def slice_of(model: GaussianModel, simplification: Simplification, live: Gaussians3D, query: CameraTime) -> Gaussians3D:
@@ -134,7 +95,7 @@ def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
     with r = -x / 2, where it would be an improvement, nothing.
     """
     model, N = trained_a_little("3dgs", 0), 4
-    at = camera(0.3, 0.2, SIZE)
+    at = camera(0.3, 0.2, MODEL_SIZE)
     live = model.slice(CameraTime.of(at, None))
     image = rasterize_slice(live, at, BLACK, model.backend).image[0]
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_sensitivity import BLACK, N, trained_a_little, views_of
+from worlds import BLACK, N, trained_a_little, views_of
 
 from gsbench.gates.gate import apply, choose, effect_sets_of
 from gsbench.gates.sensitivity import probe, share_asleep, visible_times

@@ -1,15 +1,21 @@
-"""Scenes made in memory, of a few coloured Gaussians and cameras around them, for tests of what a scene calls for."""
+"""Scenes and models made in memory, of a few coloured Gaussians and cameras around them."""
 
+import copy
+import functools
 import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from gsbench.gates.gate import apply, choose
+from gsbench.gates.sensitivity import Sensitivity, probe
 from gsbench.kernels.backends import AUTO
+from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
-from gsbench.scenes.scene import Camera, Scene, View, scene_extent
+from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
+from gsbench.schedule import ActiveComponents
 
 SIZE = 40
 World = Callable[[float], Gaussians3D]
@@ -140,3 +146,60 @@ def brightening(moment: float) -> Gaussians3D:
     colors = world.colors.clone()
     colors[::2] *= 0.4 + 0.6 * math.sin(math.pi * moment)
     return world._replace(colors=colors)
+
+
+# ---- models that gates are to simplify
+
+N, MODEL_SIZE, VIEWS = 60, 24, 30
+BLACK = torch.zeros(3)
+OPTIONS = {
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3, "agr": True},
+    "7dgs_nodir": {"lambda_t": 0.5, "agr": True},
+    "6dgs": {"lambda_d": 0.3},
+    "4dgs": {},
+    "3dgs": {},
+}
+
+
+def trained_a_little(name: str, seed: int) -> GaussianModel:
+    """A model whose Gaussians move, gleam and are refined."""
+    random = torch.Generator().manual_seed(seed)
+    model = build(name, **OPTIONS[name])
+    model.initialise(Points(torch.rand(N, 3, generator=random) * 2 - 1, torch.rand(N, 3, generator=random)), 4, random)
+    model.set_active(ActiveComponents(3, model.agr, False))
+    with torch.no_grad():
+        for key, parameter in model.splats.items():
+            size = {"means": 0.02, "motion": 0.15, "opacities": 1.5, "shN": 0.08}.get(key, 0.2)
+            parameter += size * torch.randn(parameter.shape, generator=random)
+        if model.refinement is not None:
+            weight = model.refinement.weight_out
+            weight += 0.02 * torch.randn(weight.shape, generator=random)
+    return model.requires_grad_(False)
+
+
+def views_of(model: GaussianModel, seed: int) -> list[View]:
+    """Views of what the model might have been fitted to: its own images and noise."""
+    random = torch.Generator().manual_seed(seed)
+    film = []
+    for i in range(VIEWS):
+        draws = torch.rand(3, generator=random).tolist()
+        at, time = camera(6.28 * draws[0], 1.6 * draws[1] - 0.8, MODEL_SIZE), draws[2]
+        image = rasterize_slice(model.slice(CameraTime.of(at, time)), at, BLACK, model.backend).image[0]
+        film.append(View(str(i), at, time, image + 0.02 * torch.randn(image.shape, generator=random)))
+    return film
+
+
+@functools.cache
+def probed(name: str) -> tuple[GaussianModel, Sensitivity]:
+    """A model and what its simplifications would cost; no test may change them."""
+    model = trained_a_little(name, 0)
+    return model, probe(model, views_of(model, 1)[:10], BLACK)
+
+
+@functools.cache
+def gated(name: str, share: float) -> tuple[GaussianModel, GaussianModel]:
+    """A model before and after a gate; no test may change them."""
+    model, sensitivity = probed(name)
+    after = copy.deepcopy(model)
+    apply(after, sensitivity, choose(sensitivity, after, share))
+    return model, after

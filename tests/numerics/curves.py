@@ -145,7 +145,7 @@ def _sliced(
         backward(out)
         return out[1].detach().cpu().double()
 
-    F, cov = both(), torch.from_numpy(exact.cov)
+    F, cov = both(), exact.cov
     errors = ((F @ F.mT - cov).norm(dim=(1, 2)) / cov.norm(dim=(1, 2))).numpy()
     way = f"{scheme} {backend} {str(dtype).removeprefix('torch.')}"
     return AccuracyPoint("slicing", way, percentile(errors), fastest(both))

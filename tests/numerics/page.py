@@ -189,7 +189,7 @@ PLOTS: dict[str, tuple[str, str, Callable[[Axes, Audit], None]]] = {  # by file:
     "time_slicing.png": (
         "Error against time: slicing",
         "99.9th percentile of the covariance's relative error over 20,000 hard slices, against milliseconds forward "
-        "and backward. Lower left is better. The reference is Gram-Schmidt in float64.",
+        "and backward. Lower left is better. The reference is the model in float64.",
         partial(_by_time, thing="slicing"),
     ),
     "time_picture.png": (

@@ -1,8 +1,7 @@
 """Test slices of many random ill-conditioned Gaussians against float64: a million of 7DGS, thousands of other models.
 
-The exact slices of 7DGS are those of modified Gram-Schmidt, done twice ("twice is enough": Giraud et al. 2005), and of
-other models those of the torch model in float64. mpmath would need weeks for a million Gaussians, so each audit
-compares both with mpmath on a few (`verify`, `verify_moving`).
+The exact slices are those of the torch model in float64. mpmath would need weeks for a million Gaussians, so each audit
+compares them with mpmath on a few (`verify`, `verify_moving`).
 """
 
 import time
@@ -58,9 +57,9 @@ class Hard:
 class PopulationTruth:
     """The exact conditional means and covariances, and the gradient of a loss by the raw parameters of the factor."""
 
-    mean: Floats  # [N, 3]
-    cov: Floats  # [N, 3, 3]
-    gradient: Floats  # [N, 28]
+    mean: Tensor  # [N, 3]
+    cov: Tensor  # [N, 3, 3]
+    gradient: Tensor  # [N, 28]
 
 
 @dataclass(frozen=True)
@@ -127,80 +126,45 @@ def conditioned(order: str) -> list[int]:
     return [4, 5, 6, 3] if order == "paper" else [0, 1, 2, 3]
 
 
-def weights(N: int) -> tuple[Floats, Floats]:
+def weights(N: int) -> tuple[Tensor, Tensor]:
     """Return fixed random weights of means [N, 3] and covariances [N, 3, 3] in the loss."""
     random = np.random.default_rng(1)
     W = random.standard_normal((N, 3, 3))
-    return random.standard_normal((N, 3)), W + W.transpose(0, 2, 1)
+    return torch.from_numpy(random.standard_normal((N, 3))), torch.from_numpy(W + W.transpose(0, 2, 1))
 
 
 def truth(hard: Hard, order: str) -> PopulationTruth:
     """Compute the exact conditional means and covariances, and the gradient of a loss, in float64.
 
-    The loss is w . mean / |mean| + <W, cov> / |cov| with the random `weights` w and W.
+    The loss is w . mean / |mean| + <W, cov> / |cov| with the random `weights` w and W, and exact |mean| and |cov|.
     """
-    w, W = weights(len(hard))
-    chunks = [slice(i, i + CHUNK) for i in range(0, len(hard), CHUNK)]
-    parts = [_truth(hard.rows(rows), order, w[rows].T, W[rows].transpose(1, 2, 0)) for rows in chunks]
-    return PopulationTruth(
-        *(np.ascontiguousarray(np.moveaxis(np.concatenate(x, -1), -1, 0)) for x in zip(*parts, strict=True))
-    )
+    model, (w, W) = all_seen(order, "square_root", "reference").double(), weights(len(hard))
+    double = Hard(*(x.double() for x in (hard.log_diagonal, hard.off_diagonal, hard.offset)))
+    parts = [_differentiated(model, double, w, W, slice(i, i + CHUNK))[0] for i in range(0, len(hard), CHUNK)]
+    return PopulationTruth(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def _truth(hard: Hard, order: str, w: Floats, W: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compute `truth` from and to arrays with the Gaussians last."""
-    L, q = np.ascontiguousarray(factor(hard).transpose(1, 2, 0)), conditioned(order)
-    p = [i for i in range(7) if i not in q]
-    Q, R = gram_schmidt(L[q + p])  # L = R^T Q^T
-    T_qq, T_pq, T_pp = (_transposed(x) for x in (R[:4, :4], R[:4, 4:], R[4:, 4:]))
-    white = _solve_lower(T_qq, -hard.offset.double().numpy().T[:, None])
-    mean, cov = _product(T_pq, white)[:, 0], _product(T_pp, R[4:, 4:])
-    g, G = w / np.linalg.norm(mean, axis=0), W / np.sqrt((cov * cov).sum((0, 1)))
-    # dcov = 2 sym(dF_p - K dF_q) (F_p - K F_q)^T and dmean by dK, with F_p - K F_q = T_pp Q_p^T and y = S_qq^-1 delta.
-    K = _transposed(_solve_upper(R[:4, :4], R[:4, 4:]))
-    y = _solve_upper(R[:4, :4], white)
-    residual, along = _product(T_pp, _transposed(Q[:, 4:])), _product(Q[:, :4], white)
-    g_F = np.zeros_like(L)
-    g_F[p] = 2 * _product(G, residual) + g[:, None] * _transposed(along)
-    g_F[q] = y * _product(g[None], residual) - _product(_transposed(K), g_F[p])
-    return mean, cov, np.concatenate([g_F[range(7), range(7)] * L[range(7), range(7)], g_F[BELOW]])
+def _differentiated(
+    model: CholeskyModel, hard: Hard, w: Tensor, W: Tensor, rows: slice, exact: PopulationTruth | None = None
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Slice Gaussians `rows` in their type, relative to `exact`; None: to themselves.
 
-
-def gram_schmidt(rows: Floats) -> tuple[Floats, Floats]:
-    """Compute the QR decomposition rows^T = Q R of N matrices [n, n, N] by Gram-Schmidt, orthogonalising twice."""
-    Q, R = np.zeros_like(rows), np.zeros_like(rows)
-    for i in range(len(rows)):
-        v = rows[i].copy()
-        for _ in range(2):
-            for j in range(i):
-                along = (Q[:, j] * v).sum(0)
-                v -= along * Q[:, j]
-                R[j, i] += along
-        R[i, i] = np.sqrt((v * v).sum(0))
-        Q[:, i] = v / R[i, i]
-    return Q, R
-
-
-def _transposed(A: Floats) -> Floats:
-    return A.transpose(1, 0, 2)
-
-
-def _product(A: Floats, B: Floats) -> Floats:
-    return np.asarray(sum(A[:, j, None] * B[None, j] for j in range(len(B))))
-
-
-def _solve_lower(T: Floats, B: Floats) -> Floats:
-    X = np.zeros_like(B)
-    for i in range(len(B)):
-        X[i] = (B[i] - (T[i, :i, None] * X[:i]).sum(0)) / T[i, i]
-    return X
-
-
-def _solve_upper(T: Floats, B: Floats) -> Floats:
-    X = np.zeros_like(B)
-    for i in reversed(range(len(B))):
-        X[i] = (B[i] - (T[i, i + 1 :, None] * X[i + 1 :]).sum(0)) / T[i, i]
-    return X
+    Return means, covariances and gradients of the loss in float64, and which covariances are indefinite or whose
+    factors are not finite.
+    """
+    some = hard.rows(rows)
+    leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
+    raw = raw_parameters(Hard(*leaves, some.offset), model)
+    there = {name: value.to(device_of(model.backend.name)) for name, value in raw.items()}
+    out = model.slice_geometry(there, at_the_origin(model, some.offset.dtype))
+    mean, F = out.means.cpu(), out.factors.cpu().double()
+    cov = F @ F.mT
+    sizes = (mean.detach(), cov.detach()) if exact is None else (exact.mean[rows], exact.cov[rows])
+    loss = (w[rows] * mean / sizes[0].norm(dim=1, keepdim=True)).sum()
+    loss = loss + (W[rows] * cov / sizes[1].norm(dim=(1, 2), keepdim=True)).sum()
+    gradient = torch.cat(torch.autograd.grad(loss, leaves), 1).double()
+    bad = slices.indefinite(model, raw) | ~F.isfinite().all((1, 2))
+    return (mean.detach(), cov.detach(), gradient), bad.detach()
 
 
 def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
@@ -235,11 +199,15 @@ def _oracle(order: str) -> oracle.Function:
 
 def judge(hard: Hard, exact: PopulationTruth, order: str, scheme: str, backend: str) -> Errors:
     """Measure the float32 errors of the conditional 3D Gaussians by one scheme and backend."""
-    model = all_seen(order, scheme, backend)
-    w, W = weights(len(hard))
-    parts = [_judge(model, hard, exact, w, W, slice(i, i + CHUNK)) for i in range(0, len(hard), CHUNK)]
-    cov, gradient, bad = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Errors(cov, gradient, bad)
+    model, (w, W), parts = all_seen(order, scheme, backend), weights(len(hard)), []
+    for i in range(0, len(hard), CHUNK):
+        rows = slice(i, i + CHUNK)
+        (mean, cov, gradient), bad = _differentiated(model, hard, w, W, rows, exact)
+        bad |= ~(mean.isfinite().all(1) & gradient.isfinite().all(1))
+        cov_error = (cov - exact.cov[rows]).norm(dim=(1, 2)) / exact.cov[rows].norm(dim=(1, 2))
+        gradient_error = (gradient - exact.gradient[rows]).norm(dim=1) / exact.gradient[rows].norm(dim=1)
+        parts.append((cov_error.numpy(), gradient_error.numpy(), bad.numpy()))
+    return Errors(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def all_seen(order: str, scheme: str, backend: str) -> CholeskyModel:
@@ -258,34 +226,12 @@ def at_the_origin(model: CholeskyModel, dtype: torch.dtype = torch.float32) -> C
     return CameraTime(torch.zeros(3, **there), torch.zeros((), **there))
 
 
-def _judge(
-    model: CholeskyModel, hard: Hard, exact: PopulationTruth, w: Floats, W: Floats, rows: slice
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    some = hard.rows(rows)
-    leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
-    raw = raw_parameters(Hard(*leaves, some.offset), model)
-    there = {name: value.to(device_of(model.backend.name)) for name, value in raw.items()}
-    out = model.slice_geometry(there, at_the_origin(model))
-    mean, F = out.means.cpu(), out.factors.cpu()
-    exact_mean, exact_cov = torch.from_numpy(exact.mean[rows]), torch.from_numpy(exact.cov[rows])
-    cov = F.double() @ F.double().mT
-    loss = (torch.from_numpy(w[rows]) * mean / exact_mean.norm(dim=1, keepdim=True)).sum()
-    loss = loss + (torch.from_numpy(W[rows]) * cov / exact_cov.norm(dim=(1, 2), keepdim=True)).sum()
-    gradient = torch.cat(torch.autograd.grad(loss, leaves), 1).double()
-    exact_gradient = torch.from_numpy(exact.gradient[rows])
-    bad = ~(mean.isfinite().all(1) & F.isfinite().all((1, 2)) & gradient.isfinite().all(1))
-    bad |= slices.indefinite(model, raw)
-    cov_error = (cov - exact_cov).norm(dim=(1, 2)) / exact_cov.norm(dim=(1, 2))
-    gradient_error = (gradient - exact_gradient).norm(dim=1) / exact_gradient.norm(dim=1)
-    return cov_error.detach().numpy(), gradient_error.numpy(), bad.numpy()
-
-
 def raw_parameters(hard: Hard, model: CholeskyModel) -> dict[str, Tensor]:
     """Return the raw parameters of the given 7D Gaussians for a model made by `all_seen`."""
-    N = len(hard)
-    return {"means": torch.zeros(N, 3), "directions": hard.offset[:, :3], "times": hard.offset[:, 3:],
+    directions, times = hard.offset.split([3, 1], 1)
+    return {"means": torch.zeros_like(directions), "directions": directions, "times": times,
             "log_diagonal": hard.log_diagonal, **model.layout.split(hard.off_diagonal),
-            "opacities": torch.zeros(N)}  # fmt: skip
+            "opacities": torch.zeros_like(times[:, 0])}  # fmt: skip
 
 
 # ---- dGS, dBS, UBS and FreeTimeGS
