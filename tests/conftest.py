@@ -1,6 +1,5 @@
 """Fixtures that every test folder may use."""
 
-import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,12 +7,6 @@ from pathlib import Path
 import pytest
 
 import gsbench  # noqa: F401  before torch: how its threads wait is settled as it loads
-
-with contextlib.suppress(ModuleNotFoundError):  # the tests of kernels run without Hydra too
-    import composed
-
-    composed.keep()
-
 
 # Files of many seconds and few tests: first, so that at the end no process waits for another's.
 LONGEST = (
@@ -23,9 +16,8 @@ LONGEST = (
     "test_command_line.py",
     "test_checkpoint.py",
     "test_install.py",
-    "test_heap.py",
+    "test_start.py",
     "test_end_to_end.py",
-    "test_changed_data.py",
 )
 
 

@@ -16,8 +16,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import composed
-
 ROOT = Path(__file__).resolve().parents[1]
 # One thread: tests share the machine, and the sums of a run are those of its thread count.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "COLUMNS": "100"}
@@ -144,7 +142,6 @@ if __name__ == "__main__":
     sys.path[0] = str(ROOT)
     for name in IMPORTED:
         importlib.import_module(name)
-    composed.keep()
     gc.freeze()  # a collection would write to, and so copy, every page of what was imported
     serve()
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

@@ -78,20 +78,12 @@ def bits(folder: Path) -> dict[str, Any]:
     return comparable
 
 
-def assert_same_bits(a: object, b: object, where: str = "state") -> None:
+def assert_same_bits(a: Any, b: Any, where: str = "state") -> None:
     """Compare two states bit by bit."""
-    if isinstance(a, torch.Tensor):
-        assert isinstance(b, torch.Tensor)
-        assert a.shape == b.shape, where
-        assert torch.equal(a, b), where
-    elif isinstance(a, dict):
-        assert isinstance(b, dict)
-        assert a.keys() == b.keys(), where
-        for key in a:
+    if isinstance(a, dict | list):
+        assert type(a) is type(b), where
+        assert len(a) == len(b), where
+        for key in a if isinstance(a, dict) else range(len(a)):
             assert_same_bits(a[key], b[key], f"{where}.{key}")
-    elif isinstance(a, list):
-        assert isinstance(b, list)
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_same_bits(x, y, f"{where}[{i}]")
     else:
-        assert a == b, where
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, where

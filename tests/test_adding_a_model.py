@@ -33,14 +33,7 @@ def methods_for_gates() -> str:
 
 
 # An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
-START = (
-    "import runpy, sys\n"
-    f"sys.path.append({os.fspath(ROOT / 'tests')!r})\n"
-    "import composed\n"
-    "composed.keep()\n"
-    f"{WITHOUT_EDITABLE}\n"
-    "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
-)
+START = f"import runpy, sys\n{WITHOUT_EDITABLE}\nrunpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
-from tiny_run import gsbench
+from tiny_run import SIZE, gsbench, overrides, write_moving_square
 
 from gsbench.measure import record
 from gsbench.report import output
@@ -14,20 +16,10 @@ SHORT = ("train.iterations=250", "train.densify.every=25", "train.curve_points=1
          "protocol.renders=30", "protocol.pictures=0")  # fmt: skip
 
 
-def scores(results: Path) -> dict[tuple[str, str], float]:
-    by_run = {}
-    for path in record.find(results):
-        run = record.read(path)
-        assert run.status == "ok", run.reason
-        assert run.metrics is not None
-        psnr = run.metrics["psnr"]
-        assert psnr is not None
-        background = run.metrics["psnr_background_only"]
-        assert run.metrics["psnr_train"] is not None
-        assert background is not None
-        assert psnr > background + 3, f"{run.scene} {run.model}: {psnr:.2f} dB, an empty picture has {background:.2f}"
-        by_run[run.scene, run.model] = psnr
-    return by_run
+def metrics_of(run: record.Record) -> dict[str, float]:
+    """The metrics that a run has."""
+    assert run.metrics is not None, run.reason
+    return {name: value for name, value in run.metrics.items() if value is not None}
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +32,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
     """Catches a model that does not learn, or a time dimension that does nothing where things move."""
-    psnr = scores(results)
-    assert len(psnr) == 4
-    assert psnr["moving-matte", "7dgs"] > psnr["moving-matte", "3dgs"] + 1
-    assert psnr["suzanne", "7dgs"] > psnr["suzanne", "3dgs"] + 1
+    runs = {(run.scene, run.model): metrics_of(run) for run in map(record.read, record.find(results))}
+    assert len(runs) == 4
+    for metrics in runs.values():
+        assert metrics["psnr"] > metrics["psnr_background_only"] + 3  # dB of an empty picture
+        assert "psnr_train" in metrics
+    for scene in ("moving-matte", "suzanne"):
+        assert runs[scene, "7dgs"]["psnr"] > runs[scene, "3dgs"]["psnr"] + 1
 
 
 def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
@@ -59,3 +54,19 @@ def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
         assert word in (folder / "table.md").read_text()
     assert max(map(len, text.splitlines())) <= 120
     assert len((folder / "table.csv").read_text().splitlines()) == 1 + 4
+
+
+def test_changed_data_runs_again_and_training_views_keep_their_score(tmp_path: Path) -> None:
+    """Catches a result of other data that is passed off as this one's, and a psnr_train measured on another split: the
+    images of the test split alone change, and the training stays the same to the bit."""
+    data, runs = write_moving_square(tmp_path / "data"), []
+    for is_changed in (False, True):
+        done = gsbench(*overrides(data, tmp_path / "results", "model=3dgs"))
+        assert done.returncode == 0, done.stderr
+        assert ("running again" in done.stderr) == is_changed, done.stderr
+        (path,) = record.find(tmp_path / "results")
+        runs.append(metrics_of(record.read(path)))
+        for image in (data / "square" / "test").glob("*.png"):
+            assert cv2.imwrite(str(image), np.full((SIZE, SIZE, 4), 255, np.uint8))
+    assert runs[0]["psnr"] != runs[1]["psnr"]
+    assert runs[0]["psnr_train"] == runs[1]["psnr_train"]

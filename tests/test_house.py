@@ -1,7 +1,6 @@
 """Check that imports run one way through the rooms of gsbench, and that a module says in a sentence what it does."""
 
 import ast
-import math
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -81,28 +80,25 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
     return next((cycle for name in graph if (cycle := visit(name, []))), [])
 
 
-def folder(module: str, graph: dict[str, set[str]]) -> str:
-    """The folder of a module, or "" for a command and a loose file beside the folders."""
-    first = [*module.split("."), ""][1]
-    return first if first in FLOOR and not is_of_command(module, graph) else ""
-
-
 def is_of_command(module: str, graph: dict[str, set[str]]) -> bool:
     """Whether a module is a command (`__main__`), or only commands import it."""
     importers = [name for name in graph if module in graph[name]] or [""]
     return module.endswith(".__main__") or all(name.endswith(".__main__") for name in importers)
 
 
-def height(module: str, graph: dict[str, set[str]]) -> float:
-    """The floor of a module in a graph without circles.
+def folder(module: str, graph: dict[str, set[str]]) -> str:
+    """The folder of a module, or "" for a command and a loose file beside the folders."""
+    first = [*module.split("."), ""][1]
+    return first if first in FLOOR and not is_of_command(module, graph) else ""
 
-    A command is above all. A loose file is half a floor above the highest floor that it imports from.
-    """
+
+def height(module: str, graph: dict[str, set[str]]) -> int:
+    """The floor of a module in a graph without circles; a command is above all, a loose file as high as its imports."""
     if is_of_command(module, graph):
-        return math.inf
+        return len(FLOORS)
     if room := folder(module, graph):
         return FLOOR[room]
-    return math.floor(max((height(imported, graph) for imported in graph[module]), default=-1)) + 0.5
+    return max((height(imported, graph) for imported in graph[module]), default=-1)
 
 
 def upward(graph: dict[str, set[str]]) -> list[str]:
@@ -161,13 +157,10 @@ def vague_names(root: Path) -> Counter[str]:
 GSBENCH = modules(ROOT / "gsbench")
 
 
-def test_every_folder_has_a_floor() -> None:
-    """Catches a new folder that no one has placed, whose modules would count as loose files, and one that has gone."""
-    assert {path.parent.name for path in (ROOT / "gsbench").glob("*/__init__.py")} == FLOOR.keys()
-
-
 def test_imports_run_down() -> None:
-    """Catches a kernel that needs a model, a report that needs a training, and imports in a circle."""
+    """Catches a kernel that needs a model, a report that needs a training, imports in a circle, and a new folder that
+    no one has placed, whose modules would count as loose files."""
+    assert {path.parent.name for path in (ROOT / "gsbench").glob("*/__init__.py")} == FLOOR.keys()
     graph = imports(GSBENCH)
     assert graph["gsbench.train.training_parts"] >= {"gsbench.config", "gsbench.models", "gsbench.scenes"}
     assert not circle(graph)
@@ -177,9 +170,7 @@ def test_imports_run_down() -> None:
 def test_libraries_are_changed_in_known_places() -> None:
     """Catches a module that changes another library, which no file of this list names."""
     changed = {name: names for name, tree in GSBENCH.items() if (names := patched(tree))}
-    assert changed == {
-        "gsbench.view.request_guard": {"websockets_server"},
-    }
+    assert changed == {"gsbench.view.request_guard": {"websockets_server"}}
 
 
 @pytest.mark.parametrize("name", GSBENCH)

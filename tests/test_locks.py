@@ -1,6 +1,7 @@
 """What `make` installs: everything by version and hash, nothing of it forgotten, and actions by their commit."""
 
 import hashlib
+import itertools
 import re
 import subprocess
 import sys
@@ -17,13 +18,9 @@ from tiny_run import ROOT
 LOCKS = sorted((ROOT / "locks").glob("*.txt"))
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 OURS = PYPROJECT["project"]
+TRACKERS = {"tensorboard", "wandb", "mlflow"}  # extras that `make` does not install
 MAKEFILE = (ROOT / "Makefile").read_text()
-INSTALLED = (
-    "build",
-    "docs",
-    "tests",
-    "torch_cpu",
-)  # on this machine; torch.txt where there is a GPU, uv.txt by no one else
+INSTALLED = ("build", "docs", "tests", "torch_cpu")  # on this machine; torch.txt where there is a GPU, uv.txt by no one
 
 
 def locked(path: Path) -> dict[str, list[Requirement]]:
@@ -56,18 +53,10 @@ def test_every_line_has_one_version_and_its_hashes(path: Path) -> None:
         assert re.fullmatch(r"[a-z0-9._-]+==[^ ,*]+( ; [^#]+?)?( +--hash=sha256:[0-9a-f]{64})+", line), line
 
 
-TRACKERS = {"tensorboard", "wandb", "mlflow"}  # extras that `make` does not install
-
-
 def test_what_gsbench_asks_for_is_locked() -> None:
     """Catches a dependency that is added to pyproject.toml or changed in constraints.txt without `make locks`."""
-    asked = [*OURS["dependencies"], *PYPROJECT["build-system"]["requires"]]
-    asked += [
-        requirement
-        for name, extra in OURS["optional-dependencies"].items()
-        if name not in TRACKERS
-        for requirement in extra
-    ]
+    extras = [extra for name, extra in OURS["optional-dependencies"].items() if name not in TRACKERS]
+    asked = [*OURS["dependencies"], *PYPROJECT["build-system"]["requires"], *itertools.chain(*extras)]
     assert [package for package in asked if not holds(Requirement(package))] == []
     pins = (ROOT / "constraints.txt").read_text().splitlines()
     assert [pin for pin in pins if not pin.startswith("#") and not holds(Requirement(pin))] == []
@@ -102,22 +91,13 @@ def test_make_installs_locks_and_nothing_else() -> None:
 def test_a_file_with_another_hash_is_refused(tmp_path: Path) -> None:
     """Catches options of pip under which hashes are not looked at: the Makefile's own are tried on a small wheel."""
     wheel, lock = tmp_path / "trial-1-py3-none-any.whl", tmp_path / "lock.txt"
+    texts = {"METADATA": "Metadata-Version: 2.1\nName: trial\nVersion: 1\n", "RECORD": "",
+             "WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"}  # fmt: skip
     with zipfile.ZipFile(wheel, "w") as archive:
-        about = "Metadata-Version: 2.1\nName: trial\nVersion: 1\n"
-        archive.writestr("trial-1.dist-info/METADATA", about)
-        archive.writestr("trial-1.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
-        archive.writestr("trial-1.dist-info/RECORD", "")
+        for name, text in texts.items():
+            archive.writestr(f"trial-1.dist-info/{name}", text)
     (options,) = re.findall(r"^PIP := \$\(BIN\)/pip (.*)$", MAKEFILE, re.MULTILINE)
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        *options.split(),
-        "--require-hashes",
-        "--no-index",
-        "--find-links",
-        str(tmp_path),
-    ]
+    pip = [sys.executable, "-m", "pip", *options.split(), "--require-hashes", "--no-index", f"--find-links={tmp_path}"]
     right = hashlib.sha256(wheel.read_bytes()).hexdigest()
     for digest, message in (("0" * 64, "DO NOT MATCH THE HASHES"), (right, "")):
         lock.write_text(f"trial==1 --hash=sha256:{digest}\n")

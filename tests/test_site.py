@@ -1,40 +1,30 @@
 """The site that `make docs` builds: its tables, that every page and link is there, that it needs no network."""
 
 import dataclasses
-import importlib.util
 import os
 import re
 import subprocess
 import sys
-from collections import defaultdict
 from collections.abc import Callable
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
-from types import ModuleType
 from urllib.parse import unquote
 
 import pytest
+import tables
+from report.records import but
 from tiny_run import ROOT, environment
 
 from gsbench.measure.record import Record
 from gsbench.report import blocks, study
 
+LINK = re.compile(r'<a\b[^>]*?\shref="([^"]*)"')
+LOADED = re.compile(r'<(?:link\b[^>]*?\shref|[a-z]+\b[^>]*?\ssrc)="([^"]*)"')  # what a browser would load
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 
 
-@pytest.fixture(scope="module")
-def tables() -> ModuleType:
-    """docs/site/tables.py, which is no module of a package."""
-    spec = importlib.util.spec_from_file_location("site_tables", ROOT / "docs" / "site" / "tables.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("page", ["README.md", "docs/models.md", "docs/config.md", "docs/results.md"])
-def test_a_page_is_what_code_and_records_say(tables: ModuleType, page: str) -> None:
+def test_a_page_is_what_code_and_records_say(page: str) -> None:
     """Catches a model, a key, a default or a published record that was changed without its page."""
     assert (ROOT / page).read_text() == tables.filled(page), "write it anew by docs/site/tables.py"
 
@@ -50,8 +40,7 @@ def copied(to: Path, name: str, change: Callable[[Record], Record] = lambda reco
 def better(record: Record, by: float) -> Record:
     """The record of the same run with a higher PSNR, on average and in each view."""
     views = [dataclasses.replace(view, psnr=view.psnr + by) for view in record.per_view if view.psnr is not None]
-    metrics = dict(record.metrics or {})
-    return dataclasses.replace(record, metrics=metrics | {"psnr": (metrics["psnr"] or 0) + by}, per_view=views)
+    return but(record, metrics={"psnr": record.metrics["psnr"] + by}, per_view=views)
 
 
 def row_of(block: str, name: str) -> list[str]:
@@ -74,7 +63,7 @@ def test_the_tables_follow_from_the_records(tmp_path: Path) -> None:
     assert lost[0] - lost[1] == pytest.approx((20 + 20.85 - 24.72) / 9, abs=0.02)  # without playroom and lego100
 
 
-def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:
+def test_the_tables_name_every_model_and_key() -> None:
     """Catches a table that leaves rows out, or facts of a key."""
     models = [row.split("`")[1] for row in tables.models().splitlines()[2:]]
     assert models == sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
@@ -84,35 +73,17 @@ def test_the_tables_name_every_model_and_key(tables: ModuleType) -> None:
     assert "`scene.name` | required | folder in data.root\n" in config
 
 
-class Page(HTMLParser):
-    """The links, the anchors and what a browser would load of an HTML page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.loaded: list[str] = []
-        self.ids: set[str] = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = defaultdict(str, {key: value or "" for key, value in attrs})
-        self.ids.add(values["id"])
-        if tag == "a" and values["href"]:
-            self.links.append(values["href"])
-        self.loaded += [link for link in (values["src"], values["href"] if tag == "link" else "") if link]
-
-
 def broken(site: Path) -> list[str]:
     """The links of a site's pages that lead to nothing in it; those to other sites are not looked at."""
-    pages = {path: Page(path.read_text()) for path in site.rglob("*.html")}
+    pages = {path: path.read_text() for path in site.rglob("*.html")}
+    ids = {path: set(re.findall(r'\sid="([^"]*)"', text)) for path, text in pages.items()}
     bad = []
-    for path, page in pages.items():
-        for target in [*page.links, *page.loaded]:
-            if target.startswith(("http://", "https://", "mailto:", "data:")):
-                continue
+    for path, text in pages.items():
+        for target in map(unescape, [*LINK.findall(text), *LOADED.findall(text)]):
             name, _, anchor = unquote(target.partition("?")[0]).partition("#")
             file = (path.parent / name).resolve() if name else path
-            if not file.is_file() or (anchor and file in pages and anchor not in pages[file].ids):
+            is_outside = target.startswith(("http://", "https://", "mailto:", "data:"))
+            if not is_outside and (not file.is_file() or (anchor and anchor not in ids.get(file, {anchor}))):
                 bad.append(f"{path.relative_to(site)}: {target}")
     return bad
 
@@ -140,7 +111,7 @@ def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
     assert broken(site) == []
     written = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert written <= {path.stem for path in site.glob("*.html")}
-    loaded = {address for path in site.rglob("*.html") for address in Page(path.read_text()).loaded}
+    loaded = {address for path in site.rglob("*.html") for address in LOADED.findall(path.read_text())}
     assert not [address for address in loaded if address.startswith(("http:", "https:", "//"))]
     assert "red ball" in (site / "api.html").read_text()
     assert "site.css" in (site / "results.html").read_text(), "without it, a table of ten columns is cut"

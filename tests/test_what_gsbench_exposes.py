@@ -25,12 +25,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def examples(name: str) -> list[doctest.DocTest]:
-    """The examples in the documentation of a public name."""
-    exposed = doctest.DocTestFinder(recurse=False).find(getattr(gsbench, name), name, globs={})
-    return [test for test in exposed if test.examples]
-
-
 def failures(tests: list[doctest.DocTest]) -> int:
     """Run examples; print those that fail, and count them."""
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
@@ -45,15 +39,11 @@ def test_the_examples_run(name: str, folder: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(folder)
     monkeypatch.setenv("TORCH_HOME", str(folder))  # a machine without the weights of LPIPS
     perceptual.load.cache_clear()
-    tests = examples(name)
-    assert tests, f"gsbench.{name}: expected an example in its documentation"
+    tests = doctest.DocTestFinder(recurse=False).find(getattr(gsbench, name), name, globs={})
+    assert any(test.examples for test in tests), f"gsbench.{name}: expected an example in its documentation"
     assert failures(tests) == 0
-
-
-def test_an_example_that_is_wrong_is_found() -> None:
-    """Catches a check of examples that passes whatever they print."""
     wrong = doctest.DocTestParser().get_doctest(">>> 1 + 1\n3\n", {}, "wrong", None, None)
-    assert failures([wrong]) == 1
+    assert failures([wrong]) == 1, "the check passes whatever examples print"
 
 
 @pytest.mark.parametrize("name", gsbench.__all__)
@@ -82,15 +72,11 @@ def test_import_gsbench_is_quick() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_star_gives_the_public_names() -> None:
-    """Catches a name in `__all__` that nothing defines."""
-    arguments: dict[str, object] = {}
-    exec("from gsbench import *", arguments)
-    assert set(arguments) - {"__builtins__"} == set(gsbench.__all__)
-
-
-def test_a_name_that_is_not_public_is_refused() -> None:
-    """Catches a `__getattr__` that answers to anything, or by another error than Python's own."""
+def test_only_public_names_are_there() -> None:
+    """Catches a name in `__all__` that nothing defines, and a `__getattr__` that answers to anything."""
+    names: dict[str, object] = {}
+    exec("from gsbench import *", names)
+    assert set(names) - {"__builtins__"} == set(gsbench.__all__)
     assert not hasattr(gsbench, "rasterise")
 
 

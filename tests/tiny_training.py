@@ -1,5 +1,7 @@
 """A training small enough for a test: its settings, and a scene of a few pixels in memory."""
 
+import copy
+import functools
 import math
 from dataclasses import replace
 
@@ -21,6 +23,11 @@ POINTS = 80
 
 def compose(model: str, steps: int, *overrides: str) -> Config:
     """The settings of a short training with the experiment `+exp=mini`; its scene is not loaded."""
+    return copy.deepcopy(_composed(model, steps, *overrides))
+
+
+@functools.cache
+def _composed(model: str, steps: int, *overrides: str) -> Config:
     register_schema()
     names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
              "train.densify.every=25", *overrides]  # fmt: skip

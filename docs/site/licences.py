@@ -11,20 +11,21 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib import metadata
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from gsbench.version import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "licences.md"
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT: dict[str, Any] = PYPROJECT["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 OF_DEVELOPERS = ("docs", "dev")  # nothing of these is imported by gsbench
 # What no .venv of make has, as it would double its size.
 NOT_INSTALLED = {"tensorboard": "Apache-2.0", "wandb": "MIT", "mlflow": "Apache-2.0"}
@@ -50,40 +51,42 @@ SHORT = {
 }
 
 
-def name_of(requirement: str) -> str:
-    """Return the normalised name of a requirement."""
-    return re.sub(r"[-_.]+", "-", Requirement(requirement).name).lower()
-
-
-def installed(requirements: Iterable[str], visited: set[str]) -> Iterator[metadata.Distribution]:
-    """Yield what requirements bring along, as far as it is installed here and not in `visited`, which is added to."""
-    for requirement in requirements:
-        marker, name = Requirement(requirement).marker, name_of(requirement)
-        if name in visited or (marker and not marker.evaluate({"extra": ""})):
+def installed(requirements: Iterable[str]) -> dict[str, metadata.Distribution | None]:
+    """Return what requirements bring along by name, sorted; None: it is not installed here."""
+    packages: dict[str, metadata.Distribution | None] = {}
+    waiting = [*requirements]
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        name = canonicalize_name(requirement.name)
+        if name in packages or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
             continue
-        visited.add(name)
         try:
-            package = metadata.distribution(name)
+            package = packages[name] = metadata.distribution(name)
+            waiting += package.requires or []
         except metadata.PackageNotFoundError:
-            continue
-        yield package
-        yield from installed(package.requires or [], visited)
+            packages[name] = None
+    return dict(sorted(packages.items()))
 
 
-def of_users() -> list[str]:
-    """Return the requirements of gsbench and of all extras but those of developers."""
-    extras = (EXTRAS[extra] for extra in EXTRAS.keys() - {*OF_DEVELOPERS})
-    return [*PROJECT["project"]["dependencies"], *chain.from_iterable(extras)]
+def of_users() -> dict[str, metadata.Distribution]:
+    """Return what users install: gsbench's requirements, those of all extras for users, and what these bring along."""
+    extras = [requirement for extra in EXTRAS.keys() - {*OF_DEVELOPERS} for requirement in EXTRAS[extra]]
+    return {name: package for name, package in installed([*PROJECT["dependencies"], *extras]).items() if package}
 
 
 def direct() -> dict[str, str]:
     """Return what gsbench itself depends on, and for what: the core, an extra, or the build."""
+    groups = {"core": PROJECT["dependencies"], "build": PYPROJECT["build-system"]["requires"], **EXTRAS}
     group_of: dict[str, str] = {}
-    groups = {"core": PROJECT["project"]["dependencies"], "build": PROJECT["build-system"]["requires"], **EXTRAS}
     for group in (*(name for name in groups if name not in OF_DEVELOPERS), *OF_DEVELOPERS):
         for requirement in groups[group]:
-            group_of.setdefault(name_of(requirement), group)
+            group_of.setdefault(canonicalize_name(Requirement(requirement).name), group)
     return group_of
+
+
+def along() -> dict[str, metadata.Distribution]:
+    """Return what users install that gsbench does not name, without what only torch for CUDA brings."""
+    return {name: package for name, package in of_users().items() if name not in direct() and not CUDA.match(name)}
 
 
 def licence_of(distribution: metadata.Distribution) -> str:
@@ -97,13 +100,13 @@ def licence_of(distribution: metadata.Distribution) -> str:
         if line.startswith("License :: OSI Approved ::") or line == "License :: Public Domain"
     ]
     short = ", ".join(SHORT.get(name, name.removesuffix(" License")) for name in names)
-    missing = WITHOUT_METADATA.get(name_of(facts["Name"]), field.partition("\n")[0])
+    missing = WITHOUT_METADATA.get(canonicalize_name(facts["Name"]), field.partition("\n")[0])
     return facts.get("License-Expression") or (field if is_name else "") or short or missing
 
 
 def tables() -> str:
     """Return the table of the page, a row for each licence, and what is to be known of single packages."""
-    packages = dict.fromkeys(direct(), "") | {name_of(package.metadata["Name"]): "" for package in along()}
+    packages = dict.fromkeys([*direct(), *along()], "")
     for name in packages:
         try:
             packages[name] = NOT_INSTALLED.get(name) or licence_of(metadata.distribution(name))
@@ -118,13 +121,6 @@ def tables() -> str:
     return "\n".join([*rows, "", *(f"- {name}: {note}." for name, note in NOTES.items())])
 
 
-def along() -> list[metadata.Distribution]:
-    """Return what users install that gsbench does not name, sorted by name; without what only torch for CUDA brings."""
-    named = direct()
-    packages = {name_of(package.metadata["Name"]): package for package in installed(of_users(), set())}
-    return [packages[name] for name in sorted(packages) if name not in named and not CUDA.match(name)]
-
-
 def sbom() -> dict[str, Any]:
     """Return what users install here as a bill of materials in the format CycloneDX 1.6."""
 
@@ -132,17 +128,12 @@ def sbom() -> dict[str, Any]:
         facts = {"type": kind, "name": name, "version": version, "purl": f"pkg:pypi/{name}@{version}"}
         return facts | {"licenses": [{"license": {"name": licence}}]}
 
-    packages = {name_of(package.metadata["Name"]): package for package in installed(of_users(), set())}
-    project = PROJECT["project"]
     return {
         "bomFormat": "CycloneDX",
         "specVersion": "1.6",
         "version": 1,
-        "metadata": {"component": component("application", project["name"], __version__, project["license"])},
-        "components": [
-            component("library", name, package.version, licence_of(package))
-            for name, package in sorted(packages.items())
-        ],
+        "metadata": {"component": component("application", PROJECT["name"], __version__, PROJECT["license"])},
+        "components": [component("library", name, of.version, licence_of(of)) for name, of in of_users().items()],
     }
 
 

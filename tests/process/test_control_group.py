@@ -6,76 +6,65 @@ import pytest
 
 from gsbench.process import memory
 
-V2 = "30 20 0:26 {root} /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw\n"
-V1 = (
-    "41 30 0:36 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n"
-    "40 30 0:35 {root} /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n"
-)
+V2 = "30 20 0:26 {} /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw\n"
+V1 = ("41 30 0:36 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n"
+      "40 30 0:35 {} /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n")  # fmt: skip
 
 
-def tree(root: Path, groups: str, mounts: str, **files: str) -> Path:
-    """Write a tree with proc/self and the files of control groups; a name's `__` is a `/`, its `_of_` a `.`."""
-    written = {"proc/self/cgroup": groups, "proc/self/mountinfo": mounts}
-    written |= {f"sys/fs/cgroup/{name.replace('__', '/')}": text for name, text in files.items()}
-    for name, text in written.items():
-        path = root / name.replace("_of_", ".")
+def tree(root: Path, groups: str, mounts: str, files: dict[str, str]) -> Path:
+    """Write a tree with proc/self and the files of control groups: `max`, `current` and `stat` are memory.max .."""
+    texts = {"proc/self/cgroup": groups, "proc/self/mountinfo": mounts}
+    for name, text in files.items():
+        folder, _, last = name.rpartition("/")
+        texts[f"sys/fs/cgroup/{folder}/memory.{last}"] = text
+    for name, text in texts.items():
+        path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     return root
 
 
-def test_a_nested_group_of_version_2_limits(tmp_path: Path) -> None:
-    """Catches a batch job whose own limit is not read, as that of the root is not set."""
-    root = tree(
-        tmp_path, "0::/slurm/job 7\n", V2.format(root="/"),
-        slurm__memory_of_max="max\n", slurm__memory_of_current="9\n",
-        **{"slurm__job 7__memory_of_max": "1000\n", "slurm__job 7__memory_of_current": "600\n",
-           "slurm__job 7__memory_of_stat": "anon 500\ninactive_file 50\n"},
-    )  # fmt: skip
-    assert memory.left_by_control_groups(root) == 450
+def limited(limit: int, current: int, stat: str = "", folder: str = "") -> dict[str, str]:
+    """The files of a group of version 2."""
+    return {f"{folder}/max": f"{limit}\n", f"{folder}/current": f"{current}\n", f"{folder}/stat": stat}
 
 
-def test_a_group_above_that_leaves_less_decides(tmp_path: Path) -> None:
-    """Catches a limit of a container that the group of a process in it does not repeat."""
-    root = tree(
-        tmp_path, "0::/a/b\n", V2.format(root="/"),
-        a__memory_of_max="1000", a__memory_of_current="1200", a__memory_of_stat="inactive_file 50\n",
-        a__b__memory_of_max="5000", a__b__memory_of_current="20", a__b__memory_of_stat="",
-    )  # fmt: skip
-    assert memory.left_by_control_groups(root) == 0
-
-
-@pytest.mark.parametrize("path", ["/docker/abc/job", "/docker/abc/../../job", "/elsewhere"])
-def test_a_mount_of_a_part_of_the_groups(path: str, tmp_path: Path) -> None:
-    """Catches a container that has its own group at the top of its mount, under the path of the host."""
-    files = {"memory_of_max": "100", "memory_of_current": "40", "memory_of_stat": ""}
-    root = tree(tmp_path, f"0::{path}\n", V2.format(root="/docker/abc"), **files)
-    assert memory.left_by_control_groups(root) == 60
-
-
-def test_version_1(tmp_path: Path) -> None:
-    """Catches a system of version 1, where the files have other names and each controller has its own mount."""
-    root = tree(
-        tmp_path, "5:cpu:/jobs\n4:hugetlb,memory:/jobs/3\n0::/\n", V2.format(root="/") + V1.format(root="/"),
-        memory__memory_of_limit_in_bytes="9223372036854771712", memory__memory_of_usage_in_bytes="10",
-        memory__memory_of_stat="inactive_file 5\ntotal_inactive_file 9\n",
-        memory__jobs__3__memory_of_limit_in_bytes="2000", memory__jobs__3__memory_of_usage_in_bytes="500",
-        memory__jobs__3__memory_of_stat="inactive_file 5\ntotal_inactive_file 100\n",
-    )  # fmt: skip
-    assert memory.left_by_control_groups(root) == 1600
+@pytest.mark.parametrize(
+    ("groups", "mounts", "files", "left"),
+    [
+        # A batch job, whose limit is not read where that of the root is not set.
+        ("0::/slurm/job 7\n", V2.format("/"), {"slurm/max": "max\n", "slurm/current": "9\n"}
+         | limited(1000, 600, "anon 500\ninactive_file 50\n", "slurm/job 7"), 450),
+        # A group above leaves less than the group of the process.
+        ("0::/a/b\n", V2.format("/"), limited(1000, 1200, "inactive_file 50\n", "a") | limited(5000, 20, "", "a/b"), 0),
+        # A container has its group at the top of its mount, under the path of the host.
+        *[(f"0::{path}\n", V2.format("/docker/abc"), limited(100, 40), 60)
+          for path in ("/docker/abc/job", "/docker/abc/../../job", "/elsewhere")],
+        # Version 1 has other names of files, and each controller has its own mount.
+        ("5:cpu:/jobs\n4:hugetlb,memory:/jobs/3\n0::/\n", V2.format("/") + V1.format("/"),
+         {"memory/limit_in_bytes": "9223372036854771712", "memory/usage_in_bytes": "10",
+          "memory/stat": "inactive_file 5\ntotal_inactive_file 9\n",
+          "memory/jobs/3/limit_in_bytes": "2000", "memory/jobs/3/usage_in_bytes": "500",
+          "memory/jobs/3/stat": "inactive_file 5\ntotal_inactive_file 100\n"}, 1600),
+    ],
+    ids=["nested", "above", "container", "outside", "elsewhere", "version 1"],
+)  # fmt: skip
+def test_the_group_that_leaves_least_decides(
+    groups: str, mounts: str, files: dict[str, str], left: int, tmp_path: Path
+) -> None:
+    """Catches a limit of a batch job or a container that is not read, and memory of files counted as used."""
+    assert memory.left_by_control_groups(tree(tmp_path, groups, mounts, files)) == left
 
 
 @pytest.mark.parametrize("text", ["", "\n", "0", "0::", ":::::\n", "x\0y", "4:memory\n", "9" * 5000, "- - - - - -\n",
                                   "1 2 3 - cgroup2\n", "a - cgroup\n", " - \n"])  # fmt: skip
 def test_files_that_are_something_else_limit_nothing(text: str, tmp_path: Path) -> None:
     """Catches a run that ends because a system writes these files in another way."""
-    assert memory.left_by_control_groups(tree(tmp_path, text, V2.format(root="/") + V1.format(root="/"))) is None
-    files = {"memory_of_max": text, "memory_of_current": text, "memory_of_stat": text}
-    assert memory.left_by_control_groups(tree(tmp_path, "0::/\n", V2.format(root="/"), **files)) is None
-    limited = {"memory_of_max": "100", "memory_of_current": "40", "memory_of_stat": ""}
-    for mounts in (text, text + V2.format(root="/")):
-        tree(tmp_path, "0::/\n4:memory:/\n", mounts, **limited)
-        memory.left_by_control_groups(tmp_path)
+    assert memory.left_by_control_groups(tree(tmp_path, text, V2.format("/") + V1.format("/"), {})) is None
+    files = dict.fromkeys(("/max", "/current", "/stat"), text)
+    assert memory.left_by_control_groups(tree(tmp_path, "0::/\n", V2.format("/"), files)) is None
+    for mounts in (text, text + V2.format("/")):
+        memory.left_by_control_groups(tree(tmp_path, "0::/\n4:memory:/\n", mounts, limited(100, 40)))
     (tmp_path / "proc/self/mountinfo").write_bytes(b"\xff\xfe")
     assert memory.left_by_control_groups(tmp_path) is None
     assert memory.left_by_control_groups(tmp_path / "nothing") is None

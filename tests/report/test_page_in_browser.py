@@ -89,28 +89,23 @@ def test_it_opens_in_silence_on_any_screen(visit, name, width, scheme):
 def test_the_slider_by_mouse_and_keyboard(visit):
     """Catches a slider that does not move the edge between the images, and choices that do not change them."""
     page = visit()
-    slider = page.locator(".stage input")
-    shares = lambda: page.locator(".compare").evaluate("e => e.style.getPropertyValue('--share')")  # noqa: E731
-    assert shares() == "50%"
+    slider, over, under = (page.locator(f".stage {name}") for name in ("input", ".over", ".under"))
+    share = lambda: page.locator(".compare").evaluate("e => e.style.getPropertyValue('--share')")  # noqa: E731
     slider.focus()
     for _ in range(5):
         page.keyboard.press("ArrowRight")
-    assert shares() == "55%"
+    assert share() == "55%"
     slider.scroll_into_view_if_needed()
     box = slider.bounding_box()
     page.mouse.click(box["x"] + 0.2 * box["width"], box["y"] + box["height"] / 2)
-    assert int(shares()[:-1]) in range(17, 24)
-    over = page.locator(".stage .over")
-    before = over.get_attribute("src")
+    assert int(share()[:-1]) in range(17, 24)
+    before = over.get_attribute("src"), under.get_attribute("src")
     page.locator(".left").select_option(label="3dgs, error")
-    assert over.get_attribute("src") != before
+    page.locator(".view").select_option(index=1)
+    assert not {over.get_attribute("src"), under.get_attribute("src")} & {*before}
     assert over.get_attribute("alt").startswith("3dgs, error of ")
     assert re.fullmatch(r"3dgs, error: PSNR \d\d\.\d\d dB", page.locator(".left-name").inner_text())
     assert page.locator(".right-name").inner_text() == "ground truth"
-    under = page.locator(".stage .under").get_attribute("src")
-    page.locator(".view").select_option(index=1)
-    assert page.locator(".stage .under").get_attribute("src") != under
-    assert page.locator(".left").input_value() == "error:3dgs"
     assert over.evaluate("i => i.naturalWidth") == 60
 
 
@@ -133,49 +128,35 @@ def test_text_in_drawings_has_contrast(visit, scheme):
 MARKS = "#g0-frontier .chart >> nth=0 >> .mark-symbol path[aria-label]"
 
 
-def test_the_legend_hides_a_model_in_every_figure(visit):
-    """Catches a name that hides nothing, by mouse or by keyboard, and one that hides in one section only."""
-    page = visit()
-
-    def lines(key):
-        return page.locator(f"#g0-{key} .mark-line path").count()
-
-    before = page.locator(MARKS).count(), lines("curves")
+def test_figures_answer(visit):
+    """Catches a name in the legend that hides nothing, or in one section only; a choice of a scene that draws nothing
+    else, or that a reload forgets; and points without a tooltip, or with one that leaves the screen."""
+    page = visit(width=390)
+    lines = page.locator("#g0-curves .mark-line path")
+    labels = lambda: sorted(page.locator(MARKS).evaluate_all("all => all.map((mark) => mark.ariaLabel)"))  # noqa: E731
+    before = lines.count(), labels()
     entry = page.locator("#g0-frontier button.model", has_text=re.compile("^7dgs_noagr$"))
     entry.focus()
     page.keyboard.press("Enter")
     page.wait_for_timeout(300)
     assert entry.get_attribute("aria-pressed") == "false"
-    assert page.locator(MARKS).count() < before[0]
-    assert lines("curves") < before[1]
+    assert lines.count() < before[0]
+    assert len(labels()) < len(before[1])
     page.locator("#g0-curves button.model", has_text=re.compile("^7dgs_noagr$")).click()
     page.wait_for_timeout(300)
-    assert (page.locator(MARKS).count(), lines("curves")) == before
-
-
-def test_a_scene_is_chosen_and_remembered(visit):
-    """Catches a choice that draws nothing else, and a page that loads itself again and forgets it."""
-    page = visit()
-    labels = lambda: page.locator(MARKS).evaluate_all("all => all.map((mark) => mark.ariaLabel)")  # noqa: E731
-    before = labels()
-    page.locator("#g0-frontier select.scene").select_option("suzanne")
-    page.wait_for_timeout(300)
-    assert labels()
-    assert labels() != before
-    page.reload()
-    assert page.locator("#g0-frontier select.scene").input_value() == "suzanne"
-
-
-def test_a_point_names_its_model_and_numbers(visit):
-    """Catches points without a tooltip, and a tooltip that leaves the screen."""
-    page = visit(width=390)
-    page.locator(MARKS).first.scroll_into_view_if_needed()
+    assert (lines.count(), labels()) == before
     page.locator(MARKS).last.hover(force=True)
     tip = page.locator("#vg-tooltip-element.visible")
     tip.wait_for()
     assert "PSNR, dB" in tip.inner_text()
     box = tip.bounding_box()
     assert 0 <= box["x"] <= box["x"] + box["width"] <= 390
+    page.locator("#g0-frontier select.scene").select_option("suzanne")
+    page.wait_for_timeout(300)
+    assert labels()
+    assert labels() != before[1]
+    page.reload()
+    assert page.locator("#g0-frontier select.scene").input_value() == "suzanne"
 
 
 def test_it_prints_and_has_its_tables_without_script(visit):
