@@ -43,17 +43,11 @@ def at_most(packed: Tensor, limit: int) -> Tensor:
 
 
 def coefficients_within(
-    packed: Tensor,  # [N]
-    degree: int,
-    waves: int = 1,
+    packed: Tensor,  # [N] as `ColorOrder.packed`
+    degree: int,  # of the stored coefficients
+    waves: int = 1,  # of the stored coefficients
 ) -> Tensor:  # [N, waves, (degree + 1)^2] bool
-    """Return a mask of the colour coefficients that each Gaussian uses, given its SH degree and frequencies in time.
-
-    Args:
-        packed: the SH degree and the number of frequencies of each Gaussian, as degree + 4 (waves - 1).
-        degree: the SH degree of the stored coefficients.
-        waves: the number of frequencies of the stored coefficients.
-    """
+    """Return a mask of the colour coefficients that each Gaussian uses, given its SH degree and frequencies in time."""
     order = order_of(packed)
     degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])
     frequencies = torch.arange(waves, device=packed.device)
@@ -85,36 +79,27 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(basis, -1)
 
 
-def sh_colors(coefficients: Tensor, directions: Tensor, degree: int, orders: Tensor | None = None) -> Tensor:
-    """Compute SH colours max(0, sum_lm beta_lm Y_lm(d) + 0.5), as in 3DGS and 7DGS eq. 2.
-
-    Args:
-        coefficients: SH coefficients beta of each Gaussian, [N, K, 3].
-        directions: unit vectors d from the camera to the Gaussians, [N, 3].
-        degree: the SH degree in use, 0 to 3.
-        orders: the SH degree of each Gaussian if it is lower, [N] int32; None: `degree` for all.
-
-    Returns:
-        The colours, [N, 3].
-    """
+def sh_colors(
+    coefficients: Tensor,  # [N, K, 3] SH coefficients beta
+    directions: Tensor,  # [N, 3] unit vectors d from the camera to the Gaussians
+    degree: int,  # the SH degree in use, 0 to 3
+    orders: Tensor | None = None,  # [N] int32: the SH degree of each Gaussian if it is lower; None: `degree` for all
+) -> Tensor:  # [N, 3]
+    """Compute SH colours max(0, sum_lm beta_lm Y_lm(d) + 0.5), as in 3DGS and 7DGS eq. 2."""
     basis = _basis_within(directions, degree, orders)
     used = coefficients[:, : basis.shape[-1]]
     return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
 
 
 def sh_time_colors(
-    coefficients: Tensor, directions: Tensor, degree: int, time_offset: Tensor, orders: Tensor | None = None
-) -> Tensor:
-    """Compute the colours [N, 3] of 4DGS, whose basis functions are Y_lm(d) cos(2 pi n (t - mu_t)) (4DGS, eq. 12).
-
-    Args:
-        coefficients: K SH coefficients for each frequency n = 0 .. M-1, [N, M, K, 3].
-        directions: unit vectors d from the camera to the Gaussians, [N, 3].
-        degree: the SH degree in use, 0 to 3.
-        time_offset: the time less the mean time of each Gaussian, t - mu_t, [N].
-        orders: the SH degree and number of frequencies of each Gaussian if these are lower, encoded in one number
-            degree + 4 (frequencies - 1), [N] int32; None: all coefficients are used.
-    """
+    coefficients: Tensor,  # [N, M, K, 3] SH coefficients for each frequency n = 0 .. M-1
+    directions: Tensor,  # [N, 3] unit vectors d from the camera to the Gaussians
+    degree: int,  # the SH degree in use, 0 to 3
+    time_offset: Tensor,  # [N] t - mu_t
+    orders: Tensor
+    | None = None,  # [N] int32: lower orders of Gaussians, as `ColorOrder.packed`; None: all coefficients
+) -> Tensor:  # [N, 3]
+    """Compute the colours of 4DGS, whose basis functions are Y_lm(d) cos(2 pi n (t - mu_t)) (4DGS, eq. 12)."""
     frequencies = torch.arange(coefficients.shape[1], device=time_offset.device, dtype=time_offset.dtype)
     waves = torch.cos(2 * math.pi * frequencies * time_offset[:, None])  # [N, M]
     if orders is not None:

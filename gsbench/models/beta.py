@@ -70,7 +70,6 @@ class BetaModel(GaussianModel):
         raw["scales"][:, :3].clamp_(min=softplus_inverse(least * reach(profiles(raw)))[:, None])
 
     def spread(self, rows: Tensor) -> Tensor:
-        """Return the factors of the conditional covariances of the Gaussians `rows` [M], [M, 3, 3]."""
         return self.factors(self.raw_of(rows))
 
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
@@ -193,7 +192,6 @@ class UniversalBetaModel(BetaModel):
         return raw
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
-        """Return means, covariance factors, opacity factors and exponents of profiles, by the formulas of the class."""
         reduced = reduce(joint_factor(raw))
         parts = [unit(raw["means"] - query.center) - raw["directions"]]
         if "time" in self.observes:
@@ -222,7 +220,6 @@ class UniversalBetaModel(BetaModel):
         self.splats["scales"].data[:, -1].clamp_(min=softplus_inverse(reach(b) * least))
 
     def factors(self, raw: Raw) -> Tensor:
-        """Compute the factors of the conditional covariances, [N, 3, 3], by the formula of the class."""
         return self._modulated(reduce(joint_factor(raw)), shift_weights(raw["betas"]))
 
     def _modulated(self, reduced: Reduced, weights: Tensor) -> Tensor:

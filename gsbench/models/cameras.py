@@ -35,10 +35,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def intrinsics(width: int, height: int) -> Tensor:
-    """Return the intrinsic matrix K [3, 3] for an image of the given size.
-
-    The horizontal field of view is 0.69 radians, as in D-NeRF.
-    """
+    """Return the intrinsic matrix K [3, 3] for an image of a size, with the field of view FIELD_OF_VIEW."""
     focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
@@ -52,24 +49,14 @@ def _level(up: Tensor) -> tuple[Tensor, Tensor]:
 
 def around(
     model: GaussianModel,
-    distance: float,
+    distance: float,  # of the camera from the middle of the model, world units
     width: int,
     height: int,
-    azimuth: float,
-    elevation: float = ELEVATION,
-    up: Sequence[float] = UP,
+    azimuth: float,  # the angle about `up`, radians
+    elevation: float = ELEVATION,  # the angle above the horizon, radians
+    up: Sequence[float] = UP,  # a unit vector in world space
 ) -> Camera:
-    """Return a camera that looks at the middle of a model.
-
-    Args:
-        model: the model.
-        distance: the distance of the camera from the middle, world units.
-        width: the width of the image, pixels.
-        height: the height of the image, pixels.
-        azimuth: the angle about `up`, radians.
-        elevation: the angle above the horizon, radians.
-        up: a unit vector in world space.
-    """
+    """Return a camera that looks at the middle of a model."""
     flat, axis = math.cos(elevation), torch.tensor(up, dtype=torch.float32)
     basis = torch.stack([*_level(axis), axis])
     towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)]) @ basis

@@ -115,10 +115,7 @@ class CholeskyModel(JointModel):
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the 3D Gaussians of Gaussians that do not depend on time or direction.
-
-        Their covariance factor L_pp is the position block of the Cholesky factor.
-        """
+        """Return 3D Gaussians whose covariance factor is the position block of the Cholesky factor."""
         space = self.rows["p"]
         factors = CholeskyLayout("ppp", self.layout.form).factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
@@ -139,7 +136,6 @@ class CholeskyModel(JointModel):
         return named | ({"directions": self.mean_directions(raw)} if "direction" in self.observes else {})
 
     def spatial_scales(self) -> Tensor:
-        """Return the diagonal entries of position in each Cholesky factor, [N, 3]."""
         return sizes(self.splats["log_diagonal"][:, self.rows["p"]])
 
     def scales(self) -> Tensor:
@@ -148,7 +144,6 @@ class CholeskyModel(JointModel):
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise the diagonal entries of position in each Cholesky factor to at least `least` [N], world units."""
         space = self.rows["p"]
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=log(least)[:, None])
 
@@ -214,7 +209,6 @@ class CholeskyModel(JointModel):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the value of unused parameter entries: the largest log size for `log_diagonal`, else 0."""
         return LOG_SIZE_MAX if name == "log_diagonal" else 0.0
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
@@ -354,7 +348,6 @@ class TimedModel(CholeskyModel):
         self.bounded_times = bounded_times
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; see `GaussianModel.lifetimes`."""
         lifetimes = super().lifetimes()
         assert lifetimes is not None
         return self.mean_times(dict(self.splats.items()))[:, 0], lifetimes[1]
@@ -440,7 +433,6 @@ class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
         return times, deviations / math.sqrt(2) if self.joint_gate else deviations
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the lifetime of each Gaussian to at least `least`; see `TimedModel.hold_lifetimes`."""
         super().hold_lifetimes(least * math.sqrt(2) if self.joint_gate else least)
 
 

@@ -86,7 +86,6 @@ class GatedModel(GaussianModel):
         return None if self.effect_sets is None or not self.observes else self.effect_sets.conditioned
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
-        """Return what `kernel` may take, by name, with the number of Gaussians that it conditions."""
         return super().kernel_arguments(raw, query) | {"conditioned": self.conditioned}
 
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
@@ -155,7 +154,6 @@ class JointModel(GatedModel):
         return reduce(self.factors(self.raw_of(rows))).T_pp
 
     def durations(self) -> Tensor | None:
-        """Return the standard deviation in time of each Gaussian, [N]; None for a model without time."""
         if "time" not in self.observes:
             return None
         return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1)

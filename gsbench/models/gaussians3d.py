@@ -33,36 +33,28 @@ class Gaussians3DModel(GatedModel, gates=True):
         return {"scales": log(distances)[:, None].repeat(1, 3), "quats": quats}
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
-        """Return the Gaussians themselves, because 3DGS depends on neither time nor direction."""
         return self.static(raw)
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the scales and quaternions of the trained 3D Gaussians."""
         return {"scales": trained.log_scales, "quats": trained.quats}
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the Gaussians themselves, with covariance factors R S and unchanged opacities."""
         return Conditioned(raw["means"], self.factors(raw), torch.ones_like(raw["opacities"]))
 
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
-        """Return an empty dictionary, because 3DGS has no dependence on time or direction that could be removed."""
         return {}
 
     def spatial_scales(self) -> Tensor:
-        """Return the three scales of each Gaussian, [N, 3]."""
         return sizes(self.splats["scales"])
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise all three scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data.clamp_(min=log(least)[:, None])
 
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
-        """Multiply the three scales of each Gaussian in `rows` by the factor of this Gaussian."""
         self.splats["scales"].data[rows] += log(factors)[:, None].to(self.splats["scales"].dtype)
 
     def spread(self, rows: Tensor) -> Tensor:
-        """Return the factors R S of the covariances of the Gaussians `rows`, [M, 3, 3]."""
         return self.factors(self.raw_of(rows))
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:

@@ -93,7 +93,6 @@ class Gaussians4DModel(JointModel, gates=True):
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        """Return the spatial scales and rotations of trained 3D Gaussians, with the initial size in time."""
         left, right = quaternions_in_space(trained.quats)
         scales = torch.cat([trained.log_scales, raw["scales"][:, 3:]], 1)
         return {"scales": scales, "left_quats": left, "right_quats": right}
@@ -127,7 +126,6 @@ class Gaussians4DModel(JointModel, gates=True):
         return {"static": static}
 
     def full_order(self) -> int:
-        """Return the SH degree in use and the number of frequencies in time, as degree + 4 (frequencies - 1)."""
         return ColorOrder(self.active.sh_degree, self.time_degree + 1).packed
 
     def lower_orders(self) -> list[int]:
@@ -158,7 +156,6 @@ class Gaussians4DModel(JointModel, gates=True):
         return masks
 
     def constant(self, name: str) -> float:
-        """Return the value to which unused parameter entries are set: the largest log size for `scales`, else 0."""
         return LOG_SIZE_MAX if name == "scales" else 0.0
 
     @torch.no_grad()
@@ -178,7 +175,6 @@ class Gaussians4DModel(JointModel, gates=True):
         return super().kernel_arguments(raw, query) | {"clock": self.clock}
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
-        """Compute the colours of 4DGS, which change with time, by the backend's kernel if possible, else in torch."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
@@ -189,17 +185,14 @@ class Gaussians4DModel(JointModel, gates=True):
         return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)
 
     def initial_colors(self, dc: Tensor) -> Raw:
-        """Return SH coefficients for all frequencies of time; all are zero except the constant colour `dc` [N, 3]."""
         K = (self.sh_degree + 1) ** 2
         waves = dc.new_zeros(len(dc), self.time_degree + 1, K, 3)
         return {"sh0": dc[:, None, None], "shN": waves.flatten(1, 2)[:, 1:]}
 
     def spatial_scales(self) -> Tensor:
-        """Return the three spatial scales of each Gaussian, [N, 3]; density control uses the largest one, as 4DGS."""
         return sizes(self.splats["scales"][:, :3])
 
     def hold_sizes(self, least: Tensor) -> None:
-        """Raise the three spatial scales of each Gaussian to at least `least` [N]."""
         self.splats["scales"].data[:, :3].clamp_(min=log(least)[:, None])
 
     def hold_lifetimes(self, least: float) -> None:

@@ -48,7 +48,6 @@ class MovingGaussians3D(Gaussians3DModel):
         """Return mean [N] and standard deviation [N] of each opacity as a function of time; None without time."""
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
-        """Return the moved means, the covariance factors R S and the opacity factors for a camera centre and a time."""
         shift, opacity_factor = self.change(raw, query)
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 
@@ -66,7 +65,6 @@ class MovingGaussians3D(Gaussians3DModel):
         return {"static": {name: value.to(raw[name].dtype) for name, value in new.items()}}
 
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used: a static Gaussian uses no parameter in `moving`."""
         masks = super().kept(effect_sets)
         if effect_sets.frozen is not None:
             rows = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
@@ -110,18 +108,15 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         }
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
-        """Return the shifts v (t - mu_t) of means [N, 3] and opacity factors exp(-1/2 ((t - mu_t) / s)^2) [N]."""
         assert query.time is not None
         delta = query.time - raw["times"]
         opacity_factor = exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
         return raw["velocities"] * delta, opacity_factor
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return the mean times mu_t [N] and the standard deviations s [N] in time."""
         return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the standard deviation in time of each Gaussian to at least `least`."""
         self.splats["durations"].data.clamp_(min=math.log(least))
 
 
@@ -184,7 +179,6 @@ class DirectModel(MovingGaussians3D, gates=True):
         }
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
-        """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""
         assert query.time is not None
         direction = unit(raw["means"] - query.center).detach()
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
@@ -215,7 +209,6 @@ class DirectModel(MovingGaussians3D, gates=True):
         self.splats["shares"].data[rows] = larger.logit()
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        """Return the mean time [N] of each Gaussian, and the standard deviation [N] of its opacity over time."""
         L_tt = sizes(self.splats["precision"].detach()[:, 6])
         return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * DIRECT_FADING) * L_tt)
 
@@ -286,15 +279,12 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         return raw
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
-        """Return moved means, covariance factors, opacity factors and the exponents of the profiles."""
         return super().condition(raw, query)._replace(beta_exponents=profiles(raw))
 
     def static(self, raw: Raw) -> Conditioned:
-        """Return the Gaussians at their means, with their profiles."""
         return super().static(raw)._replace(beta_exponents=profiles(raw))
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
-        """Return how far the means move [N, 3] and the factors of the opacities [N], by the formulas of the class."""
         delta = unit(raw["means"] - query.center).detach() - raw["directions"]
         if "time" in self.observes:
             assert query.time is not None

@@ -37,18 +37,12 @@ class Refinement(nn.Module):
     units: Tensor  # [sum of outputs]
 
     def __init__(
-        self, outputs: list[int], generator: torch.Generator, octaves: int = OCTAVES, units: Tensor | None = None
+        self,
+        outputs: list[int],  # of each network: one for each mean, and the last for the covariance
+        generator: torch.Generator,  # the source of the random weights of the first layers
+        octaves: int = OCTAVES,  # frequencies of the time encoding; many of them overfit a scene of few frames
+        units: Tensor | None = None,  # [sum of outputs] the sizes of inputs and outputs in this scene; None: ones
     ) -> None:
-        """Make the networks, with output layers of zero.
-
-        Args:
-            outputs: the number of outputs of each network. The last network changes the parameters of the covariance,
-                the others change one mean each.
-            generator: the source of the random weights of the first layers.
-            octaves: frequencies of the time encoding; many of them overfit a scene of few frames.
-            units: [sum of outputs], by which inputs are divided and outputs multiplied, so that the size of the scene
-                does not matter; by default ones.
-        """
         super().__init__()
         self.features = sum(outputs[:-1])
         self.octaves = octaves
@@ -66,19 +60,18 @@ class Refinement(nn.Module):
         self.bias_out = nn.Parameter(torch.zeros(sum(outputs)))
 
     def forward(
-        self, values: list[Tensor], time: Tensor, *, by_kernel: bool = False, rows: int | None = None,
-        intervals: Tensor | None = None,
-    ) -> list[Tensor]:  # fmt: skip
-        """Return the raw parameters plus the outputs of AGR's networks at a time.
-
-        Args:
-            values: raw parameters, [N, c] each: first the means, which are the input, then the parameters of the
-                covariance.
-            time: the time in [0, 1], [].
-            by_kernel: whether the backend's kernel (float32) computes it, which stores no hidden layer in memory.
-            rows: only the first `rows` Gaussians change; None: all.
-            intervals: the first and the last time at which each of these Gaussians changes, [rows, 2]; None: always.
-        """
+        self,
+        values: list[
+            Tensor
+        ],  # raw parameters [N, c]: first the means, which are the input, then those of the covariance
+        time: Tensor,  # [] in [0, 1]
+        *,
+        by_kernel: bool = False,  # whether the backend's kernel (float32) computes it, which stores no hidden layer
+        rows: int | None = None,  # only the first `rows` Gaussians change; None: all
+        intervals: Tensor
+        | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
+    ) -> list[Tensor]:
+        """Return the raw parameters plus the outputs of AGR's networks at a time."""
         if by_kernel:
             gamma = encode_time(time, self.octaves)
             return refine(values, self.weight_in, self.bias_in, self.weight_out, self.bias_out, self.units, gamma,

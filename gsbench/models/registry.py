@@ -31,15 +31,9 @@ def register(name: str) -> Callable[[M], M]:
 
 
 def find(name: str, module: str | None = None) -> type[GaussianModel]:
-    """Return the model class registered as `name`.
+    """Return the model class registered as `name` by gsbench, an installed package, or a Python module to import.
 
-    The function first imports every module of `gsbench.models`, and every module that an installed package lists as an
-    entry point of the group `gsbench.models`.
-
-    Args:
-        name: the name of the model.
-        module: a Python module that registers the model, to be imported as well. It must come from the user, never from
-            a checkpoint, because an import runs code.
+    The name of the module must come from the user, never from a checkpoint, because an import runs code.
 
     Raises:
         InputError: the model is unknown, or a module cannot be imported.
@@ -64,19 +58,17 @@ def is_registered(name: str) -> bool:
 def _import_all() -> None:
     """Import every module of `gsbench.models`, and those that installed packages list as entry points."""
     package = importlib.import_module("gsbench.models")
-    for own in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"gsbench.models.{own.name}")
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"gsbench.models.{module.name}")
     for point in entry_points(group=ENTRY_POINTS):
         import_models(point.module, f"entry point {point.name} of {ENTRY_POINTS}")
 
 
-def import_models(module: str | None, named_by: str = "--model-module") -> None:
-    """Import a Python module that registers models; raises InputError with the file and line if the import fails.
-
-    Args:
-        module: the name of the module, such as package.module; None: do nothing.
-        named_by: the option that gave the name, for the error message.
-    """
+def import_models(
+    module: str | None,  # the name of the module, such as package.module; None: do nothing
+    named_by: str = "--model-module",  # the option that gave the name, for the error message
+) -> None:
+    """Import a Python module that registers models; raises InputError with the file and line if the import fails."""
     if module is None:
         return
     try:
@@ -124,8 +116,8 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
     known: dict[str, inspect.Parameter] = {}
     for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):
-        own = inspect.signature(cls.__init__, eval_str=True).parameters.values()
-        known = {p.name: p for p in own if p.kind is p.KEYWORD_ONLY} | known
+        options_of_cls = inspect.signature(cls.__init__, eval_str=True).parameters.values()
+        known = {p.name: p for p in options_of_cls if p.kind is p.KEYWORD_ONLY} | known
     for option, value in options.items():
         if option not in known:
             raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")

@@ -5,7 +5,6 @@ the Gaussian in each view. A simplified Gaussian is an ordinary row of the model
 checkpoints need no change.
 """
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,21 +34,18 @@ class Simplification:
 
 
 def simplifications_of(
-    model: GatedModel, queries: Sequence[CameraTime], slices: Sequence[Gaussians3D], by_halves: bool = True
+    model: GatedModel,
+    queries: Sequence[CameraTime],  # of the views over which constants are averaged
+    slices: Sequence[Gaussians3D],  # of the model for these views; their opacities are the weights of the average
+    by_halves: bool = True,  # whether to include Gaussians that are independent of only one of time and direction
 ) -> list[Simplification]:
     """Return the parameters of a model's Gaussians after each possible simplification.
 
     A simplified Gaussian is independent of AGR (the neural refinement), time, direction or all of them, or has a lower
     SH degree, or is removed.
-
-    Args:
-        model: the model, which does not change.
-        queries: the camera centres and times of the views over which constants are averaged.
-        slices: the 3D Gaussians of the model for these views; their opacities are the weights of the average.
-        by_halves: whether to include Gaussians that are independent of only one of time and direction.
     """
-    weights = shares_of([one.opacities for one in slices])
-    found = []
+    weights = shares_of([gaussians.opacities for gaussians in slices])
+    simplified = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
     fewer = {order: raw | {"shN": raw["shN"] * model.kept(EffectSets(0, 0, _all(model, order)))["shN"]}
@@ -59,17 +55,17 @@ def simplifications_of(
     refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
     raw = raw | refined
     if rows["refined"]:
-        found.append(Simplification(CONDITIONED, refined, rows["refined"]))
+        simplified.append(Simplification(CONDITIONED, refined, rows["refined"]))
     for name, frozen in model.frozen(raw, queries, weights).items():
         if name != STATIC and not by_halves:
             continue
-        found.append(Simplification(name, {key: raw[key] for key in names} | frozen, conditioned))
-    found.append(Simplification(REMOVED, None, len(model)))
+        simplified.append(Simplification(name, {key: raw[key] for key in names} | frozen, conditioned))
+    simplified.append(Simplification(REMOVED, None, len(model)))
     for (order, less), missing in zip(fewer.items(), lost, strict=True):
         constant = less["sh0"].clone()
         constant.flatten(1, -2)[:, 0] += missing / SH_C0
-        found.append(Simplification(f"order{order}", {"sh0": constant, "shN": less["shN"]}, len(model), order))
-    return found
+        simplified.append(Simplification(f"order{order}", {"sh0": constant, "shN": less["shN"]}, len(model), order))
+    return simplified
 
 
 def shares_of(opacities: Sequence[Tensor]) -> Tensor:
@@ -84,31 +80,25 @@ def _all(model: GaussianModel, order: int) -> Tensor:
 
 
 def _averages(
-    model: GaussianModel, queries: Sequence[CameraTime], slices: Sequence[Gaussians3D], weights: Tensor,
-    names: Sequence[str], fewer: Sequence[Raw],
-) -> tuple[Raw, list[Tensor]]:  # fmt: skip
-    """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops.
-
-    Args:
-        model: the model, which does not change.
-        queries: the camera centres and times of V views.
-        slices: the 3D Gaussians of the model for these views.
-        weights: the weight of each view for each Gaussian, [V, N].
-        names: the names of the raw parameters that AGR changes; empty without AGR.
-        fewer: raw parameters with lower SH degrees, one dictionary for each degree.
-    """
+    model: GaussianModel,
+    queries: Sequence[CameraTime],  # of V views
+    slices: Sequence[Gaussians3D],  # of the model for these views
+    weights: Tensor,  # [V, N] of each view for each Gaussian
+    names: Sequence[str],  # of the raw parameters that AGR changes; empty without AGR
+    fewer: Sequence[Raw],  # raw parameters with lower SH degrees
+) -> tuple[Raw, list[Tensor]]:
+    """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops."""
 
     def at(v: int) -> list[Tensor]:
-        moved, seen, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
-        colors = [model.shade(moved | {"shN": less["shN"]}, seen.means, seen.opacities, queries[v]) for less in fewer]
-        return [weight * moved[name] for name in names] + [weight * (seen.colors - others) for others in colors]
+        moved, sliced, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
+        colors = [
+            model.shade(moved | {"shN": less["shN"]}, sliced.means, sliced.opacities, queries[v]) for less in fewer
+        ]
+        return [weight * moved[name] for name in names] + [weight * (sliced.colors - others) for others in colors]
 
-    workers = model.backend.workers(weights)
-    total = functools.reduce(_add, side_by_side(at, range(len(queries)), workers))
+    parts = side_by_side(at, range(len(queries)), model.backend.workers(weights))
+    total = next(parts)
+    for part in parts:
+        for x, y in zip(total, part, strict=True):
+            x += y
     return dict(zip(names, total, strict=False)), total[len(names) :]
-
-
-def _add(total: list[Tensor], more: list[Tensor]) -> list[Tensor]:
-    for one, other in zip(total, more, strict=True):
-        one += other
-    return total
