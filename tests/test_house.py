@@ -28,8 +28,6 @@ LEAST_WORDS = 4
 VAGUE = {"found", "one", "own", "said", "told", "seen", "theirs", "mine", "given", "made"}
 # How often a room still gives such a name to something. A number may only fall; a room that is not here has none.
 VAGUE_NAMES: dict[str, int] = {
-    "gsbench/models": 8,
-    "gsbench/raster": 1,
     "gsbench/report": 7,
     "tests/report": 30,
 }

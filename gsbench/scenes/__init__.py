@@ -22,7 +22,7 @@ class _Layout:
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
-    reader: str  # module.function of this package: (root, *, downscale, background, resize) -> Scene; imported late
+    reader: str  # module.function of this package: (root, rendition) -> Scene; imported late
     reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
 
 
@@ -106,9 +106,11 @@ def load(
     layout = present[0]
     more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
     more |= {} if repair is None else {"repair": _repair(repair, layout)}
+    from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
+
     module, function = layout.reader.split(".")
     reader = getattr(importlib.import_module(f"gsbench.scenes.{module}"), function)
-    scene: Scene = reader(root, downscale=downscale, background=background, resize=resize, **more)
+    scene: Scene = reader(root, Rendition(downscale, background, resize), **more)
     if others := ", ".join(other.marker for other in present[1:] if other.marker not in layout.reads_too):
         scene = replace(scene, notes=(f"{layout.marker} is read, and not {others}", *scene.notes))
     for note in scene.notes:

@@ -7,6 +7,7 @@ import math
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import files, shots, times
 from gsbench.scenes.files import ImageFinder
+from gsbench.scenes.images import Rendition
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.scene import HELD_OUT, Points, Scene, hold_out
 from gsbench.scenes.shots import MASKS, Lens, Shot
@@ -63,8 +65,8 @@ class PosedImage:
     camera: int  # key of `read_cameras`
 
 
-def load(root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None) -> Scene:
-    """Load a scene from images and a COLMAP model; see `gsbench.scenes.load` for the arguments.
+def load(root: Path, rendition: Rendition) -> Scene:
+    """Load a scene from images and a COLMAP model.
 
     - `images/` has a PNG or a JPEG for each image that the model registers. If the one that the model names is missing,
       an image of the same name with another suffix is read.
@@ -86,7 +88,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
     cameras, posed, points = (read_part(folder, part) for part in ("cameras", "images", "points3D"))
     listed, digests, more = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
-    loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
+    loaded = shots.read(listed, rendition)
     digests |= {
         shot.path.relative_to(root).as_posix(): digest for shot, digest in zip(listed, loaded.digests, strict=True)
     }
@@ -97,7 +99,7 @@ def load(root: Path, *, downscale: int, background: tuple[float, float, float], 
         train=train,
         val=[],
         test=test,
-        background=background,
+        background=rendition.background,
         points=initial,
         fingerprint=files.fingerprint(digests),
         notes=(*more, *notes, *loaded.notes),
@@ -117,7 +119,7 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
                              f"{image.camera}")  # fmt: skip
     names, viewmats = [image.name for image in listed], np.stack([image.viewmat for image in listed])
     places = times.places_of(viewmats, [lenses[image.camera].key for image in listed])
-    timed, digests = times.of_images(root, names, viewmats, places, posed.path)
+    timed, digests = times.of_images(root, times.NamedImages(names, viewmats, places, posed.path))
     result, finder = [], ImageFinder(root)
     for image, time in zip(listed, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"
@@ -248,17 +250,12 @@ def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
 def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
     """Yield the cameras of cameras.txt, whose lines have an id, a model, width, height and the model's parameters."""
     for number, line in _lines(file):
-        if not line or line.startswith("#"):
-            continue
-        words = line.split()
-        where = f"{file.path}: line {number}"
-        try:
-            identifier, width, height = int(words[0]), int(words[2]), int(words[3])
-            values = tuple(float(word) for word in words[4:])
-        except (ValueError, IndexError):
-            raise InputError(f"{where}: expected a camera's id, model, width, height and parameters, "
-                             f"got {line[:60]!a}") from None  # fmt: skip
-        yield identifier, _known(words[1], where), width, height, values
+        if line:
+            words = line.split()
+            with _expects("a camera's id, model, width, height and parameters", file, number, line):
+                identifier, width, height = int(words[0]), int(words[2]), int(words[3])
+                values = tuple(float(word) for word in words[4:])
+            yield identifier, _known(words[1], f"{file.path}: line {number}"), width, height, values
 
 
 def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
@@ -274,16 +271,13 @@ def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
 
 def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
     """Yield the images of images.txt, each of which has two lines: the second lists keypoints and may be empty."""
-    lines = ((number, line) for number, line in _lines(file) if not line.startswith("#"))
+    lines = _lines(file)
     for number, line in lines:
         if not line:
             continue
         words = line.split(maxsplit=9)
-        try:
+        with _expects("an image's id, qw qx qy qz tx ty tz, camera and name", file, number, line):
             row = words[9], tuple(float(word) for word in words[1:8]), int(words[8])
-        except (ValueError, IndexError):
-            raise InputError(f"{file.path}: line {number}: expected an image's id, qw qx qy qz tx ty tz, camera and "
-                             f"name, got {line[:60]!a}") from None  # fmt: skip
         number, line = next(lines, (number + 1, ""))
         if not _are_keypoints(line.split()):
             raise InputError(f"{file.path}: line {number}: expected the keypoints (x y id ..) of image {row[0][:40]!a} "
@@ -316,30 +310,30 @@ def _binary_points(file: ModelFile) -> list[tuple[float, ...]]:
 
 
 def _text_points(file: ModelFile) -> list[tuple[float, ...]]:
-    """Return (x, y, z, r, g, b) of each point of points3D.txt.
-
-    A line of the file has an id, x, y, z, r, g, b, an error and a track of keypoints.
-    """
-    rows = []
+    """Return (x, y, z, r, g, b) of each point of points3D.txt; an id is before them, an error and a track behind."""
+    rows: list[tuple[float, ...]] = []
     for number, line in _lines(file):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            rows.append(tuple(float(word) for word in words[1:7]))
-            if len(rows[-1]) < 6:
-                raise ValueError
-        except ValueError:
-            raise InputError(
-                f"{file.path}: line {number}: expected an id, x y z and a colour, got {line[:60]!a}"
-            ) from None
+        if line:
+            with _expects("an id, x y z and a colour", file, number, line):
+                x, y, z, red, green, blue = (float(word) for word in line.split()[1:7])
+            rows.append((x, y, z, red, green, blue))
     return rows
 
 
 def _lines(file: ModelFile) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a text file without spaces around them, with their numbers from 1."""
+    """Yield the lines of a text file that are no comments, without spaces around them, with their numbers from 1."""
     for number, line in enumerate(file.data.decode("utf-8-sig", "replace").split("\n"), 1):
-        yield number, line.strip()
+        if not line.strip().startswith("#"):
+            yield number, line.strip()
+
+
+@contextmanager
+def _expects(what: str, file: ModelFile, number: int, line: str) -> Iterator[None]:
+    """Raise an InputError that names the line if its words are no numbers, or too few, within a `with` block."""
+    try:
+        yield
+    except (ValueError, IndexError):
+        raise InputError(f"{file.path}: line {number}: expected {what}, got {line[:60]!a}") from None
 
 
 class _Reader:

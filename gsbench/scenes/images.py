@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +27,15 @@ from gsbench.reading import read_file
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 Size = tuple[int, int]  # width and height, pixels
 Color = tuple[float, float, float]  # RGB in [0, 1]
+
+
+@dataclass(frozen=True)
+class Rendition:
+    """Hold how the images of a scene are composited and reduced; see `gsbench.scenes.load`."""
+
+    downscale: int
+    background: Color
+    resize: str | None = None  # one of gsbench.scenes.RESIZES
 
 
 class DamagedError(InputError):
@@ -196,9 +206,8 @@ def alpha_of(pixels: Pixels, size: Size) -> Tensor | None:  # [H, W, 3|4] as sto
 
 def composite(
     pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
-    background: tuple[float, float, float],
-    size: Size,
-    resize: str | None = None,  # one of gsbench.scenes.RESIZES
+    rendition: Rendition,
+    size: Size,  # after the reduction
 ) -> Tensor:  # [h, w, 3] float32 in [0, 1]
     """Composite an image with straight alpha over a background colour, then reduce it: a pixel is the mean of its area.
 
@@ -206,7 +215,8 @@ def composite(
     show at silhouettes. With `resize="pillow"` the composite is truncated to 8 bits and reduced by Pillow's bicubic
     filter, as in the code of 3DGS and of methods derived from it.
     """
-    if resize == "pillow":
+    background = rendition.background
+    if rendition.resize == "pillow":
         whole = Image.fromarray(_composite_8_bits(pixels, background))
         reduced = whole.resize(size, Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(reduced)).float() / 255
@@ -222,7 +232,7 @@ def composite(
 
 def _composite_8_bits(
     pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
-    background: tuple[float, float, float],
+    background: Color,
 ) -> NDArray[np.uint8]:  # [H, W, 3]
     """Composite an image in double precision and truncate it to 8 bits; one channel at a time, to save memory."""
     most = np.iinfo(pixels.dtype).max

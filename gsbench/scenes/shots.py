@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.scenes import files, images
-from gsbench.scenes.images import Pixels, Size
+from gsbench.scenes.images import Pixels, Rendition, Size
 from gsbench.scenes.scene import Camera, View
 
 _HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres are at +0.5 here, and at integers in OpenCV
@@ -117,30 +117,19 @@ def size_of(path: Path, where: str) -> Size:
 
 
 def read(
-    shots: Sequence[Shot],
+    shots: Sequence[Shot],  # at least one
+    rendition: Rendition,
     *,
-    downscale: int,
-    background: tuple[float, float, float],
-    resize: str | None,
-    in_8_bits: bool | None = None,
+    in_8_bits: bool | None = None,  # whether pixels stay in 8 bits; None: those of a large scene do
     decode: Callable[[Shot, bytes], Pixels] = lambda shot, data: images.decode_photo(data, shot.where),
 ) -> Shots:
-    """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis.
-
-    Args:
-        shots: the images, at least one.
-        downscale: the integer factor by which they are reduced.
-        background: the colour behind images with alpha.
-        resize: the filter by which they are reduced; see `gsbench.scenes.load`.
-        in_8_bits: whether pixels stay in 8 bits; None: those of a large scene do, others are stored as floats.
-        decode: the function that decodes the bytes of an image.
-    """
-    first = shots[0]
+    """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis."""
+    first, downscale = shots[0], rendition.downscale
     data = images.read_image(first.path, first.where)
     size = images.photo_size(data, first.where)
     reduced = images.reduced_size(size, downscale, first.where)
     if in_8_bits is None:
-        in_8_bits = resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
+        in_8_bits = rendition.resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
     def read_one(shot: Shot) -> tuple[View, str, bool]:
         data = images.read_image(shot.path, shot.where)
@@ -151,12 +140,12 @@ def read(
                              "`colmap image_undistorter`")  # fmt: skip
         pixels = lens.undistort(decoded, shot.where)
         is_kept = in_8_bits and pixels.dtype == np.uint8
-        image = torch.from_numpy(pixels) if is_kept else images.composite(pixels, background, reduced, resize)
+        image = torch.from_numpy(pixels) if is_kept else images.composite(pixels, rendition, reduced)
         K = np.diag([reduced[0] / size[0], reduced[1] / size[1], 1]) @ lens.pinhole()
         camera = Camera(shot.viewmat, torch.from_numpy(K.astype(np.float32)), image.shape[1], image.shape[0])
         alpha = None if is_kept else images.alpha_of(decoded, reduced)
         regions = None if shot.mask is None else _read_mask(shot, shot.mask, lens, reduced)
-        view = View(shot.name, camera, shot.time, image, background, alpha, regions)
+        view = View(shot.name, camera, shot.time, image, rendition.background, alpha, regions)
         return view, files.digest(data), images.is_turned(data)
 
     kept = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # bytes a pixel, alpha and mask too

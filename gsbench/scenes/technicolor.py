@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsbench.errors import InputError
 from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images, shots
-from gsbench.scenes.images import Size
+from gsbench.scenes.images import Rendition, Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import Points, Scene, View
@@ -39,14 +39,12 @@ class _Image:
 
 def load(
     root: Path,
+    rendition: Rendition,
     *,
-    downscale: int,
-    background: tuple[float, float, float],
-    resize: str | None = None,
     frames: tuple[int, int] | None = None,  # the first and the last
     repair: tuple[str, ...] = (),
 ) -> Scene:
-    """Load a scene of the Technicolor light field data (Sabater et al. 2017); see `gsbench.scenes.load`.
+    """Load a scene of the Technicolor light field data (Sabater et al. 2017).
 
     The folder has images `<Scene>_undist_<frame>_<camera>.png` and a table of cameras `cameras_parameters.txt` with
     intrinsics in pixels and poses (world to camera, OpenCV axes). Camera 10 is the test split, the others are for
@@ -69,7 +67,7 @@ def load(
                          f"got {len(rows)}")  # fmt: skip
     listed = _list_images(root, frames, len(rows))
     replaced = _replacements(repair, listed)
-    views, digests = _read_views(listed, replaced, rows, downscale, resize)
+    views, digests = _read_views(listed, replaced, rows, rendition)
     for image, before in replaced.items():
         print(f"{image.path}: damaged, replaced by {before.path.name} (data.repair)", file=sys.stderr)
     digests[CAMERAS] = files.digest(text)
@@ -80,7 +78,7 @@ def load(
         train=train,
         val=[],
         test=test,
-        background=background,
+        background=rendition.background,
         points=_points(root),
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
@@ -178,8 +176,7 @@ def _read_views(
     listed: list[_Image],
     replaced: dict[_Image, _Image],
     rows: list[dict[str, float]],
-    downscale: int,
-    resize: str | None,
+    rendition: Rendition,
 ) -> tuple[list[View], dict[str, str]]:
     """Return the views of all images, and the SHA-256 of each file by name.
 
@@ -206,8 +203,7 @@ def _read_views(
             return _decode(before, images.read_image(before.path, str(before.path)), is_named=True)
         raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
 
-    loaded = shots.read(listed_shots, downscale=downscale, background=(0, 0, 0), resize=resize,
-                        in_8_bits=downscale == 1, decode=decode)  # fmt: skip
+    loaded = shots.read(listed_shots, rendition, in_8_bits=rendition.downscale == 1, decode=decode)
     names = [f"{i.path.name} replaced by {replaced[i].path.name}" if i in replaced else i.path.name for i in listed]
     return loaded.views, dict(zip(names, loaded.digests, strict=True))
 

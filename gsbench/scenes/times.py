@@ -2,17 +2,18 @@
 
 Names have numbers of frames, of cameras, of takes and of pixels. Which one is the time follows from the cameras: images
 with the same pose and intrinsics are of one fixed camera, whose own number is constant there and whose time is not.
-Times that cannot be determined raise `InputError`. `places` are from `places_of`, `source` is the file of the names.
+Times that cannot be determined raise `InputError`.
 """
 
 import csv
 import os
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from fractions import Fraction
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -84,13 +85,38 @@ class _Column:
 
     @property
     def values(self) -> list[Fraction]:
-        """The numbers."""
+        """The numbers without their labels."""
         return [number.value for number in self.numbers]
 
     @property
     def words(self) -> set[str]:
         """The words before the numbers."""
         return {number.word for number in self.numbers}
+
+    @cached_property
+    def order(self) -> list[int]:
+        """The indices of the images in the order of the numbers."""
+        return sorted(range(len(self.numbers)), key=self.values.__getitem__)
+
+
+@dataclass(frozen=True)
+class NamedImages:
+    """Hold what tells the times of images: their names, and which of them a fixed camera took."""
+
+    names: Sequence[str]  # with folders
+    viewmats: NDArray[np.float64]  # [N, 4, 4] world to camera
+    places: Sequence[Hashable]  # from `places_of`
+    source: Path  # the file that names the images, for messages
+
+    @cached_property
+    def poses(self) -> NDArray[np.float64]:  # [N, 12]
+        """Rotations and relative positions of the cameras."""
+        return _relative(self.viewmats)
+
+    @property
+    def has_fixed_camera(self) -> bool:
+        """Whether two images have the same pose and intrinsics."""
+        return len(set(self.places)) < len(self.places)
 
 
 def places_of(
@@ -102,19 +128,13 @@ def places_of(
     return [(pose.tobytes(), lens) for pose, lens in zip(poses, lenses, strict=True)]
 
 
-def of_images(
-    root: Path,  # the scene's folder
-    names: Sequence[str],  # of images, with folders
-    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
-    places: Sequence[Hashable],  # from `places_of`
-    source: Path,  # the file that names the images, for messages
-) -> tuple[Times, dict[str, str]]:
-    """Return the times from times.csv, if it exists, otherwise from names, and the SHA-256 of times.csv by name."""
+def of_images(root: Path, images: NamedImages) -> tuple[Times, dict[str, str]]:
+    """Return the times from times.csv in `root`, if it exists, otherwise from names; and its SHA-256 by its name."""
     path = table_of(root)
     if path is None:
-        return of_names(names, viewmats, places, source), {}
+        return of_names(images), {}
     data = read_file(path, str(path), _MAX_TABLE)
-    return of_table(data, path, names, places), {path.name: digest(data)}
+    return of_table(data, path, images), {path.name: digest(data)}
 
 
 def table_of(root: Path) -> Path | None:
@@ -123,24 +143,24 @@ def table_of(root: Path) -> Path | None:
     return root / (TABLE if TABLE in names else names[0]) if names else None
 
 
-def of_names(names: Sequence[str], viewmats: NDArray[np.float64], places: Sequence[Hashable], source: Path) -> Times:
+def of_names(images: NamedImages) -> Times:
     """Return the time of each image from a number in its name, scaled to [0, 1]; None for all without such numbers."""
-    columns = _columns(names, source)
+    columns, none = _columns(images), [None] * len(images.names)
     changing = [column for column in columns if len(set(column.values)) > 1]
     if not changing:
         if columns:
-            check_distinct(names, [Fraction(0)] * len(names), places, source)
+            check_distinct(images, [Fraction(0)] * len(images.names), images.source)
         why = "the numbers in the names do not change" if columns else "the names have no numbers"
-        return Times([None] * len(names), [f"times: none, as {why} and there is no {TABLE}"])
-    column = _time_among(changing, names, viewmats, places, source)
+        return Times([*none], [f"times: none, as {why} and there is no {TABLE}"])
+    column = _time_among(changing, images)
     if column is None:
         note = f"times: none, as the names have only the number of the camera; write {TABLE} if the scene moves"
-        return Times([None] * len(names), [note])
-    check_distinct(names, column.values, places, source)
-    return Times([*_scaled(column.values)], [_described(column, names)])
+        return Times([*none], [note])
+    check_distinct(images, column.values, images.source)
+    return Times([*_scaled(column.values)], [_described(column, images.names)])
 
 
-def of_table(data: bytes, path: Path, names: Sequence[str], places: Sequence[Hashable]) -> Times:  # data: of times.csv
+def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of times.csv
     """Return the time of each image from times.csv, scaled to [0, 1]; None for all if all times are equal.
 
     The table has a first line with `name` and `time`, in any case and order. Columns are separated by commas,
@@ -169,8 +189,8 @@ def of_table(data: bytes, path: Path, names: Sequence[str], places: Sequence[Has
     loose: dict[str, list[str]] = defaultdict(list)
     for name in table:
         loose[_loose(name)].append(name)
-    used = [name if name in table else next(iter(loose.get(_loose(name), [""]))) for name in names]
-    missing = next((name for name, row in zip(names, used, strict=True) if not row), None)
+    used = [name if name in table else next(iter(loose.get(_loose(name), [""]))) for name in images.names]
+    missing = next((name for name, row in zip(images.names, used, strict=True) if not row), None)
     if missing is not None:
         raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
                          docs="data.md#times")  # fmt: skip
@@ -180,8 +200,8 @@ def of_table(data: bytes, path: Path, names: Sequence[str], places: Sequence[Has
     others = [name for name in columns if name not in ("name", "time")]
     rest += f"; columns that are not read: {', '.join(others)[:60]!a}" if any(others) else ""
     if len(set(values)) == 1:
-        return Times([None] * len(names), [f"times: none, as all times of {TABLE} are equal{rest}"])
-    check_distinct(names, values, places, path)
+        return Times([None] * len(used), [f"times: none, as all times of {TABLE} are equal{rest}"])
+    check_distinct(images, values, path)
     first, last = float(min(values)), float(max(values))
     return Times([*_scaled(values)], [f"times: {TABLE}, {first:.10g} to {last:.10g}, scaled to [0, 1]{rest}"])
 
@@ -214,23 +234,23 @@ def of_fields(
 
 
 def check_distinct(
-    names: Sequence[str],
+    images: NamedImages,
     times: Sequence[float | Fraction | None],
-    places: Sequence[Hashable],
-    source: Path,
+    source: Path,  # the file that has the times
     cure: str = f"write {TABLE}, or correct it",
 ) -> None:
     """Raise InputError if two images of a fixed camera have the same time."""
     first: dict[tuple[Hashable, float | Fraction], str] = {}
-    for name, time, place in zip(names, times, places, strict=True):
+    for name, time, place in zip(images.names, times, images.places, strict=True):
         other = name if time is None else first.setdefault((place, time), name)
         if other != name:
             raise InputError(f"{source}: images {other[:80]!a} and {name[:80]!a}: expected different times, as their "
                              f"pose and intrinsics are equal, got the same: {cure}", docs="data.md#times")  # fmt: skip
 
 
-def _columns(names: Sequence[str], source: Path) -> list[_Column]:
+def _columns(images: NamedImages) -> list[_Column]:
     """Return the numbers that all names have, place by place from the right."""
+    names, source = images.names, images.source
     numbers = _numbers(names, source)
     least = min(len(row) for row in numbers)
     if not least and any(numbers):
@@ -307,24 +327,16 @@ def _exact(text: str, where: str) -> Fraction:
     return Fraction(text) if is_short else Fraction(value)
 
 
-def _time_among(
-    changing: list[_Column],
-    names: Sequence[str],
-    viewmats: NDArray[np.float64],  # [N, 4, 4]
-    places: Sequence[Hashable],
-    source: Path,
-) -> _Column | None:
+def _time_among(changing: list[_Column], images: NamedImages) -> _Column | None:
     """Return the column that is the time; None if the only one is the number of the camera.
 
     The time changes while a camera stays where it is. Without fixed cameras, words before the numbers decide, then how
     far cameras move from one number to the next.
     """
-    candidates = [column for column in changing if _changes_at_a_place(column, places)]
+    candidates = [column for column in changing if _changes_at_a_place(column, images.places)]
     if not candidates:
-        if max(Counter(places).values()) > 1:
-            first, second = _pair_at_a_place(names, places)
-            raise InputError(f"{source}: images {first[:60]!a} and {second[:60]!a}: expected a number that changes, as "
-                             f"their pose and intrinsics are equal: write {TABLE}", docs="data.md#times")  # fmt: skip
+        if images.has_fixed_camera:  # its images have equal numbers
+            check_distinct(images, [Fraction(0)] * len(images.names), images.source)
         candidates = [column for column in changing if not column.words & {*_CAMERA_WORDS}]
         if not candidates:
             if len(changing) == 1:
@@ -333,14 +345,15 @@ def _time_among(
     candidates = _without_copies(candidates)
     if len(candidates) > 1:
         named = [column for column in candidates if column.words <= {*_TIME_WORDS}]
-        candidates = named if len(named) == 1 else _steadiest(candidates, changing, names, viewmats)
+        candidates = named if len(named) == 1 else _steadiest(candidates, changing, images)
     if len(candidates) == 1:
-        candidates += _chapters(candidates[0], changing, names, viewmats, places)
+        candidates += _chapters(candidates[0], changing, images)
     if len(candidates) == 1:
         return candidates[0]
     listed = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
-    raise InputError(f"{source}: image {names[0][:80]!a}: expected one number that is the time, got {listed}, which "
-                     f"all change from image to image: write {TABLE}", docs="data.md#times")  # fmt: skip
+    raise InputError(f"{images.source}: image {images.names[0][:80]!a}: expected one number that is the time, "
+                     f"got {listed}, which all change from image to image: write {TABLE}",
+                     docs="data.md#times")  # fmt: skip
 
 
 def _changes_at_a_place(column: _Column, places: Sequence[Hashable]) -> bool:
@@ -349,28 +362,18 @@ def _changes_at_a_place(column: _Column, places: Sequence[Hashable]) -> bool:
     return any(first.setdefault(place, value) != value for place, value in zip(places, column.values, strict=True))
 
 
-def _pair_at_a_place(names: Sequence[str], places: Sequence[Hashable]) -> tuple[str, str]:
-    """Return the names of two images of a fixed camera."""
-    first: dict[Hashable, str] = {}
-    return next(pair for name, place in zip(names, places, strict=True)
-                if (pair := (first.setdefault(place, name), name))[0] != name)  # fmt: skip
-
-
 def _without_copies(columns: list[_Column]) -> list[_Column]:
     """Leave out columns whose times would be those of a later one, such as frame_0003/0003.png."""
     scaled = [_scaled(column.values) for column in columns]
     return [column for i, column in enumerate(columns) if scaled[i] not in scaled[i + 1 :]]
 
 
-def _steadiest(
-    candidates: list[_Column], changing: list[_Column], names: Sequence[str], viewmats: NDArray[np.float64]
-) -> list[_Column]:
+def _steadiest(candidates: list[_Column], changing: list[_Column], images: NamedImages) -> list[_Column]:
     """Return the column from number to number of which cameras clearly move least; otherwise all candidates.
 
     Numbers that only repeat the order of each other, such as a frame and its time stamp, leave the one with decimals.
     """
-    poses = _relative(viewmats)
-    steps = [_step(column, [other for other in changing if other is not column], names, poses) for column in candidates]
+    steps = [_step(column, [other for other in changing if other is not column], images) for column in candidates]
     moving = sorted((step, i) for i, step in enumerate(steps) if step is not None)
     if moving:
         step, best = moving[0][0], candidates[moving[0][1]]
@@ -380,43 +383,41 @@ def _steadiest(
         least = step * (_CLEARLY**2 if has_fewer else _CLEARLY)
         if len(moving) == 1 or least < moving[1][0]:
             return [best]
-    orders = [sorted(range(len(names)), key=column.values.__getitem__) for column in candidates]
+    orders = [column.order for column in candidates]
     decimal = [column for column in candidates if any(value.denominator > 1 for value in column.values)]
     return decimal if not moving and len(decimal) == 1 and orders.count(orders[0]) == len(orders) else candidates
 
 
-def _step(column: _Column, others: list[_Column], names: Sequence[str], poses: NDArray[np.float64]) -> float | None:
+def _step(column: _Column, others: list[_Column], images: NamedImages) -> float | None:
     """Return by how much poses change on average from one number to the next while the rest of the name stays."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
-    for i, name in enumerate(names):
+    for i, name in enumerate(images.names):
         groups[(re.sub("[0-9]+", "#", name), *(other.values[i] for other in others))].append(i)
     values, lengths = column.values, []
     for group in groups.values():
         ordered = sorted(group, key=values.__getitem__)
-        lengths += [float(np.linalg.norm(poses[a] - poses[b])) for a, b in pairwise(ordered)]
+        lengths += [_distance(images, a, b) for a, b in pairwise(ordered)]
     return sum(lengths) / len(lengths) if lengths else None
 
 
-def _chapters(
-    column: _Column,
-    changing: list[_Column],
-    names: Sequence[str],
-    viewmats: NDArray[np.float64],  # [N, 4, 4]
-    places: Sequence[Hashable],
-) -> list[_Column]:
+def _distance(images: NamedImages, a: int, b: int) -> float:
+    """Return how far the pose of image number `a` is from that of number `b`."""
+    return float(np.linalg.norm(images.poses[a] - images.poses[b]))
+
+
+def _chapters(column: _Column, changing: list[_Column], images: NamedImages) -> list[_Column]:
     """Return the columns of which each number goes on where the one before ends, such as chapters of a video.
 
     There both numbers together are the time. The moving camera makes no large step from chapter to chapter.
     """
     others = [other for other in changing if other is not column and not other.words & {*_CAMERA_WORDS}]
-    poses, step = _relative(viewmats), _step(column, others, names, _relative(viewmats))
-    if step is None or max(Counter(places).values()) > 1:
+    step = _step(column, others, images)
+    if step is None or images.has_fixed_camera:
         return []
     chapters = []
     for other in others:
-        order = sorted(range(len(names)), key=lambda i: (other.values[i], column.values[i]))
-        jumps = [float(np.linalg.norm(poses[a] - poses[b])) for a, b in pairwise(order)
-                 if other.values[a] != other.values[b]]  # fmt: skip
+        order = sorted(column.order, key=other.values.__getitem__)
+        jumps = [_distance(images, a, b) for a, b in pairwise(order) if other.values[a] != other.values[b]]
         repeats = len({(other.values[i], column.values[i]) for i in order}) > len(set(column.values))
         if repeats and sum(jumps) < _CLEARLY * step * len(jumps):
             chapters.append(other)
@@ -448,7 +449,7 @@ def _described(column: _Column, names: Sequence[str]) -> str:
         what = "the number" if column.count == 1 else f"number {column.place} of {column.count}"
         unit = "decimals" if any(value.denominator > 1 for value in column.values) else "whole numbers"
     ends = f"{last - first:.10g} seconds" if column.numbers[0].is_moment else f"{first:.16g} to {last:.16g} ({unit})"
-    at = min(range(len(names)), key=column.values.__getitem__)
+    at = column.order[0]
     return f"times: {what} in each name, {ends}, scaled to [0, 1]; {names[at][:80]!a} is the first"
 
 

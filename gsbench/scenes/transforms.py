@@ -7,8 +7,9 @@ A value that is not read raises `InputError`; `where` is the file and the field.
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,11 @@ from gsbench.errors import InputError
 from gsbench.reading import MAX_JSON, parse_json, read_file
 from gsbench.scenes import files, shots, times
 from gsbench.scenes.files import ImageFinder
-from gsbench.scenes.images import Size
+from gsbench.scenes.images import Rendition, Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import HELD_OUT, Scene, View, hold_out
-from gsbench.scenes.shots import MASKS, Lens, Shot
+from gsbench.scenes.shots import MASKS, Lens, Shot, Shots
 
 NERFSTUDIO = "transforms.json"
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -112,10 +113,8 @@ class Split:
     notes: list[str]
 
 
-def load_blender(
-    root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None
-) -> Scene:
-    """Load a scene in the Blender layout; see `gsbench.scenes.load` for the arguments.
+def load_blender(root: Path, rendition: Rendition) -> Scene:
+    """Load a scene in the Blender layout.
 
     Each file transforms_{train,val,test}.json has
 
@@ -139,17 +138,15 @@ def load_blender(
     splits = {split: _read_split(root, f"transforms_{split}.json", finder) for split in ("train", "test")}
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
         splits["val"] = _read_split(root, "transforms_val.json", finder)
-    timed, notes = _times(splits)
+    timed, notes = _times(list(splits.values()))
     size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)
-    listed = [shot for split in splits for shot in _shots_of(splits[split].frames, timed[split], size)]
-    loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
-    views, parts, at = {}, {}, 0
-    for split in splits:
-        part = slice(at, at := at + len(splits[split].frames))
-        views[split], parts[split] = loaded.views[part], loaded.digests[part]
-    digests = {
-        frame.name: digest for split in splits for frame, digest in zip(splits[split].frames, parts[split], strict=True)
-    }
+    listed = [shot for split, part in zip(splits.values(), timed, strict=True)
+              for shot in _shots_of(split.frames, part, size)]  # fmt: skip
+    loaded = shots.read(listed, rendition)
+    in_order = iter(loaded.views)
+    views = {name: list(islice(in_order, len(split.frames))) for name, split in splits.items()}
+    frames = [frame for split in splits.values() for frame in split.frames]
+    digests = {frame.name: digest for frame, digest in zip(frames, loaded.digests, strict=True)}
     digests |= {split.source.name: split.digest for split in splits.values()}
     if times.table_of(root):
         notes.append(f"{times.TABLE} is not read: the times are those of transforms_*.json")
@@ -159,17 +156,15 @@ def load_blender(
         train=views["train"],
         val=views.get("val", []),
         test=views["test"],
-        background=background,
+        background=rendition.background,
         points=None,
         fingerprint=files.fingerprint(digests),
-        notes=(*notes, *_shared_views(views, parts)),
+        notes=(*notes, *_shared_views(views, loaded)),
     )
 
 
-def load_nerfstudio(
-    root: Path, *, downscale: int, background: tuple[float, float, float], resize: str | None = None
-) -> Scene:
-    """Load a scene from transforms.json; see `gsbench.scenes.load` for the arguments.
+def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
+    """Load a scene from transforms.json.
 
     The file has what `load_blender` reads from each of its files. `train_filenames`, `val_filenames` and
     `test_filenames` may list the images of each split by their `file_path`. Otherwise every eighth image in the order
@@ -184,15 +179,18 @@ def load_nerfstudio(
     root = root.resolve()
     finder = ImageFinder(root)
     split = _read_split(root, NERFSTUDIO, finder, _NERFSTUDIO_KEYS)
-    timed, digests = _nerfstudio_times(root, split)
+    if split.frames[0].time is None or times.table_of(root):
+        _check_all_or_none([split])
+        timed, digests = times.of_images(root, _named_images(split))
+    else:
+        (values,), lines = _times([split])
+        timed, digests = times.Times(values, lines), {}
     size = shots.size_of(split.frames[0].path, split.frames[0].where)
     listed = _shots_of(split.frames, timed.values, size)
-    loaded = shots.read(listed, downscale=downscale, background=background, resize=resize)
+    loaded = shots.read(listed, rendition)
     digests |= dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
     train, val, test, how = _split_views(split, finder, loaded.views)
-    by_view = dict(zip(map(id, loaded.views), loaded.digests, strict=True))
-    views = {"train": train, "val": val, "test": test}
-    parts = {part: [by_view[id(view)] for view in views[part]] for part in views}
+    shared = _shared_views({"train": train, "val": val, "test": test}, loaded)
     points = split.content.get("ply_file_path")
     initial = None
     if points is not None:
@@ -206,10 +204,10 @@ def load_nerfstudio(
         train=train,
         val=val,
         test=test,
-        background=background,
+        background=rendition.background,
         points=initial,
         fingerprint=files.fingerprint(digests | {NERFSTUDIO: split.digest}),
-        notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes, *_shared_views(views, parts)),
+        notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes, *shared),
         up=None,
     )
 
@@ -251,10 +249,12 @@ def _shots_of(frames: Sequence[Frame], timed: Sequence[float | None], size: Size
     ]  # fmt: skip
 
 
-def _places_of(frames: Sequence[Frame]) -> list[Any]:
-    """Return a key of each frame that is equal for frames with the same pose and intrinsics."""
-    viewmats = np.stack([frame.viewmat.double().numpy() for frame in frames])
-    return list(times.places_of(viewmats, [(frame.intrinsics.focal, frame.intrinsics.angle) for frame in frames]))
+def _named_images(split: Split) -> times.NamedImages:
+    """Return the names of a file's frames, their poses, and which of them have the same pose and intrinsics."""
+    viewmats = np.stack([frame.viewmat.numpy() for frame in split.frames])
+    lenses = [(frame.intrinsics.focal, frame.intrinsics.angle) for frame in split.frames]
+    names = [frame.name for frame in split.frames]
+    return times.NamedImages(names, viewmats, times.places_of(viewmats, lenses), split.source)
 
 
 def _read_frame(
@@ -302,20 +302,19 @@ def _viewmat(
     return torch.from_numpy(viewmat)
 
 
-def _times(splits: dict[str, Split]) -> tuple[dict[str, list[float | None]], list[str]]:
-    """Return the times of each split's frames in [0, 1], or None for all, and sentences on how they were read."""
-    _check_all_or_none(splits.values())
-    if splits["train"].frames[0].time is None:
-        return {name: [None] * len(split.frames) for name, split in splits.items()}, []
-    for split in splits.values():
-        names, fields = [frame.name for frame in split.frames], [frame.time for frame in split.frames]
-        times.check_distinct(names, fields, _places_of(split.frames), split.source, _OWN_TIMES)
-    by_file = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits.values()}
-    timed, notes = times.of_fields(by_file)
-    return {name: timed[str(split.source)] for name, split in splits.items()}, notes
+def _times(splits: list[Split]) -> tuple[list[list[float | None]], list[str]]:
+    """Return the times of each file's frames in [0, 1] by their field `time`, or None for all, and notes."""
+    _check_all_or_none(splits)
+    if splits[0].frames[0].time is None:
+        return [[None] * len(split.frames) for split in splits], []
+    fields = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits}
+    for split in splits:
+        times.check_distinct(_named_images(split), fields[str(split.source)], split.source, _OWN_TIMES)
+    timed, notes = times.of_fields(fields)
+    return [timed[str(split.source)] for split in splits], notes
 
 
-def _check_all_or_none(splits: Iterable[Split]) -> None:
+def _check_all_or_none(splits: Sequence[Split]) -> None:
     """Raise InputError if some frames of a data set have a time and others do not."""
     listed = [(split, index, frame) for split in splits for index, frame in enumerate(split.frames)]
     first = listed[0][2].time
@@ -328,13 +327,11 @@ def _check_all_or_none(splits: Iterable[Split]) -> None:
             )
 
 
-def _shared_views(views: dict[str, list[View]], digests: dict[str, list[str]]) -> list[str]:
+def _shared_views(views: dict[str, list[View]], loaded: Shots) -> list[str]:
     """Return sentences on images that two splits share, with the same pose and time."""
-    keys_of = {
-        split: [(digest, view.camera.viewmat.numpy().tobytes(), view.time) for view, digest in
-                zip(views[split], digests[split], strict=True)]
-        for split in views
-    }  # fmt: skip
+    digests = dict(zip(map(id, loaded.views), loaded.digests, strict=True))
+    keys_of = {split: [(digests[id(view)], view.camera.viewmat.numpy().tobytes(), view.time) for view in listed]
+               for split, listed in views.items()}  # fmt: skip
     notes = []
     for part, other in (("test", "train"), ("test", "val"), ("val", "train")):
         if part in keys_of and other in keys_of:
@@ -343,22 +340,6 @@ def _shared_views(views: dict[str, list[View]], digests: dict[str, list[str]]) -
                 notes.append(f"{count} of {len(keys_of[part])} views of {part} are views of {other} too (image, pose "
                              f"and time are equal): PSNR on {part} is not that of unseen views")  # fmt: skip
     return notes
-
-
-def _nerfstudio_times(root: Path, split: Split) -> tuple[times.Times, dict[str, str]]:
-    """Return the times of the frames in [0, 1], and the SHA-256 of times.csv by name, if there is one.
-
-    They are from times.csv, otherwise from the frames, otherwise from the names of the images.
-    """
-    _check_all_or_none([split])
-    places, names = _places_of(split.frames), [frame.name for frame in split.frames]
-    if split.frames[0].time is None or times.table_of(root):
-        viewmats = np.stack([frame.viewmat.double().numpy() for frame in split.frames])
-        return times.of_images(root, names, viewmats, places, split.source)
-    fields = [frame.time or 0.0 for frame in split.frames]
-    times.check_distinct(names, fields, places, split.source, _OWN_TIMES)
-    timed, notes = times.of_fields({NERFSTUDIO: fields})
-    return times.Times(timed[NERFSTUDIO], notes), {}
 
 
 def _split_views(

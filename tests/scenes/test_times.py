@@ -35,7 +35,12 @@ def nudged(viewmats: np.ndarray) -> np.ndarray:
 
 
 def of_names(names: Sequence[str], viewmats: np.ndarray) -> times.Times:
-    return times.of_names(names, viewmats, times.places_of(viewmats, [0] * len(names)), SOURCE)
+    places = times.places_of(viewmats, [0] * len(names))
+    return times.of_names(times.NamedImages(names, viewmats, places, SOURCE))
+
+
+def of_table(data: bytes, names: Sequence[str], places: Sequence[object]) -> times.Times:
+    return times.of_table(data, Path("times.csv"), times.NamedImages(names, circle(len(names)), places, SOURCE))
 
 
 FORMS: dict[str, Callable[[int, int], str]] = {
@@ -145,7 +150,7 @@ def stereo(count: int) -> np.ndarray:
 
 REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
     "a camera's number alone": ([f"cam{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.repeat(circle(4), 2, 0),
-                                "'cam0_a.png' and 'cam0_b.png'.*a number that changes"),
+                                "'cam0_a.png' and 'cam0_b.png'.*expected different times"),
     "equal": ([f"{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.tile(circle(1), (8, 1, 1)),
               "'0_a.png' and '0_b.png'.*expected different times"),
     "constant": ([f"{'abcd'[i]}_1080p.png" for i in range(4)], np.tile(circle(1), (4, 1, 1)),
@@ -201,7 +206,7 @@ TABLES = {
 def test_tables_as_programs_write_them(kind: str) -> None:
     """Catches a table that is refused for what a spreadsheet adds to it."""
     names = ["a.png", "b.png", "c.png"]
-    timed = times.of_table(TABLES[kind].encode(), Path("times.csv"), names, names)
+    timed = of_table(TABLES[kind].encode(), names, names)
     assert timed.values == pytest.approx([0, 1 / 3, 1])
     assert ("left out" in timed.notes[0]) == (kind == "rows of others")
     assert ("'frame, note'" in timed.notes[0]) == (kind == "another column")
@@ -220,20 +225,20 @@ def test_tables_as_programs_write_them(kind: str) -> None:
 def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) -> None:
     """Catches two images of one camera at one time, and a row of another length."""
     with pytest.raises(InputError, match=words):
-        times.of_table(content.encode(), Path("times.csv"), ["a", "b", "c"], [0, 0, 0])
+        of_table(content.encode(), ["a", "b", "c"], [0, 0, 0])
 
 
 def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) -> None:
     """Catches Times.CSV that is left out in silence, and a number whose exact value has a hundred million digits."""
     (tmp_path / "Times.CSV").write_text("name,time\na,1e-99999999\nb,1\n")
-    timed, digests = times.of_images(tmp_path, ["a", "b"], circle(2), [0, 1], Path("images.txt"))
+    timed, digests = times.of_images(tmp_path, times.NamedImages(["a", "b"], circle(2), [0, 1], SOURCE))
     assert timed.values == [0, 1]
     assert list(digests) == ["Times.CSV"]
 
 
 def test_a_table_of_equal_times_is_a_still_scene() -> None:
     """Catches a division by zero, and a scene of many cameras at one moment that is called moving."""
-    timed = times.of_table(b"name,time\na,3\nb,3\n", Path("times.csv"), ["a", "b"], [0, 1])
+    timed = of_table(b"name,time\na,3\nb,3\n", ["a", "b"], [0, 1])
     assert timed.values == [None, None]
 
 
