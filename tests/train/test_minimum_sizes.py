@@ -112,3 +112,6 @@ def test_every_step_of_a_training_holds_them() -> None:
         assert len(hook.least) == len(fitted.model)
         if fitted.step == 0:
             torch.testing.assert_close(splats["scales"].detach()[:, 0], least.log(), rtol=1e-2, atol=0)
+    before = hook.least
+    fitted.rows.select(torch.tensor([5, 3]))
+    assert torch.equal(hook.least, before[[5, 3]])
