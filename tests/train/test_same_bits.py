@@ -50,24 +50,12 @@ OF_MKL = ("acos", "asin", "atan", "cos", "erf", "erfc", "exp", "log", "log10", "
 class OtherProcessor(TorchDispatchMode):
     """Change the last bit of every third float32 result of the functions that torch leaves to MKL."""
 
-    changed = 0
-
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = function(*args, **(kwargs or {}))
         if function.overloadpacket.__name__.rstrip("_") in OF_MKL and result.dtype == torch.float32:
             third = torch.arange(result.numel()).reshape(result.shape) % 3 == 0
             result.copy_(torch.where(third, torch.nextafter(result, torch.tensor(torch.inf)), result))
-            self.changed += 1
         return result
-
-
-def test_the_last_bits_of_mkl_are_changed() -> None:
-    """Catches a test that compares a training with itself."""
-    x = torch.ones(7)
-    with OtherProcessor() as other:
-        assert not torch.equal(x.exp(), torch.full((7,), torch.e))
-        assert torch.equal(x.double().exp(), torch.full((7,), torch.e).double().fill_(torch.e))
-    assert other.changed == 1
 
 
 @pytest.mark.parametrize("model", ["3dgs", "4dgs", "6dgs", "7dgs", "dbs", "dgs", "freetime", "ndgs", "ubs"])
@@ -82,6 +70,7 @@ def test_a_training_does_not_depend_on_the_last_bits_of_mkl(model: str) -> None:
 
     here = trained()
     with OtherProcessor():
+        assert not torch.equal(torch.ones(7).exp(), torch.full((7,), torch.e)), "nothing is changed"
         there = trained()
     assert len(here[0]) > 40, "if no Gaussian is split, nothing is tested here"
     assert all(torch.equal(a, b) for a, b in zip(here, there, strict=True))
