@@ -1,6 +1,6 @@
-"""Bring up a real Slurm on this machine: munge, MariaDB, slurmdbd, slurmctld and two slurmds in a folder of their own.
+"""Bring up a real Slurm on this machine: MariaDB, slurmdbd, slurmctld and two slurmds in a folder of their own.
 
-    apt-get install --no-install-recommends slurm-wlm slurmdbd munge mariadb-server
+    apt-get install --no-install-recommends slurm-wlm slurmdbd mariadb-server
 
 Nothing of the machine's own configuration is read or written, and every daemon that was started is stopped at the end.
 Accounting (slurmdbd with MariaDB) is what real clusters have: without it, nobody can say why a job ended.
@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
-PROGRAMS = ("munged", "mariadbd", "mariadb-install-db", "slurmdbd", "slurmctld", "slurmd", "sbatch", "sacctmgr")
+PROGRAMS = ("mariadbd", "mariadb-install-db", "slurmdbd", "slurmctld", "slurmd", "sbatch", "sacctmgr")
 NODES = ("n1", "n2")
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 PATH = f"{os.environ['PATH']}:/usr/sbin:/sbin"
@@ -37,8 +37,8 @@ SlurmdSpoolDir={folder}/spool_%n
 SlurmdPidFile={folder}/slurmd_%n.pid
 SlurmdLogFile={folder}/slurmd_%n.log
 SlurmdTimeout=20
-# A requeued job waits until its old credential has run out: 121 seconds by default.
-AuthInfo=socket={folder}/munge.socket,cred_expire=10
+AuthType=auth/none
+CredType=cred/none
 ReturnToService=2
 MpiDefault=none
 TaskPlugin=task/none
@@ -51,7 +51,6 @@ JobAcctGatherParams=OverMemoryKill
 AccountingStorageType=accounting_storage/slurmdbd
 AccountingStorageHost=127.0.0.1
 AccountingStoragePort={dbd_port}
-AccountingStoragePass={folder}/munge.socket
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU_Memory
 SchedulerParameters=sched_interval=2,bf_interval=2,batch_sched_delay=0
@@ -62,7 +61,7 @@ PartitionName=main Nodes=n1,n2 Default=YES MaxTime=INFINITE State=UP
 """
 
 SLURMDBD_CONF = """
-AuthInfo=socket={folder}/munge.socket
+AuthType=auth/none
 DbdHost=localhost
 DbdAddr=127.0.0.1
 DbdPort={dbd_port}
@@ -82,7 +81,7 @@ def missing() -> str | None:
     absent = [name for name in PROGRAMS if shutil.which(name, path=PATH) is None]
     if absent:
         return (f"needs {', '.join(absent)}: "
-                "apt-get install --no-install-recommends slurm-wlm slurmdbd munge mariadb-server")  # fmt: skip
+                "apt-get install --no-install-recommends slurm-wlm slurmdbd mariadb-server")  # fmt: skip
     if os.geteuid() != 0:
         return f"slurmd runs as root, this is {getpass.getuser()}"
     return None
@@ -99,7 +98,6 @@ class Cluster:
     def __enter__(self) -> "Cluster":
         try:
             self._configure()
-            self._munge()
             self._database()
             self.start("slurmdbd", "slurmdbd", "-D")
             self._until("slurmdbd answers", lambda: self.ok("sacctmgr", "-n", "list", "cluster"))
@@ -187,15 +185,6 @@ class Cluster:
             path = self.folder / name
             path.write_text(text.format(**values))
             path.chmod(0o600)
-
-    def _munge(self) -> None:
-        key = self.folder / "munge.key"
-        key.write_bytes(secrets.token_bytes(128))
-        key.chmod(0o400)
-        at = [f"--{what}={self.folder}/munge.{what.removesuffix('-file')}" for what in (
-            "key-file", "socket", "pid-file", "log-file", "seed-file")]  # fmt: skip
-        self.start("munged", "munged", "--foreground", "--force", *at)
-        self._until("munged answers", (self.folder / "munge.socket").exists)
 
     def _database(self) -> None:
         data, sock = self.folder / "sql", self.folder / "sql.socket"
