@@ -5,17 +5,23 @@ import io
 import json
 import os
 import random
+import resource
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import torch
+from tiny_run import ROOT, command, environment, overrides
 
 from gsbench.errors import InputError
 from gsbench.measure import atomic, record
 from gsbench.process import memory
+from gsbench.process.memory import is_out_of_memory
 from gsbench.report import study
+from gsbench.scenes import images
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 
@@ -48,8 +54,9 @@ def test_a_disk_that_is_full_while_a_checkpoint_is_written_is_named(
 
 
 @pytest.mark.parametrize("write", [atomic.write_atomically, atomic.create_atomically])
+@pytest.mark.parametrize("methods", [("open", "unlink"), ("write_bytes", "open")])
 def test_a_read_only_disk_is_named_by_the_user_s_file(
-    write: Callable[[Path, bytes], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    write: Callable[[Path, bytes], object], methods: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches the removal of the temporary file, which fails there too, and whose error named that file."""
 
@@ -57,7 +64,7 @@ def test_a_read_only_disk_is_named_by_the_user_s_file(
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
 
     with monkeypatch.context() as patched:
-        for name in ("open", "unlink"):
+        for name in methods:
             patched.setattr(Path, name, refused)
         with pytest.raises(OSError, match="Read-only") as caught:
             write(tmp_path / "a.ply", b"x")
@@ -103,58 +110,90 @@ def test_a_checkpoint_that_asks_for_gradients_is_refused(tmp_path: Path) -> None
         checkpoint.read(tmp_path / "c.pt")
 
 
-def in_tried(plain: dict[str, Any], count: int) -> None:
-    tried = [{"name": "a", "psnr_val": 1.0, "seconds": 1.0}] * count
-    plain["length_choice"] = {"kept": 1, "tried": tried}
+CANDIDATE = {"name": "a", "psnr_val": 1.0, "seconds": 1.0}
+CHOSEN = {"iteration": 1, "chosen": "a"}
+ENDLESS: dict[str, Callable[[dict[str, Any], int], object]] = {
+    "lengths": lambda plain, n: plain.update(length_choice={"kept": 1, "tried": [CANDIDATE] * n}),
+    "candidates": lambda plain, n: plain.update(on_demand={"comparison": CHOSEN | {"candidates": [CANDIDATE] * n}}),
+    "protocol": lambda plain, n: plain["protocol"].update({f"key{i}": i for i in range(n)}),
+    "config": lambda plain, n: plain["provenance"]["config"].update(all=list(range(n))),
+    "views": lambda plain, n: plain.update(per_view=[{"name": "a"}] * n),
+}
 
 
-def in_compared(plain: dict[str, Any], count: int) -> None:
-    candidates = [{"name": "a", "psnr_val": 1.0, "seconds": 1.0}] * count
-    plain["on_demand"] = {"comparison": {"iteration": 1, "chosen": "a", "candidates": candidates}}
-
-
-def in_protocol(plain: dict[str, Any], count: int) -> None:
-    plain["protocol"] |= {f"key{i}": i for i in range(count)}
-
-
-def in_config(plain: dict[str, Any], count: int) -> None:
-    plain["provenance"]["config"]["all"] = list(range(count))
-
-
-def in_views(plain: dict[str, Any], count: int) -> None:
-    plain["per_view"] = [{"name": "a"}] * count
-
-
-@pytest.mark.parametrize("harm", [in_tried, in_compared, in_protocol, in_config, in_views])
-def test_a_record_with_endless_entries_is_refused(harm: Callable[[dict[str, Any], int], None], tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", ENDLESS)
+def test_a_record_with_endless_entries_is_refused(part: str, tmp_path: Path) -> None:
     """Catches a record whose lists hold a report for a minute and take a gigabyte."""
     path = tmp_path / "record.json"
     record.write(study.read(Path(__file__).parents[2] / "results" / "published" / "effects")[0][0], path)
     plain = json.loads(path.read_text())
     record.read(path)
-    harm(plain, 20_000)
+    ENDLESS[part](plain, 20_000)
     path.write_text(json.dumps(plain))
     with pytest.raises(InputError, match=r"at most 10,000 entries, got 20,000|(array|object) of length <= \d+"):
         record.read(path)
 
 
-def test_a_claim_names_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an error on a read-only folder that names a file which the user has never seen."""
-
-    def refused(self: Path, _: bytes) -> int:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
-
-    monkeypatch.setattr(Path, "write_bytes", refused)
-    with pytest.raises(OSError, match="Read-only file system") as caught:
-        atomic.create_atomically(tmp_path / "progress.json", b"")
-    assert caught.value.filename == str(tmp_path / "progress.json")
-
-
 def test_a_limit_of_the_address_space_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an export of 16384 x 16384 pixels under `ulimit -v` that ends in a stack trace."""
-    import resource
-
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1, 1))
     assert memory.available() == 0
     with pytest.raises(InputError, match=r"0\.0 GiB are available: lower"):
         memory.require(1 << 30, "frames", "lower --width")
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (MemoryError(), True),
+        (OSError(12, "Cannot allocate memory"), True),
+        (OSError(28, "No space left on device"), False),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), True),
+        (ImportError("No module named 'x'"), False),
+        (RuntimeError("can't start new thread"), True),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp:119] DefaultCPUAllocator: can't allocate memory"), True),
+        (RuntimeError("std::bad_alloc"), True),
+        (RuntimeError("shapes do not match"), False),
+        (InputError("model: expected a name"), False),
+    ],
+)
+def test_what_says_that_there_is_no_memory(error: Exception, expected: bool) -> None:
+    """Catches a library that says it in words of its own, which was a stack trace."""
+    assert is_out_of_memory(error) == expected
+
+
+def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches `copy or render it again` for a file that is right."""
+
+    def full(*_: object) -> None:
+        error = cv2.error("Failed to allocate 7680000 bytes")
+        error.code = cv2.Error.StsNoMem
+        raise error
+
+    monkeypatch.setattr(images, "photo_size", lambda *_: (1, 1))
+    monkeypatch.setattr(cv2, "imdecode", full)
+    with pytest.raises(MemoryError, match=r"r_0\.png: OpenCV has none"):
+        images.decode_photo(b"png", "r_0.png")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("megabytes", [300, 400, 700, 1000, 1279, 1280, 1300, 1400, 1600, 2000])
+def test_too_little_memory_is_one_line(megabytes: int, square: Path, tmp_path: Path) -> None:
+    """Catches a stack trace or a signal, wherever the memory ends: as torch is loaded, the scene, in a step."""
+    words = overrides(square, tmp_path / "r", "model=7dgs")
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (megabytes << 20, megabytes << 20))
+
+    done = subprocess.run(
+        command(*words), capture_output=True, text=True, cwd=ROOT, env=environment(), preexec_fn=limit, check=False
+    )
+    assert done.returncode in (0, 1), done.stderr
+    assert "Traceback" not in done.stderr
+    for path in record.find(tmp_path / "r"):
+        assert record.read(path).status in ("ok", "failed")
+    assert done.returncode or megabytes >= 1280
+    if done.returncode:
+        errors = [line for line in done.stderr.splitlines() if line.startswith("gsbench: error:")]
+        assert len(errors) == 1
+        assert "out of memory" in errors[0]

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import hydra
 import pytest
@@ -34,12 +35,7 @@ SAMPLE, ALL = 30, 700
 NUMBERS = ("0", "1", "-1", "2", "0.5", "1e-3", "1e39", "-1e-9", "nan", "inf", "-inf", "1.5", "9223372036854775807",
            "9223372036854775808", "1e400", "100000", "true", "null", "abc", "''", "[]", "{a: 1}", "no", "'\\0'",
            "../..", "pkg://nosuch", "/dev/zero", "/proc/self/mem", "cuda:7", "cpu:5", "é")  # fmt: skip
-LONG = (
-    "train.iterations",
-    "train.recipe_iterations",
-    "data.initial_points",
-    "protocol.renders",
-)  # would only take long
+LONG = ("train.iterations", "train.recipe_iterations", "data.initial_points", "protocol.renders")  # many are slow
 SECONDS = 60
 
 
@@ -97,8 +93,9 @@ def end(words: list[str], square: Path, results: Path) -> str:
     return done.status
 
 
-def check(seeds: range, square: Path, tmp_path: Path) -> dict[str, int]:
-    """Do the cases of some seeds; how many ended in which way."""
+@pytest.mark.parametrize("seeds", [range(SAMPLE), pytest.param(range(SAMPLE, ALL), marks=pytest.mark.slow)])
+def test_hostile_overrides_are_refused_or_run(seeds: range, square: Path, tmp_path: Path) -> None:
+    """Catches a stack trace, a hang, and a training that ends well and is then lost."""
     known, ends = keys(), dict.fromkeys(("refused", "ok", "failed", "diverged"), 0)
 
     def give_up(_: int, __: FrameType | None) -> None:
@@ -118,58 +115,36 @@ def check(seeds: range, square: Path, tmp_path: Path) -> dict[str, int]:
                 signal.alarm(0)
     finally:
         signal.signal(signal.SIGALRM, before)
-    return ends
-
-
-def test_a_sample_of_hostile_overrides_is_refused_or_runs(square: Path, tmp_path: Path) -> None:
-    """Catches a stack trace, a hang, and a training that ends well and is then lost."""
-    ends = check(range(SAMPLE), square, tmp_path)
-    assert ends["refused"] + ends["failed"] > SAMPLE / 4
+    assert ends["refused"] + ends["failed"] > len(seeds) / 4
     assert ends["ok"] > 0
-
-
-@pytest.mark.slow
-def test_all_hostile_overrides_are_refused_or_run(square: Path, tmp_path: Path) -> None:
-    """The same for many more."""
-    check(range(SAMPLE, ALL), square, tmp_path)
 
 
 def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a disk without room for a record that ends the whole sweep in a stack trace, or loses the training."""
+    composed, fsync = hydra.compose("config", overrides(square, tmp_path, "model=3dgs", "train.iterations=3")), os.fsync
 
     def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    composed = hydra.compose("config", overrides(square, tmp_path, "model=3dgs", "train.iterations=3"))
-    with monkeypatch.context() as patched:
-        patched.setattr(record, "write", full)
-        with pytest.raises(InputError, match="its record cannot be written: No space left on device"):
-            execute(identify(composed))
-        assert len(list(tmp_path.rglob("checkpoint.pt"))) == 1
-    done = execute(identify(composed))
-    assert done is not None
-    assert done.status == "ok"
-    fsync = os.fsync
+        raise OSError(errno.ENOSPC, "No space left on device")  # as the system does, which names no file
 
     def full_for_checkpoints(descriptor: int) -> None:
         if os.fstat(descriptor).st_size > 10_000:
-            raise OSError(errno.ENOSPC, "No space left on device")  # as the system does, which names no file
+            full()
         fsync(descriptor)
 
-    with monkeypatch.context() as patched:
-        patched.setattr("gsbench.measure.atomic.os.fsync", full_for_checkpoints)
-        composed.seed = 1
-        done = execute(identify(composed))
-    assert done is not None
+    def run(seed: int, place: Any, name: str, replacement: Any) -> Any:
+        composed.seed = seed
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, replacement)
+            return execute(identify(composed))
+
+    with pytest.raises(InputError, match="its record cannot be written: No space left on device"):
+        run(0, record, "write", full)
+    assert len(list(tmp_path.rglob("checkpoint.pt"))) == 1
+    assert run(0, os, "fsync", fsync).status == "ok"
+    failed = run(1, os, "fsync", full_for_checkpoints)
     (path,) = (written.with_name(checkpoint.FILE_NAME) for written in tmp_path.rglob("seed1/record.json"))
-    assert (done.status, done.reason) == ("failed", f"{path}: No space left on device")
-    with monkeypatch.context() as patched:
-        patched.setattr(checkpoint, "save", full)
-        composed.seed = 2
-        done = execute(identify(composed))
-    assert done is not None
-    assert done.reason == f"{path.parents[1] / 'seed2'}: No space left on device"
-    with monkeypatch.context() as patched:
-        patched.setattr(progress, "create_atomically", full)
-        with pytest.raises(InputError, match=r"seed2: the run cannot be claimed: .*No space left on device"):
-            execute(identify(composed))
+    assert (failed.status, failed.reason) == ("failed", f"{path}: No space left on device")
+    failed = run(2, checkpoint, "save", full)
+    assert failed.reason == f"{path.parents[1] / 'seed2'}: No space left on device"
+    with pytest.raises(InputError, match=r"seed3: the run cannot be claimed: .*No space left on device"):
+        run(3, progress, "create_atomically", full)
