@@ -88,10 +88,10 @@ def with_half(row: pd.Series, name: str = "psnr_db") -> str:
 
 
 def change(test: pd.Series, digits: int = 2) -> str:
-    """Return a difference with its interval, bold if it is significant."""
+    """Return a difference with half its interval over three or more scenes, bold if it is significant."""
     shown = number(test["mean"], digits, signed=True)
     shown = f"**{shown}**" if test.significant else shown
-    return f"{shown} ({number(test.low, digits)} to {number(test.high, digits)})"
+    return f"{shown} ± {number((test.high - test.low) / 2, digits)}"
 
 
 # ---- mini and frontier
