@@ -29,7 +29,7 @@ TIMEOUT = 10  # seconds for the compiler to say its version
 COMMAND = "gsbench.__main__:main"  # that of this project in the metadata of its distribution
 COMPILERS = ("c++", "g++", "clang++")
 INSTALL = "pip install -c constraints.txt . (docs/install.md)"
-LARGEST_ERROR = 1e-4  # between the images of two backends, as in docs/adding_a_kernel.md
+LARGEST_ERROR = 1e-4  # between the images of two backends
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ class Gating(Hook):
 
         Args:
             by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
-                no frame time, and nearly doubles the time of this function (docs/effects.md).
+                no frame time, and nearly doubles the time of this function.
         """
         training = self.training
         self.model.set_active(training.schedule.active(training.step - 1))

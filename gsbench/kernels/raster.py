@@ -147,7 +147,7 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
 def backward_by_splat() -> Iterator[None]:
     """In a `with` block, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
 
-    The gradients are the same. docs/gpu.md says why one thread per pixel is the default.
+    The gradients are the same; results/published/benchmarks/gpu.md has the times of both.
     """
     before, _blend.backward_kernel = _blend.backward_kernel, "blend_backward_by_splat"
     try:

@@ -40,7 +40,7 @@ SAVE_S = 2.0  # seconds between two files that are sent, so that they do not wai
 JPEG_MOVING, JPEG_AT_REST = 75, 95  # quality
 MOVING_MS = 40.0  # time limit of a frame while something moves
 FLOAT32_MS = 3000.0  # about what the bound on the error of float32 may take
-FLOAT32_FRAMES = 20  # that bound takes about as long as so many frames (docs/stability.md)
+FLOAT32_FRAMES = 20  # that bound takes about as long as so many frames (9 to 20 were measured)
 LEAST_PIXELS = 96 * 96
 MOST_PIXELS = 3840 * 2160  # of a frame at rest; a larger window shows it enlarged
 

@@ -13,7 +13,7 @@ from mpmath import mp, mpf
 
 DIGITS = 120
 STEP = mpf(10) ** -30
-LOG_SIZE_MAX = 16  # larger log sizes act as this one, by definition (docs/stability.md)
+LOG_SIZE_MAX = 16  # larger log sizes act as this one, by definition
 TIME_OPACITY_FACTOR_MIN = mpf("0.05")  # 4DGS culls a Gaussian unless its f_temp is above this
 UNDEFINED = mpf(10) ** -20  # |v|^2 of a vector too short to have a direction; it becomes zero
 FADING = mpf(35) / 100  # lambda_o of dGS

@@ -35,7 +35,7 @@ SEEDS = (0, 1, 2)  # of the trainings whose drift is measured
 SHAKEN = (1, 2, 3)  # seeds of the changes of start values
 # Start values are changed by at most this part. In ten steps of 7DGS on suzanne, float32 changes gradients by 4e-6 of
 # each (median, two seeds), a change of start values by 16 U changes them by 2e-6, and one by 64 U by 8e-6. After a
-# smaller change, trainings stay on the side of a threshold on which float32 puts them (docs/stability.md).
+# smaller change, trainings stay on the side of a threshold on which float32 puts them.
 SHAKE = 64 * U
 CHANCE = 0.01  # the probability that a model without a drift is taken for one that has a drift
 ENDS = {"forward": 0.0, "gradient": math.nan}  # the bound: the training ends as expected
