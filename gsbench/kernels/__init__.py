@@ -22,11 +22,7 @@ def available() -> bool:
 
 
 def native() -> ModuleType:
-    """Return the compiled extension with the CPU kernels.
-
-    Raises:
-        InputError: the extension is not built.
-    """
+    """Return the compiled extension with the CPU kernels; raises InputError if it is not built."""
     if _native is None:
         raise InputError("the native kernels are not built in this installation: reinstall with a C++20 compiler, "
                          "or go on with raster.backend=reference", docs="install.md#without-a-compiler")  # fmt: skip
@@ -39,12 +35,9 @@ def instruction_set() -> str | None:
 
 
 def use_instruction_set(name: str) -> None:
-    """Select the instruction set of the CPU kernels: `v2`, `v3` or `v4` (x86-64 levels).
+    """Select the instruction set of the CPU kernels, as the environment variable GSBENCH_ISA does: `v2`, `v3` or `v4`.
 
-    The default is the best one that the processor supports. The environment variable GSBENCH_ISA has the same effect.
-
-    Raises:
-        InputError: the kernels are not built for this instruction set, or the processor does not support it.
+    The default is the best one that the processor supports. Raises InputError for one that is not built or supported.
     """
     known = native().instruction_sets()
     if name not in known:

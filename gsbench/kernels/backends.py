@@ -43,8 +43,7 @@ BACKENDS = {backend.name: backend for backend in (AUTO, REFERENCE, CPU, CUDA)}
 def resolve(name: str, device: str = "cpu") -> Backend:
     """Return the backend with this name for a device type; "auto" becomes the fastest installed one.
 
-    Raises:
-        InputError: the backend does not exist, is not installed, or does not work on the device.
+    Raises InputError if the backend does not exist, is not installed, or does not work on the device.
     """
     if name not in BACKENDS:
         raise InputError(f"raster backend '{name}' is not known. {did_you_mean(name, BACKENDS)}")

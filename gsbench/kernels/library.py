@@ -27,11 +27,7 @@ class Library:
         self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Run a kernel on the device of `like`; `slots` holds the value of each kernel argument by name.
-
-        Raises:
-            InputError: the kernel does not support these sizes or options.
-        """
+        """Run a kernel on the device of `like`; raises InputError if it does not support these sizes or options."""
         slots["threads"] = torch.get_num_threads()
         run = partial(self._run, name, *[slots[field] for field in self._fields[name]])
         run()
@@ -63,7 +59,7 @@ class CudaLibrary(Library):
     """The compiled kernels for tensors on a GPU; they are enqueued on torch's current stream."""
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Enqueue a kernel on the device of `like`; `slots` holds the value of each kernel argument by name."""
+        """Enqueue a kernel on the device of `like`."""
         slots["threads"] = 1
         values = [slots[field] for field in self._fields[name]]
         if not like.is_cuda:  # tests run these kernels on the CPU
@@ -86,11 +82,7 @@ _LIBRARIES: dict[str, Library] = {}  # by device type, filled on first use
 
 
 def library_of(device: str) -> Library:
-    """Return the compiled kernels for a device type, "cpu" or "cuda".
-
-    Raises:
-        InputError: the kernels are not built, or there are none for the device type.
-    """
+    """Return the compiled kernels for a device type, "cpu" or "cuda"; raises InputError if there are none."""
     if device not in _LIBRARIES:
         if device not in ("cpu", "cuda"):
             raise InputError(f"expected tensors on the CPU or a CUDA device, got them on '{device}'")

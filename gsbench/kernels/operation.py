@@ -377,13 +377,7 @@ def addresses(tensors: Sequence[Tensor]) -> tuple[int, ...]:
 
 
 def first_rows(name: str, count: int, x: Tensor) -> int:
-    """Return how many rows (Gaussians) of a tensor a kernel changes, counted from the first.
-
-    `count` may be EVERY_ROW, which means all rows of the tensor.
-
-    Raises:
-        InputError: the tensor has fewer than `count` rows.
-    """
+    """Return how many rows of a tensor a kernel changes: `count`, or all for EVERY_ROW; InputError if it has fewer."""
     N = x.shape[0] if x.dim() else 0
     if count != EVERY_ROW and not 0 <= count <= N:
         raise InputError(f"{name}: expected a number of rows from 0 to {N}, as there are, got {count}")

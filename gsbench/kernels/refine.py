@@ -67,11 +67,7 @@ class _Inputs(NamedTuple):
 
 
 class _Refine(Operation):
-    """The kernels of AGR (neural refinement), whose inputs are the fields of `_Inputs` in order.
-
-    Values that are equal for all Gaussians are merged into the weights of the MLPs first: the encoded time gamma(t)
-    into the biases of the first layers, and the scales `units` of inputs and outputs into the weights.
-    """
+    """The kernels of AGR (neural refinement), whose inputs are the fields of `_Inputs` in order."""
 
     def __init__(self) -> None:
         super().__init__("refine", inputs={}, outputs={}, numbers={"refined": int}, memory="refinements")
@@ -168,35 +164,21 @@ _refine = _Refine()
 
 
 def refine(
-    values: Tensors,  # of [N, c]; those of the first P - 1 are the features, F numbers in all
-    weight_in: Tensor,  # [P * 64, F + G]
+    values: Tensors,  # of [N, c]: raw parameters; the first P - 1 tensors, of F numbers in all, are also the features
+    weight_in: Tensor,  # [P * 64, F + G] the first layers of all MLPs
     bias_in: Tensor,  # [P * 64]
-    weight_out: Tensor,  # [sum of c, 64]
+    weight_out: Tensor,  # [sum of c, 64] the second layers, a row for each output
     bias_out: Tensor,  # [sum of c]
-    units: Tensor,  # [sum of c]
-    gamma: Tensor,  # [G]
+    units: Tensor,  # [sum of c] the scales of inputs and outputs: MLPs read and give numbers in these units
+    gamma: Tensor,  # [G] the encoded time
     *,
-    rows: int | None = None,
-    intervals: Tensor | None = None,  # [rows, 2] clips
-    time: Tensor | None = None,  # []
+    rows: int | None = None,  # only the first `rows` Gaussians change, the others are copied; None: all
+    intervals: Tensor | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
+    time: Tensor | None = None,  # [] of the view, required with `intervals`
 ) -> Tensors:  # of [N, c], as `values`
     """Change raw parameters of Gaussians by P small MLPs with ReLU, as AGR of 7DGS does (eq. 14 and 15).
 
-    Each MLP has F + G inputs (F features of the Gaussian, G numbers that encode the time) and 64 hidden units. Its
-    output is added to the parameters. MLP number i changes `values[i]`; the last MLP changes all remaining tensors of
-    `values`.
-
-    Args:
-        values: raw parameters; the first P - 1 tensors are also the features.
-        weight_in: the first layers of all MLPs, 64 rows each.
-        bias_in: the biases of the first layers.
-        weight_out: the second layers, one row for each output.
-        bias_out: the biases of the second layers.
-        units: a scale for each number: MLPs read the number divided by its scale, and their output is multiplied by it.
-        gamma: the encoded time, equal for all Gaussians.
-        rows: how many Gaussians, counted from the first, are changed (default: all); the others are copied.
-        intervals: the first and last time at which each of these Gaussians is changed; None for always.
-        time: the time of the view, required with `intervals`.
+    MLP number i adds its output to `values[i]`, the last one to all remaining tensors.
 
     Raises:
         InputError: tensors are not float32 on one device, their shapes do not match, or there are fewer than `rows`

@@ -197,7 +197,8 @@ class GaussianModel(nn.Module, ABC):
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, query.center, degree, orders=self.orders)
+            return show_colors(raw["sh0"], raw["shN"], means, opacities, center=query.center, degree=degree,
+                               orders=self.orders)[0]  # fmt: skip
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.orders)
 
     # ---- what every model does
@@ -236,9 +237,6 @@ class GaussianModel(nn.Module, ABC):
 
         Other parameters, such as mean times and directions, start as in `initialise`. SH coefficients above the model's
         degree are left out.
-
-        Raises:
-            InputError: there are fewer than four Gaussians.
         """
         self.initialise(Points(trained.means, (0.5 + SH_C0 * trained.dc).clamp(0, 1)), extent, generator)
         raw = {name: parameter.data for name, parameter in self.splats.items()}
@@ -250,11 +248,7 @@ class GaussianModel(nn.Module, ABC):
             raw[name].copy_(value)
 
     def slice(self, query: CameraTime) -> Gaussians3D:
-        """Slice the model at the camera centre and time of `query`: return 3D Gaussians for the rasterizer.
-
-        Raises:
-            InputError: the model depends on time and the query has none.
-        """
+        """Slice the model at the camera centre and time of `query`: return 3D Gaussians for the rasterizer."""
         if query.time is None and ("time" in self.observes or self.agr):
             raise InputError(f"{type(self).__name__}: expected a time in [0, 1], got none: this model observes time")
         raw = self.refined(query)
@@ -318,11 +312,7 @@ class GaussianModel(nn.Module, ABC):
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:
-        """Add lambda_t or lambda_d (of `time` or `direction`), the coefficient in the exponent of the opacity factor.
-
-        Raises:
-            InputError: `value` is not a positive number.
-        """
+        """Add lambda_t or lambda_d (of `time` or `direction`), the coefficient in the exponent of an opacity factor."""
         check_positive(value, f"lambda_{name[0]}")
         self.log_lambda[name] = nn.Parameter(torch.tensor(math.log(value)))
 
@@ -384,11 +374,7 @@ class GaussianModel(nn.Module, ABC):
         return sum(x.numel() * x.element_size() for name, x in self.pack().items() if name not in constants)
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Load the tensors that `pack` returned, for any number of Gaussians.
-
-        Raises:
-            InputError: the tensors belong to another model.
-        """
+        """Load what `pack` returned, of any number of Gaussians; raises InputError if it is of another model."""
         means = state.get("splats.means")
         N = len(means) if isinstance(means, Tensor) and means.dim() else 0
         present = self.state_dict()

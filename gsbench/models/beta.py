@@ -103,14 +103,13 @@ def shift_weights(betas: Tensor) -> Tensor:
     return (exponents(betas[:, 1:]) / LARGEST_SHIFT).clamp(max=1)
 
 
-def opacity_factor(white: Tensor, betas: Tensor) -> Tensor:
-    """Compute the opacity factor prod_i (1 - tanh(y_i^2))^b_i, [N], as in UBS.
+def opacity_factor(
+    white: Tensor,  # [N, C] whitened distances y of the direction and time of a query from their means
+    betas: Tensor,  # [N, 1 + C] the parameters of the exponents; the first is that of the alpha profile
+) -> Tensor:  # [N]
+    """Compute the opacity factor prod_i (1 - tanh(y_i^2))^b_i, as in UBS.
 
     With x = y^2, ln(1 - tanh(x)) = -ln(1 + (e^2x - 1) / 2) loses no digits of a small x, which a large b multiplies.
-
-    Args:
-        white: whitened distances y of the direction and time of a query from their means, [N, C].
-        betas: the parameters of the exponents, [N, 1 + C]; the first is that of the alpha profile.
     """
     doubled = (2 * white.square()).clamp(max=FADED)
     logs = (-log1p(torch.expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
@@ -158,18 +157,16 @@ class UniversalBetaModel(BetaModel):
     kernel = slice_universal
 
     def __init__(
-        self, *, time_size: float = 1.0, view_size: float = 1.0, modulation: str = "whitened", **options: Any
+        self,
+        *,
+        time_size: float = 1.0,  # the initial size of the Gaussians in time
+        view_size: float = 1.0,  # their initial size in direction
+        # Where B acts. `whitened`: as in the class. `raw`: mean = mu_p + K B delta and cov = S_pp - K B S_qp with
+        # K = S_pq S_qq^-1, as in the authors' code. This matrix is not symmetric; its upper triangle is used, and where
+        # that is indefinite the Gaussian becomes flat.
+        modulation: str = "whitened",
+        **options: Any,
     ) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            time_size: the initial size of the Gaussians in time.
-            view_size: their initial size in direction.
-            modulation: where B acts. `whitened`: as in the class. `raw`: mean = mu_p + K B delta and cov = S_pp - K B
-                S_qp with K = S_pq S_qq^-1, as in the authors' code. This matrix is not symmetric; its upper triangle is
-                used, and where that is indefinite the Gaussian becomes flat.
-            options: the options of `GaussianModel`.
-        """
         super().__init__(**options)
         if modulation not in MODULATIONS:
             raise InputError(f"modulation '{modulation}' is not known. {did_you_mean(modulation, MODULATIONS)}")

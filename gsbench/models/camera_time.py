@@ -19,10 +19,6 @@ class CameraTime(NamedTuple):
 
     `CameraTime.of` takes a camera, and `CameraTime.at` a position; both check their arguments.
 
-    Args:
-        center: the position of the camera [3], world units.
-        time: the time in [0, 1], a tensor []; None if the scene has no time.
-
     Example:
         >>> import torch
         >>> from gsbench import CameraTime
@@ -44,11 +40,7 @@ class CameraTime(NamedTuple):
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> CameraTime:
-        """Take a position [3] and a time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it.
-
-        Raises:
-            InputError: the position is not a tensor [3], or the time is not a finite number.
-        """
+        """Take a position [3] and a time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it."""
         check_tensor(center, "query: center")
         if center.shape != (3,):
             raise InputError(f"query: center: expected shape [3], got {list(center.shape)}")

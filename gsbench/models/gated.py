@@ -179,11 +179,7 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
-    """Read from a checkpoint which Gaussians depend on time, direction and AGR (a network); None if not stored.
-
-    Raises:
-        InputError: the stored tensors are damaged.
-    """
+    """Read from a checkpoint which Gaussians depend on time, direction and AGR (a network); None if not stored."""
     stored = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
     if not stored:
         return None

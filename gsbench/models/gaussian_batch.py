@@ -53,11 +53,7 @@ def reach(beta_exponents: Tensor) -> Tensor:
 
 
 def joined_exponents(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are None.
-
-    Raises:
-        InputError: only one of the groups has exponents.
-    """
+    """Concatenate the exponents b of the alpha profiles (1 - r^2)^b of two groups of Gaussians; None if both are."""
     if first is None and second is None:
         return None
     if first is None or second is None:

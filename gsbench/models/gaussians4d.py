@@ -178,8 +178,9 @@ class Gaussians4DModel(JointModel, gates=True):
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
-            return show_colors(sh0, raw["shN"], means, opacities, query.center, degree, raw["times"], query.time, waves,
-                               self.orders)  # fmt: skip
+            timed = {"times": raw["times"], "time": query.time} if waves > 1 else {}
+            return show_colors(sh0, raw["shN"], means, opacities, center=query.center, degree=degree, waves=waves,
+                               orders=self.orders, **timed)[0]  # fmt: skip
         coefficients = torch.cat([sh0, raw["shN"]], 1).unflatten(1, (waves, -1))
         directions = unit(means - query.center)
         return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)

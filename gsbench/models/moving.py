@@ -148,16 +148,17 @@ class DirectModel(MovingGaussians3D, gates=True):
     moving = ("times", "directions", "precision", "coupling", "shares")
     kernel = slice_direct
 
-    def __init__(self, *, coupling: str = "text", view_precision: float = 1.0, **options: Any) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            coupling: how the mean moves. `text`: by the formula of the class. `interpolated`: by V_pq ((1 - Lam) delta
-                + Lam V_qq delta), as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
-            view_precision: the initial diagonal of L over direction. The authors use 0.02 for D-NeRF, 2.5 for the cloud
-                of 7DGS-PBR, 0.4 for its other scenes, and 1.0 elsewhere.
-            options: the options of `GatedModel`.
-        """
+    def __init__(
+        self,
+        *,
+        # How the mean moves. `text`: by the formula of the class. `interpolated`: by V_pq ((1 - Lam) delta + Lam V_qq
+        # delta), as the comments of the authors' code say. `none`: not at all (the authors' dGS-O).
+        coupling: str = "text",
+        # The initial diagonal of L over direction. The authors use 0.02 for D-NeRF, 2.5 for the cloud of 7DGS-PBR, 0.4
+        # for its other scenes, and 1.0 elsewhere.
+        view_precision: float = 1.0,
+        **options: Any,
+    ) -> None:
         super().__init__(**options)
         if coupling not in COUPLINGS:
             raise InputError(f"coupling '{coupling}' is not known. {did_you_mean(coupling, COUPLINGS)}")
@@ -257,14 +258,8 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
     moving: ClassVar[tuple[str, ...]] = ("times", "directions", "precision", "coupling")
     kernel = slice_direct_beta
 
+    # The authors' initial diagonals of L over direction are those of dGS, but 1.0 for D-NeRF.
     def __init__(self, *, view_precision: float = 1.0, **options: Any) -> None:
-        """Make a model without Gaussians.
-
-        Args:
-            view_precision: the initial diagonal of L over direction. The authors use 2.5 for the cloud of 7DGS-PBR, 0.4
-                for its other scenes, and 1.0 elsewhere.
-            options: the options of `GatedModel`.
-        """
         super().__init__(**options)
         check_positive(view_precision, "view_precision")
         self.view_precision = view_precision

@@ -46,11 +46,7 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
 
 
 def is_registered(name: str) -> bool:
-    """Return whether gsbench, an installed package or an imported module has registered a model as `name`.
-
-    Raises:
-        InputError: the models of an installed package cannot be imported.
-    """
+    """Return whether gsbench, an installed package or an imported module has registered a model as `name`."""
     _import_all()
     return name in _REGISTRY
 

@@ -75,7 +75,7 @@ def read_trained(path: Path) -> TrainedGaussians:
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
-    left_out = _check_columns(names, [name for group in _COLUMNS.values() for name in group], path)
+    left_out = _check_columns(names, path)
     if left_out:
         print(f"{path}: columns that change no image are left out: {_shortened(left_out)}", file=sys.stderr)
     if networks := _deformations(path):
@@ -185,14 +185,9 @@ def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Te
     return torch.from_numpy(columns(vertices, names, path, _LARGEST).astype(np.float32))
 
 
-def _check_columns(names: Sequence[str], needed: Sequence[str], path: Path) -> list[str]:
-    """Return the columns of a file that change no image and that gsbench leaves out.
-
-    Args:
-        names: the columns of the file.
-        needed: the columns of 3DGS without `f_rest_*`.
-        path: the file, for messages.
-    """
+def _check_columns(names: Sequence[str], path: Path) -> list[str]:
+    """Check that a file has the columns of 3DGS; return those that change no image and that gsbench leaves out."""
+    needed = [name for group in _COLUMNS.values() for name in group]
     if any(map(_PACKED.fullmatch, names)):
         raise compressed(path, "SuperSplat's columns packed_*")
     for method, pattern in _METHODS.items():

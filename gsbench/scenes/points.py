@@ -40,17 +40,16 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
     return Points(means=(2 * draws[0] - 1) * float(half_width), colors=0.5 + SH_C0 * draws[1] / 255)
 
 
-def frustum_points(count: int, cameras: Sequence[Camera], radius: float, generator: torch.Generator) -> Points:
+def frustum_points(
+    count: int,
+    cameras: Sequence[Camera],  # of the training views
+    radius: float,  # of the cameras around their mean, world units
+    generator: torch.Generator,
+) -> Points:
     """Draw `count` nearly grey points in the part of space that all cameras see, for a scene without known points.
 
     A point lies on the ray through a random pixel of a random camera. Its inverse depth is uniform between
     1 / (NEAREST radius) and 1 / (FARTHEST radius).
-
-    Args:
-        count: the number of points.
-        cameras: the cameras of the training views.
-        radius: the radius of the cameras around their mean, world units.
-        generator: the source of all random numbers.
     """
     K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]

@@ -212,15 +212,13 @@ def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
     )
 
 
-def _read_split(root: Path, name: str, finder: ImageFinder, keys: frozenset[str] = frozenset()) -> Split:
-    """Read and check a file of cameras in the folder `root`.
-
-    Args:
-        root: the scene's folder, resolved.
-        name: the file, such as transforms_train.json.
-        finder: finds the images.
-        keys: keys of the whole file that the caller reads; others that are not known get a note.
-    """
+def _read_split(
+    root: Path,  # the scene's folder, resolved
+    name: str,  # of the file, such as transforms_train.json
+    finder: ImageFinder,
+    keys: frozenset[str] = frozenset(),  # of the whole file that the caller reads; unknown others get a note
+) -> Split:
+    """Read and check a file of cameras."""
     source = root / name
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
@@ -373,12 +371,8 @@ def _split_views(
 def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], source: str, where: str) -> Intrinsics:
     """Read the intrinsics of a frame: focal lengths or fields of view, principal point and size.
 
-    Args:
-        content: the JSON object of the whole file.
-        frame: the JSON object of the frame, whose keys come first. A focal length there also replaces the file's field
-            of view along this axis, and the reverse.
-        source: the file, for messages.
-        where: the file and the frame, for messages.
+    The keys of the frame come before those of the whole file, `content`. A focal length there also replaces the file's
+    field of view along this axis, and the reverse.
     """
     of_frame = _LENS_KEYS & frame.keys()
     replaced = {key for axis in _AXES if of_frame & {*axis} for key in axis} | of_frame

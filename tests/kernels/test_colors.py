@@ -26,9 +26,9 @@ def color_inputs(waves: int, dtype: torch.dtype, N: int = 21) -> list[Tensor]:
 def shown(inputs: list[Tensor], opacities: Tensor, degree: int, waves: int, orders: Tensor | None = None) -> Tensor:
     """Colours by the kernels, on the device of the inputs, [N, 3]."""
     to = inputs[0].device
-    timed = (inputs[3], TIME.to(to)) if waves > 1 else (None, None)
-    return show_colors(*inputs[:3], opacities.to(to), CENTER.to(to), degree, *timed, waves,
-                       None if orders is None else orders.to(to))  # fmt: skip
+    timed = {"times": inputs[3], "time": TIME.to(to)} if waves > 1 else {}
+    return show_colors(*inputs[:3], opacities.to(to), center=CENTER.to(to), degree=degree, waves=waves,
+                       orders=None if orders is None else orders.to(to), **timed)[0]  # fmt: skip
 
 
 def exactly(inputs: list[Tensor], degree: int, waves: int, kept: Tensor | float = 1.0) -> Tensor:
@@ -146,7 +146,7 @@ def test_coefficients_and_orders_that_do_not_fit_are_refused() -> None:
         shown([sh0, shN[:, :6], means, torch.zeros(21, 1)], torch.ones(21), 0, 2)
     for times, time in ((None, None), (torch.zeros(0), torch.zeros(0)), (torch.zeros(0), TIME)):
         with pytest.raises(InputError, match="times"):
-            show_colors(sh0, shN, means, torch.ones(21), CENTER, 0, times, time, 2)
+            show_colors(sh0, shN, means, torch.ones(21), times, CENTER, time, degree=0, waves=2)
     for orders in (torch.zeros(21), torch.zeros(20, dtype=torch.int32), torch.zeros(21, dtype=torch.int64)):
         with pytest.raises(InputError, match="orders"):
             shown([sh0, shN, means], torch.ones(21), 3, 1, orders)

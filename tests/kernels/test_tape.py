@@ -169,8 +169,9 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
     def loss() -> Tensor:
         factors, faded = slice_static(2 * scales, quats, opacities)  # torch before an operation
         moved = means + (factors @ factors.mT).sum(-1) * faded[:, None]  # and after it
-        colors = show_colors(sh0, shN, moved, faded, torch.zeros(3), 3)
-        again = show_colors(sh0, shN, 3 * moved + 1, faded, torch.zeros(3), 3)  # coefficients that are read twice
+        colors = show_colors(sh0, shN, moved, faded, center=torch.zeros(3), degree=3)[0]
+        # coefficients that are read twice
+        again = show_colors(sh0, shN, 3 * moved + 1, faded, center=torch.zeros(3), degree=3)[0]
         return (colors * again.square()).sum() + means.square().sum()
 
     expected = torch.autograd.grad(loss(), leaves)
@@ -214,7 +215,8 @@ def test_what_is_added_does_not_depend_on_what_is_there() -> None:
 
     def gradient(sums: dict[int, Tensor]) -> Tensor:
         with Tape() as tape:
-            shown = [show_colors(sh0, shN, place, faded, torch.zeros(3), 3) for place in (means, 3 * means + 1)]
+            shown = [show_colors(sh0, shN, place, faded, center=torch.zeros(3), degree=3)[0]
+                     for place in (means, 3 * means + 1)]  # fmt: skip
             value = (shown[0] * shown[1].square()).sum()
         tape.backward(value, torch.ones(()), [sh0, shN], sums)
         return sums[id(sh0)]
