@@ -167,6 +167,7 @@ def test_orders_leave_out_what_is_above_them() -> None:
 PACKED = st.integers(0, MOST_PACKED)
 
 
+@PROPERTY
 @given(PACKED, st.lists(PACKED, min_size=1))
 def test_an_order_is_one_number(packed: int, others: list[int]) -> None:
     """Catches a packing that loses an order, for ints and for tensors; a limit that compares the numbers themselves,

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from numerics import colors, curves, pictures, population, slices, trainings
 from numerics.cases import CASES, Case, Cell, of_area, present
-from numerics.slice_cases import JOINT
+from numerics.slices import JOINT
 
 MILLION = 1_000_000
 NOT_DEFAULT = 100_000  # Gaussians that are sliced in the factor order that is not the default
@@ -33,7 +33,6 @@ class Audit:
     cells: list[Cell] = field(default_factory=list)
     verified: dict[str, float] = field(default_factory=dict)  # errors of float64 against mpmath, by order or model
     conditions: list[curves.ConditionCurve] = field(default_factory=list)
-    accuracy: list[curves.AccuracyPoint] = field(default_factory=list)
     safety: list[curves.SliceTime] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -125,7 +124,6 @@ def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -
         *_hard_slices(audit, counts | dict.fromkeys(population.MOVING, min(million, MOVING))),
         ("error by condition number", lambda: audit.conditions.extend(curves.by_condition())),
         ("drift of float32", lambda: audit.cells.extend(drifts.result())),
-        ("error by time", lambda: audit.accuracy.extend(curves.accuracy_for_time(backends))),
         ("cost of safety", lambda: audit.safety.extend(curves.safety(backends))),
     ]
 

@@ -1,16 +1,14 @@
-"""Write the results of the audit as tables, JSON and plots, and as a Markdown page that shows them all."""
+"""Write the results of the audit as tables, JSON and a plot, and as a Markdown page that shows them all."""
 
 import io
 import json
 import os
-from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.machine import processor_name
@@ -26,27 +24,25 @@ LEAST, MOST = 1e-16, 1e3  # the range of plotted errors; values outside are plot
 
 
 def write(audit: Audit, folder: Path) -> None:
-    """Write the tables, the JSON, the plots and the Markdown page to a folder."""
+    """Write the tables, the JSON, the plot and the Markdown page to a folder."""
     rows = [[getattr(cell, name) for name in COLUMNS] for cell in audit.cells]
     provenance = {"processor": processor_name(), "git_commit": git_commit(), "versions": versions()}
     write_atomically(folder / "table.md", table(audit).encode())
     write_atomically(folder / "table.csv", pd.DataFrame(rows, columns=COLUMNS).to_csv(index=False).encode())
     write_atomically(folder / "audit.json", json.dumps(asdict(audit) | provenance, indent=1).encode())
-    for file, (_, _, plot) in PLOTS.items():
-        figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
-        plot(axes, audit)
-        png = io.BytesIO()
-        figure.savefig(png, format="png", dpi=110)
-        plt.close(figure)
-        write_atomically(folder / file, png.getvalue())
+    write_atomically(folder / "condition.png", plot(audit))
     write_atomically(folder / "page.md", page(audit).encode())
 
 
 def page(audit: Audit) -> str:
     """Return the report of the audit as Markdown."""
     lines = ["# Stability audit", "", verdict(audit), "", *conditions(audit), ""]
-    for file, (title, caption, _) in PLOTS.items():
-        lines += [f"## {title}", "", f"![{title}]({file})", "", caption, ""]
+    lines += [
+        "## Error against condition number", "", "![the error against the condition number](condition.png)", "",
+        "Relative error of the sliced covariance: 7DGS in float32 by torch, the factor in the paper's order, random "
+        "factors whose diagonals go down to 10^-8. Solid: median, dashed: 99th percentile, both on the left axis. "
+        "Dotted, on the right axis: share of covariances that are indefinite or not finite.", "",
+    ]  # fmt: skip
     cases = ["## the cases", "", "| case | what it stresses, and where it was met |", "| --- | --- |"]
     cases += [f"| {case.name} | {case.stresses} |" for area in AREAS for case in of_area(area)]
     return "\n".join([*lines, table(audit), *cases, ""])
@@ -139,65 +135,21 @@ def _costs(audit: Audit) -> list[str]:
     return [*lines, ""]
 
 
-# ---- plots
-
-
-def _by_condition(axes: Axes, audit: Audit) -> None:
-    """Plot errors (left axis) and the share of invalid covariances (right axis) over the condition number."""
+def plot(audit: Audit) -> bytes:
+    """Plot errors (left axis) and the share of invalid covariances (right axis) over the condition number, as a PNG."""
+    figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
     shares = axes.twinx()
     for curve in audit.conditions:
-        color = COLORS[curve.scheme]
-        axes.loglog(curve.condition, _in_range(curve.median), color=color, marker="o", markersize=3, label=curve.scheme)
-        axes.loglog(curve.condition, _in_range(curve.percentile99), color=color, linestyle="--")
+        color, (median, tail) = COLORS[curve.scheme], np.clip([curve.median, curve.percentile99], LEAST, MOST)
+        axes.loglog(curve.condition, median, color=color, marker="o", markersize=3, label=curve.scheme)
+        axes.loglog(curve.condition, tail, color=color, linestyle="--")
         shares.plot(curve.condition, [100 * x for x in curve.bad], color=color, linestyle=":")
     axes.set(xlabel="condition number of the factor", ylabel="relative error of the covariance", ylim=(1e-8, 10))
     shares.set(ylabel="indefinite or not finite, % (dotted)", ylim=(-2, 102))
     axes.grid(alpha=0.3)
     if audit.conditions:
         axes.legend(loc="upper left", title="solid: median, dashed: 99 %")
-
-
-def _by_time(axes: Axes, audit: Audit, thing: str) -> None:
-    """Plot errors over milliseconds as labelled points, one for each algorithm that conditions or renders Gaussians."""
-    points = sorted((point for point in audit.accuracy if point.thing == thing), key=lambda point: point.ms)
-    for i, (point, height) in enumerate(zip(points, _in_range([point.error for point in points]), strict=True)):
-        color = next((color for scheme, color in COLORS.items() if scheme in point.way), "tab:blue")
-        axes.scatter(point.ms, height, color=color, marker="s" if "float64" in point.way else "o")
-        # Labels of neighbours would overlap, so that of schur, which is near cholesky, goes above.
-        above = "schur" in point.way if thing == "slicing" else i % 2 == 0
-        aside = (6, 5 if above else -12)
-        axes.annotate(point.way, (point.ms, height), textcoords="offset points", xytext=aside, fontsize=8, color=color)
-    axes.set(xscale="log", yscale="log", xlabel="ms, forward and backward (square: float64)", ylabel="error")
-    left, right = axes.get_xlim()
-    axes.set_xlim(left, right * (right / left) ** 0.35)  # room for the labels
-    axes.margins(y=0.1)
-    axes.grid(alpha=0.3)
-
-
-def _in_range(errors: list[float]) -> list[float]:
-    return [min(max(error, LEAST), MOST) for error in errors]
-
-
-PLOTS: dict[str, tuple[str, str, Callable[[Axes, Audit], None]]] = {  # by file: title, caption
-    "condition.png": (
-        "Error against condition number",
-        "Relative error of the sliced covariance: 7DGS in float32 by torch, the factor in the paper's order, random "
-        "factors whose diagonals go down to 10^-8. Solid: median, dashed: 99th percentile, both on the left axis. "
-        "Dotted, on the right axis: share of covariances that are indefinite or not finite.",
-        _by_condition,
-    ),
-    "time_slicing.png": (
-        "Error against time: slicing",
-        "99.9th percentile of the covariance's relative error over 20,000 hard slices, against milliseconds forward "
-        "and backward. Lower left is better. The reference is the model in float64.",
-        partial(_by_time, thing="slicing"),
-    ),
-    "time_picture.png": (
-        "Error against time: pictures",
-        "Largest error of a pixel that no rounding can flip, 1,500 Gaussians at 96 x 96, against milliseconds forward "
-        "and backward. The native kernel's exp2 is a polynomial and torch's exp is exact to an ulp: the two cannot be "
-        "swapped within a backend, so backends stand for them. Tile bounds and the cut-offs at 1/255 and 1e-4 are "
-        "rules of the image and cannot be switched off.",
-        partial(_by_time, thing="picture"),
-    ),
-}
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=110)
+    plt.close(figure)
+    return png.getvalue()

@@ -20,7 +20,7 @@ from gsbench.models.factors import KINDS, CholeskyLayout
 from gsbench.models.slicing import SCHEMES
 from numerics import oracle, slices
 from numerics.cases import ONE_SCHEME, Bound, Cell, backends_with, device_of
-from numerics.slice_cases import LN_10, Observed, ordinary
+from numerics.slices import LN_10, Observed, ordinary
 
 Floats = NDArray[np.float64]
 CHUNK = 50_000  # Gaussians in one chunk, to limit memory
@@ -171,7 +171,7 @@ def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
     """Return the largest relative error of the float64 `truth` against mpmath, on the first `count` Gaussians."""
     some = hard.rows(slice(count))
     approximate = truth(some, order)
-    w, W = weights(count)
+    w, W = (x.numpy() for x in weights(count))
     exact, largest = _oracle(order), 0.0
     for i in range(count):
         raw = [some.log_diagonal[i], some.off_diagonal[i], torch.zeros(3), some.offset[i], torch.zeros(1)]
@@ -180,7 +180,7 @@ def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
         mean, cov = values[:3], values[3:12]
         weight = np.concatenate([w[i] / np.linalg.norm(mean), W[i].ravel() / np.linalg.norm(cov), [0]])
         gradient = np.array(oracle.gradient(exact, x, weight.tolist(), first=28), float)
-        for got, true in ((approximate.cov[i].ravel(), cov), (approximate.gradient[i], gradient)):
+        for got, true in ((approximate.cov[i].flatten().numpy(), cov), (approximate.gradient[i].numpy(), gradient)):
             largest = max(largest, float(np.linalg.norm(got - true) / np.linalg.norm(true)))
     return largest
 

@@ -13,8 +13,7 @@ from gsbench.models.appearance import sh_basis
 from gsbench.models.factors import KINDS
 from numerics import oracle, population
 from numerics.audit import CASES
-from numerics.slice_cases import Observed
-from numerics.slices import SliceTruth, exact_slice
+from numerics.slices import Observed, SliceTruth, exact_slice
 
 
 def row(observed: Observed, i: int) -> list[float]:

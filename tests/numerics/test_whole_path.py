@@ -15,7 +15,7 @@ from gsbench.train.losses import photometric
 from numerics import pictures, population, slices
 from numerics.audit import CASES
 from numerics.cases import of_area, present
-from numerics.slice_cases import COUNT, JOINT, Observed
+from numerics.slices import COUNT, JOINT, Observed
 
 WIDTH, HEIGHT = 16, 12
 SLICES = [(case.name, model) for case in of_area("slicing") for model in case.subjects]

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from numerics import picture_cases
+from numerics import pictures
 from numerics.cases import CASES, of_area
 from torch import Generator, Tensor
 
@@ -20,7 +20,7 @@ def scene(seed: int) -> dict[str, Any]:
         cases = CASES[PICTURES[_pick(g, len(PICTURES))]](severity, seed)
         return dict(cases[_pick(g, len(cases))])
     N = 1 + _pick(g, MOST)
-    arguments = picture_cases.crowd(g, N, 0.05 * 10 ** (1.5 * _number(g)))
+    arguments = pictures.crowd(g, N, 0.05 * 10 ** (1.5 * _number(g)))
     kinds = torch.randint(8, (N,), generator=g) if _pick(g, 2) else torch.full((N,), _pick(g, 8))
     _harden(arguments, kinds, g)
     if _pick(g, 2):

@@ -7,7 +7,7 @@ from typing import Any
 import hard_scenes
 import pytest
 import torch
-from numerics import brute, picture_cases
+from numerics import brute, pictures
 from numerics.cases import CASES
 from torch import Tensor
 
@@ -142,7 +142,7 @@ def test_a_branch_that_rounding_decides_is_named(branch: int) -> None:
 
 def test_the_culprit_is_the_gaussian_with_the_error() -> None:
     """Catches a culprit that is only the brightest, the nearest or the last Gaussian."""
-    arguments = picture_cases.crowd(torch.Generator().manual_seed(0), 5, 1.0)
+    arguments = pictures.crowd(torch.Generator().manual_seed(0), 5, 1.0)
     arguments["opacities"] = torch.full((5,), 0.3)
     single: Gaussians = tuple(arguments.get(name) for name in NAMES)
     exact = tuple(None if x is None else x.double() for x in single)
@@ -163,7 +163,7 @@ def test_without_gaussians_the_image_is_the_background() -> None:
 
 def test_other_gaussians_are_refused() -> None:
     """Catches float64 taken for float32, and two sets of Gaussians that differ in number."""
-    arguments = picture_cases.crowd(torch.Generator().manual_seed(0), 4, 1.0)
+    arguments = pictures.crowd(torch.Generator().manual_seed(0), 4, 1.0)
     single = tuple(arguments.get(name) for name in NAMES)
     exact = tuple(None if x is None else x.double() for x in single)
     place = arguments["viewmats"][0], arguments["Ks"][0], 16, 12
