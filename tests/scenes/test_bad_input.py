@@ -76,9 +76,11 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png(width: int, height: int, pixels: bytes, color: int = 6, depth: int = 8, extra: bytes = b"") -> bytes:
+def png(
+    width: int, height: int, pixels: bytes, color: int = 6, depth: int = 8, extra: bytes = b"", interlacing: int = 0
+) -> bytes:
     """A PNG with right checksums around any header, pixels and other chunks."""
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, interlacing))
     return SIGNATURE + header + extra + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
 
 
@@ -102,6 +104,11 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png with too few rows": (write(IMAGE, png(8, 6, bytes(33))), IMAGE, "cannot decode"),
     "png of 10 GB": (lambda root: os.truncate(root / IMAGE, 10**10), IMAGE, "at most"),
     "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "3 bits"),
+    "png of interlacing 9": (
+        write(IMAGE, png(8, 6, bytes(6 * 33), interlacing=9)),
+        IMAGE,
+        "interlacing is unknown",
+    ),
     "png is grey": (write(IMAGE, png(8, 6, bytes(9 * 6), color=0)), IMAGE, "RGB or RGBA"),
     "png of another size": (paint(IMAGE, 6, 9, 4), IMAGE, "9x6"),
     "png of another size in test": (paint("test/r_0.png", 3, 8, 4), "test/r_0.png", "8x3"),
@@ -198,6 +205,7 @@ ARGUMENTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     *(({"downscale": factor}, ("downscale", str(factor))) for factor in (16, 0, -1, 1.5, True)),
     *(({"background": color}, ("background",)) for color in ((0, 0), (0, 0, 2.0), (0, 0, float("nan")))),
     *(({"path": path}, ("the path of a scene's folder",)) for path in ("a\0b", "a\nb", "x" * 5000, "/dev/null/x", 7)),
+    ({"frames": (0, 1)}, ("frames: transforms_train.json lists its own frames",)),
     ({"resize": "pilow"}, ("resize 'pilow' is not known. Did you mean 'pillow'",)),
 ]
 

@@ -190,6 +190,8 @@ def test_points_between_cameras_that_face_each_other() -> None:
             assert (x[:, 2] > 0).float().mean() > 0.95
             assert len(means) == 200 or (x[:, 2] > 0).all()
             assert len(means) == 200 or ((x[:, :2] / x[:, 2:]).abs() <= torch.tensor([12, 20]) / 30 + 1e-5).all()
+    again = [frustum_points(9, cameras, 1.0, torch.Generator().manual_seed(7)).means for _ in range(2)]
+    assert torch.equal(*again)
     with pytest.raises(InputError, match="see something in common"):
         frustum_points(300, opposed(-8.0), 1.0, g)
 

@@ -229,15 +229,12 @@ def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) ->
 
 
 def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) -> None:
-    """Catches Times.CSV that is left out in silence, and a number whose exact value has a hundred million digits."""
+    """Catches Times.CSV that is left out in silence, a number whose exact value has a hundred million digits, and a
+    division by zero where all times are equal, as of many cameras at one moment."""
     (tmp_path / "Times.CSV").write_text("name,time\na,1e-99999999\nb,1\n")
     timed, digests = times.of_images(tmp_path, times.NamedImages(["a", "b"], circle(2), [0, 1], SOURCE))
     assert timed.values == [0, 1]
     assert list(digests) == ["Times.CSV"]
-
-
-def test_a_table_of_equal_times_is_a_still_scene() -> None:
-    """Catches a division by zero, and a scene of many cameras at one moment that is called moving."""
     timed = of_table(b"name,time\na,3\nb,3\n", ["a", "b"], [0, 1])
     assert timed.values == [None, None]
 

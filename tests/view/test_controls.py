@@ -178,6 +178,7 @@ def test_everything_is_brought_back(page: Visitor) -> None:
     start = page.pictures[-1]
     coloured = page.set("background", (0, 200, 0))
     assert (np.abs(coloured.astype(int) - (0, 200, 0)).max(-1) < 8).any()
+    assert same(page.set("background", (0, 300, 0)), page.set("background", (-1, 0, 0)), start)  # a browser may send it
     for label, value in (("time", 1.0), ("show", ONE), ("AGR", False), ("colours", "class"), ("harmonics", 0)):
         page.set(label, value)
     page.browser.client.camera.position = (0.0, 1.0, -5.0)

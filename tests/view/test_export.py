@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import stat
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,6 @@ from gsbench.view import slice_ply, video
 
 FOUR = ("--seconds", "0.5", "--fps", "8")
 ALONG = ("--direction", "0,0,-1")
-PLAIN_SLICE = GaussianModel.slice
 
 
 def exports(run: Path, *words: object) -> bool:
@@ -39,6 +39,17 @@ def exports(run: Path, *words: object) -> bool:
 def replace_run(monkeypatch: pytest.MonkeyPatch, run: LoadedRun) -> None:
     """Let the command load this run."""
     monkeypatch.setattr("gsbench.export.load_run", lambda *_: run)
+
+
+def change_slices(monkeypatch: pytest.MonkeyPatch, change: Callable[[Gaussians3D, CameraTime], dict[str, Any]]) -> None:
+    """Let every model slice other Gaussians than it has."""
+    plain = GaussianModel.slice
+
+    def slice_otherwise(self: GaussianModel, query: CameraTime) -> Gaussians3D:
+        gaussians = plain(self, query)
+        return gaussians._replace(**change(gaussians, query))
+
+    monkeypatch.setattr(GaussianModel, "slice", slice_otherwise)
 
 
 @pytest.fixture(autouse=True)
@@ -70,19 +81,13 @@ def test_a_ply_says_how_it_differs_from_the_model(
     option: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches Beta profiles or an antialiasing filter that are lost without a word, and a word where there are none."""
-
-    def with_profiles(self: GaussianModel, query: CameraTime) -> Gaussians3D:
-        gaussians = PLAIN_SLICE(self, query)
-        return gaussians._replace(beta_exponents=torch.full_like(gaussians.opacities, 2.0))
-
     assert exports(folder, *option, *ALONG)
     assert len(capsys.readouterr().out.splitlines()) == 1
-    if option[1] == "a":
-        shutil.rmtree("a")
+    shutil.rmtree("a", ignore_errors=True)
     run = load_run(folder)
     run.config.raster.antialias = True
     replace_run(monkeypatch, run)
-    monkeypatch.setattr(GaussianModel, "slice", with_profiles)
+    change_slices(monkeypatch, lambda gaussians, _: {"beta_exponents": torch.full_like(gaussians.opacities, 2.0)})
     assert exports(folder, *option, *ALONG)
     _, profiles, filtered = capsys.readouterr().out.splitlines()
     assert f"{option[1]}: their alpha profiles (1 - r^2)^b are now the Gaussians" in profiles
@@ -173,14 +178,9 @@ def test_a_clip_that_fails_leaves_nothing(
             raise failure
         return ply_of(trained)
 
-    def fading(self: GaussianModel, query: CameraTime) -> Gaussians3D:
-        gaussians = PLAIN_SLICE(self, query)
-        assert query.time is not None
-        return gaussians._replace(opacities=gaussians.opacities * (query.time < 0.9))
-
     monkeypatch.setattr(slice_ply, "ply_of", failing)
     if failure is None:
-        monkeypatch.setattr(GaussianModel, "slice", fading)
+        change_slices(monkeypatch, lambda gaussians, query: {"opacities": gaussians.opacities * (query.time < 0.9)})
     if is_there:
         (tmp_path / "clip").mkdir()
     with pytest.raises(KeyboardInterrupt) if isinstance(failure, KeyboardInterrupt) else nullcontext():
@@ -199,28 +199,30 @@ def test_a_direction_has_no_length() -> None:
 # ---- videos and images
 
 
-@pytest.mark.parametrize("path", ["test", "orbit", "spiral"])
-def test_images_are_what_the_model_renders(path: str, folder: Path, tmp_path: Path) -> None:
-    """Catches swapped colours, and test views that are rendered at other times than their own."""
-    assert exports(folder, "--images", "a", "--path", path, *FOUR)
-    images = [cv2.imread(str(file)) for file in sorted((tmp_path / "a").iterdir())]
-    run = load_run(folder)
-    if path != "test":
-        assert len(images) == 4
-        assert any((image != images[0]).any() for image in images)
-        return
-    for image, view in zip(images, load_scene(run.config).test, strict=True):
-        rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
-        assert (image[:, :, ::-1] == to_bytes(rendered.numpy())).all()
-
-
-def test_time_runs_once_unless_it_stands_still(folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "moves"),
+    [
+        (("--path", "orbit"), True),
+        (("--path", "spiral"), True),
+        (("--camera", "train/r_0"), True),
+        (("--camera", "train/r_0", "--time", "0.5"), False),
+    ],
+)
+def test_time_runs_once_unless_it_stands_still(words: tuple[str, ...], moves: bool, folder: Path) -> None:
     """Catches a clip that is cut off, and --time without effect."""
-    for more, differ in (((), True), (("--time", "0.5"), False)):
-        out = tmp_path / f"still{differ}"
-        assert exports(folder, "--images", out, "--camera", "train/r_0", *FOUR, *more)
-        first, *others = [cv2.imread(str(file)) for file in sorted(out.iterdir())]
-        assert any((image != first).any() for image in others) == differ
+    assert exports(folder, "--images", "a", *words, *FOUR)
+    images = [cv2.imread(str(file)) for file in sorted(Path("a").iterdir())]
+    assert len(images) == 4
+    assert any((image != images[0]).any() for image in images) == moves
+
+
+def test_images_are_what_the_model_renders(folder: Path) -> None:
+    """Catches swapped colours, and test views that are rendered at other times than their own."""
+    assert exports(folder, "--images", "a", "--path", "test", *FOUR)
+    run = load_run(folder)
+    for file, view in zip(sorted(Path("a").iterdir()), load_scene(run.config).test, strict=True):
+        rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
+        assert (cv2.imread(str(file))[:, :, ::-1] == to_bytes(rendered.numpy())).all()
 
 
 def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) -> None:

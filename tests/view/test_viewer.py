@@ -14,7 +14,7 @@ import torch
 from test_viewer_frame import camera_of, renderer
 
 from gsbench.view.__main__ import main
-from gsbench.view.controls import ONE, SIDE, WIPE, ViserPose, _is_rgb
+from gsbench.view.controls import ONE, SIDE, WIPE, ViserPose
 from gsbench.view.viewer import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Browser, Resolution
 
 
@@ -101,7 +101,8 @@ class Steps(Browser):
 
 
 def test_frames_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a frame of all pixels while something moves, a bound that is kept after a change, and a busy wait."""
+    """Catches a frame of all pixels while something moves, a bound that is kept after a change, a busy wait, and an
+    error of one model that stops the frames of all browsers."""
     now = 0.0
     monkeypatch.setattr("gsbench.view.viewer.time.monotonic", lambda: now)
     browser = Steps()
@@ -129,21 +130,10 @@ def test_frames_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     browser.change()
     browser.serve()
     assert bound.cancelled()
-
-
-def test_an_error_of_a_model_is_shown_and_ends_no_thread() -> None:
-    """Catches a user's model whose error stops the frames of all browsers."""
-    browser = Steps()
-    browser.change()
+    browser.change()  # of a user's model
     browser.controls.advance = lambda: (_ for _ in ()).throw(TypeError("a <bad> model"))
     assert browser.serve() == math.inf
     assert browser.controls.costs.content == "a &lt;bad&gt; model"
-
-
-def test_a_background_is_three_bytes() -> None:
-    """Catches a colour of a hundred numbers, or of one beyond 8 bits, that a frame would be rendered with."""
-    assert _is_rgb((0, 128, 255))
-    assert not any(map(_is_rgb, [(), (1,) * 100, (0, 300, 0), (-1, 0, 0), (2**60, 0, 0)]))
 
 
 def test_a_wrong_command_is_answered_in_one_line(
