@@ -224,36 +224,31 @@ def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> 
 
 
 def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
-    """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0."""
-    data = write_moving_square(tmp_path / "data")
-    write_moving_square(tmp_path / "data", "broken")
-    source = tmp_path / "data" / "broken" / "transforms_train.json"
-    content = json.loads(source.read_text())
-    content["frames"][0]["file_path"] = "./train/gone"
-    source.write_text(json.dumps(content))
-    arguments = [a for a in overrides(data, tmp_path / "results", "model=3dgs") if not a.startswith("scene.name")]
-    arguments = ["scene=all" if a == "scene=custom" else a for a in arguments]
-    done = gsbench(*[a if not a.startswith("data.scenes") else "data.scenes=[broken,square]" for a in arguments])
-    assert done.returncode == 1
-    assert "gsbench: error: broken: " in done.stderr
-    assert "gone" in done.stderr
-    statuses = {run.scene: run.status for run in map(record.read, record.find(tmp_path / "results"))}
-    assert statuses == {"broken": "failed", "square": "ok"}
-
-
-def test_a_scene_without_time_is_refused_by_models_of_time(tmp_path: Path) -> None:
-    """Catches a 4DGS fitted to a made-up time; 3DGS takes the same scene."""
-    data = write_moving_square(tmp_path / "data")
-    for source in (data / "square").glob("transforms_*.json"):
+    """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0, and a 4DGS fitted to
+    a made-up time, where 6DGS takes the same scene."""
+    names = ("broken", "square", "static")
+    for name in names:
+        write_moving_square(tmp_path / "data", name)
+    for source in (tmp_path / "data").glob("*/transforms_*.json"):
         content = json.loads(source.read_text())
         for frame in content["frames"]:
-            del frame["time"]
+            if source.parent.name == "static":
+                del frame["time"]
+            elif source.parent.name == "broken":
+                frame["file_path"] = "./train/gone"
         source.write_text(json.dumps(content))
-    refused = gsbench(*overrides(data, tmp_path / "r", "model=4dgs"))
-    assert refused.returncode == 1
-    assert "times" in refused.stderr
-    assert "use 3dgs or 6dgs" in refused.stderr
-    assert gsbench(*overrides(data, tmp_path / "r", "model=6dgs")).returncode == 0
+    words = [word for word in overrides(tmp_path / "data", tmp_path / "r") if not word.startswith(("scene", "data.sc"))]
+    done = gsbench(
+        "-m", *words, "scene=all", "scene.downscale=1", f"data.scenes=[{','.join(names)}]", "model=4dgs,6dgs"
+    )
+    assert done.returncode == 1
+    assert "gsbench: error: broken: " in done.stderr
+    runs = {(run.scene, run.model): run for run in map(record.read, record.find(tmp_path / "r"))}
+    failed = {name for name, run in runs.items() if run.status == "failed"}
+    assert failed == {("broken", "4dgs"), ("broken", "6dgs"), ("static", "4dgs")}
+    assert len(runs) == 6
+    assert "gone" in str(runs["broken", "4dgs"].reason)
+    assert "use 3dgs or 6dgs" in str(runs["static", "4dgs"].reason)
 
 
 def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_the_tables_name_every_model_and_key() -> None:
     """Catches a table that leaves rows out, or facts of a key."""
     models = [row.split("`")[1] for row in tables.models().splitlines()[2:]]
     assert models == sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
-    config = tables.config_tables.tables()
+    config = tables.config()
     assert "`train.densify.every` | `100` | least steps between two rounds (≥1)\n" in config
     assert "`train.penalties.opacity,size,strain.weight` | `0.0` | factor of the term (≥0)\n" in config
     assert "`scene.name` | required | folder in data.root\n" in config

@@ -3,16 +3,17 @@
 `make docs` runs it; a test fails where a block is not what this writes.
 """
 
+import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import config_tables
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gsbench.config import CONF, register_schema
+from gsbench.config import CONF, Config, register_schema
+from gsbench.config_key import Key, declared, described
 from gsbench.models import find
 from gsbench.models.base import GaussianModel
 from gsbench.report import blocks
@@ -22,19 +23,16 @@ from gsbench.usage import first_sentence
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = ROOT / "results" / "published"
+MODELS_HEAD = "| `model=` | what it does | observes | numbers a Gaussian |\n| --- | --- | --- | ---: |"
+CONFIG_HEAD = "key | default | meaning\n---|---|---"
 MARKS = "<!-- written by docs/site/tables.py: {} -->", "<!-- end -->"
 
 
 def models() -> str:
     """Return a row for each choice of model=, as it is composed for the embedded scenes."""
     register_schema()
-    rows = [
-        "| `model=` | what it does | observes | numbers a Gaussian |",
-        "| --- | --- | --- | ---: |",
-    ]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        rows += [row_of(path) for path in sorted((CONF / "model").glob("*.yaml"))]
-    return "\n".join(rows)
+        return "\n".join([MODELS_HEAD, *map(row_of, sorted((CONF / "model").glob("*.yaml")))])
 
 
 def row_of(path: Path) -> str:
@@ -58,10 +56,52 @@ def numbers(composed: DictConfig) -> int:
     return sum(parameter[0].numel() for parameter in model.splats.values())
 
 
+def config() -> str:
+    """Return a heading, the purpose and a table of keys for each group of the config."""
+    groups: dict[str, dict[str, str]] = {}
+    for name, facts in declared(Config).items():
+        group = name.partition(".")[0] if "." in name else ""
+        rows = groups.setdefault(group, {})
+        cells = " | ".join(("", *cells_of(facts)))
+        alike = next((key for key in rows if rows[key] == cells and is_alike(key, name)), name)
+        rows[merged(alike, name)] = rows.pop(alike, cells)
+    return "\n\n".join(
+        "\n".join([*heading(group), CONFIG_HEAD, *(f"`{name}`{cells}" for name, cells in rows.items())])
+        for group, rows in groups.items()
+    )
+
+
+def heading(group: str) -> list[str]:
+    """Return the title of a group and what it is for."""
+    about = inspect.getdoc(described(Config, group).kind if group else Config) or ""
+    return [f"## {group or 'The run'}", "", about, ""]
+
+
+def cells_of(facts: Key) -> tuple[str, str]:
+    """Return the default of a key, and its meaning with its range."""
+    allowed = facts.range.replace("at least ", "≥").replace(" to ", "–")
+    default = f"`{facts.shown}`" if facts.shown else "required"
+    return f"{default} {facts.unit}".strip(), f"{facts.help} ({allowed})" if allowed else facts.help
+
+
+def is_alike(first: str, second: str) -> bool:
+    """Return whether two keys with equal facts are of groups beside each other, such as two penalties."""
+    before, after = first.split("."), second.split(".")
+    return len(before) == len(after) > 2 and (before[:-2], before[-1]) == (after[:-2], after[-1])
+
+
+def merged(first: str, second: str) -> str:
+    """Return one name for alike keys: `train.penalties.opacity|size.weight`."""
+    if first == second:
+        return first
+    *group, names, last = first.split(".")
+    return ".".join([*group, f"{names},{second.split('.')[-2]}", last])
+
+
 TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     "README.md": blocks.README,
     "docs/models.md": {"models": lambda _: models()},
-    "docs/config.md": {"config": lambda _: config_tables.tables()},
+    "docs/config.md": {"config": lambda _: config()},
     "docs/results.md": blocks.RESULTS,
 }
 

@@ -22,7 +22,6 @@ KEPT = Path(__file__).parent / "kept"
 STUDIES = ("mini", "frontier", "suite", "dnerf", "effects", "lengths")
 DIGITS = 10  # of the numbers that are kept
 NUMBERS: dict[str, Callable[[], today.Numbers]] = {
-    **{f"{study}.table": lambda study=study: today.table(study) for study in STUDIES},
     **{f"{study}.page": lambda study=study: today.page(study) for study in STUDIES},
     **{f"{study}.paper": lambda study=study: today.paper(study) for study in ("mini", "dnerf")},
     "mini.against_itself": lambda: today.against("mini", (0, 1, 2), (0, 1, 2)),

@@ -26,7 +26,7 @@ from gsbench.measure.record import LengthChoice
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import sections as of_report
 from gsbench.report import stats
-from gsbench.report.sections.budgets import contests, is_beside_others
+from gsbench.report.sections.budgets import contests, is_beside_others, points
 from gsbench.report.sections.curves import events, mean_curves, profiles, round_numbers, targets
 from gsbench.report.sections.experiment import table
 from gsbench.report.sections.lengths import by_length
@@ -129,6 +129,13 @@ def test_an_effect_is_priced_from_published_models():
 
 
 # ---- budgets and the frontier
+
+
+def test_of_two_equals_neither_is_dominated_and_one_is_on_the_frontier():
+    """Catches equals that dominate each other, and a frontier that has both."""
+    equal = points(chapter(*runs_of("a", "", 20.0, 10.0), *runs_of("b", "", 20.0, 10.0)), ["suzanne"])
+    assert not stats.is_dominated(equal, "train_s").any()
+    assert stats.is_on_frontier(equal, "train_s").sum() == 1
 
 
 def test_a_budget_buys_the_best_on_val():
