@@ -9,9 +9,8 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.process.ending import end_with
 from gsbench.reading import as_json
-from gsbench.report import live, output, paper_tables, reproduction, select
+from gsbench.report import output, paper_tables, reproduction, select
 from gsbench.report.frame import Results, load
-from gsbench.report.publish import publish
 from gsbench.report.render import page, text
 from gsbench.report.sections import built
 from gsbench.report.sections.experiment import WITH_TRAIN
@@ -32,13 +31,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = _options(arguments)
     columns = list(WITH_TRAIN) if options.train else []
     if options.live:
-        return live.watch(options.results, columns)
+        return output.watch(options.results, columns)
     differs = False
     try:
         chosen = select.parse(options.select)
         results = chosen.of(load(options.results))
         if options.publish:
-            print(publish(options.results, options.publish))
+            print(output.publish(options.results, options.publish))
         elif len(results.runs) and options.tables:
             _paper_tables(results, options)
         elif len(results.runs) and options.against:
@@ -97,7 +96,7 @@ def _report(results: Results, columns: Sequence[str], options: argparse.Namespac
 def _numbers(results: Results) -> dict[str, object]:
     """Return all sections of a report and the facts of every run as plain values."""
     sections = [of for chapter in results.chapters() for of in built(chapter) if of.key not in ("gallery", "runs")]
-    runs = text.rows(results.runs.drop(columns=["path", "record"]))
+    runs = results.runs.drop(columns=["path", "record"]).to_dict("records")
     return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
 
 
@@ -106,7 +105,9 @@ def _paper_tables(results: Results, options: argparse.Namespace) -> None:
     shown = [section for of in paper_tables.sections(results).values() for section in of]
     if options.latex:
         print(text.latex(shown))
-    elif not _is_json(options, lambda: {name: text.rows(of) for name, of in paper_tables.numbers(results).items()}):
+    elif not _is_json(
+        options, lambda: {name: of.to_dict("records") for name, of in paper_tables.numbers(results).items()}
+    ):
         paper_tables.write(results, options.results)
         print(text.terminal(shown))
         print(f"Written: {', '.join(str(options.results / name) for name in paper_tables.FILES)}")

@@ -1,19 +1,20 @@
 """Make the tables of README.md and docs/results.md from the published studies: each block is one function."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from gsbench.report import paper, stats
-from gsbench.report.frame import Results, load
-from gsbench.report.intervals import estimate
+from gsbench.report.frame import Results, load, names_of
+from gsbench.report.intervals import Values, estimate
+from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
-from gsbench.report.section import EMPTY, Column, Section, number
+from gsbench.report.section import Column, Section, number
 from gsbench.report.sections import tested
 from gsbench.report.sections.budgets import contests
+from gsbench.report.sections.effects import is_single
 from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
@@ -27,7 +28,8 @@ CHANGES = {"time, given direction": ("7dgs_noagr", "6dgs"), "direction": ("6dgs"
            "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
            "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
            "7DGS instead of 4DGS": ("7dgs", "4dgs"), "`model=auto` instead of 7DGS": ("auto", "7dgs")}  # fmt: skip
-COMPARED = "auto,compare=true"
+CHOICES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS", "auto": "`model=auto`",
+           "auto compare=true": "`model=auto effects.compare=true`"}  # fmt: skip
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
 ON_GPU = f"device=cuda,{AT_PAPER}"
 PARTS = (0.3, 0.5, 0.7, 1.0)  # of the training after which the best model on val is chosen
@@ -40,6 +42,13 @@ ABLATIONS = {
     "cholesky": "slices by a Cholesky factor", "no_time_split": "Gaussians split in space only",
     "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
 }  # fmt: skip
+OF_TREX = {
+    "psnr_db": Column("PSNR, last iteration"), "psnr_best_on_test_db": Column("best on test (leaks)"),
+    "psnr_val_db": Column("val"), "psnr_train_db": Column("training views", 1), "ssim": Column("SSIM", 3),
+    "lpips_alex": Column("LPIPS-Alex", 3), "CPU min": Column("CPU min", 1), "GPU min": Column("GPU min", 1),
+    "gaussians": Column("Gaussians", 0),
+}  # fmt: skip
+QUANTITIES = [*(name for name in OF_TREX if not name.endswith("min")), "train_s", "train_cpu_s"]
 
 
 @cache
@@ -56,42 +65,44 @@ def only(published: Path, name: str) -> Results:
     return chapter
 
 
-def mean(chapter: Results, *quantities: str) -> pd.DataFrame:
+def means(results: Results, *quantities: str) -> pd.DataFrame:
     """Return means and intervals over seeds by model and variant; times are not of one machine."""
-    runs = chapter.runs.assign(timed_on=chapter.runs.machine)
+    runs = results.runs.assign(timed_on=results.runs.machine)
     return stats.means(runs, ["model", "variant"], quantities).set_index(["model", "variant"])
 
 
-def block(rows: Iterable[dict[str, Any]], numbers: Sequence[str] = ()) -> str:
-    """Return rows of texts as a Markdown table; the columns `numbers` are aligned at the right."""
-    lines = list(rows)
-    marks = ["---:" if name in numbers else "---" for name in lines[0]]
-    texts = [list(lines[0]), marks, *(list(map(str, line.values())) for line in lines)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in texts)
+def block(table: pd.DataFrame, **columns: Column) -> str:
+    """Return a table as Markdown, its index first."""
+    return markdown(Section("", "", "", table.reset_index(), columns))
 
 
-def bold_best(values: dict[str, float], texts: dict[str, str] | None = None, digits: int = 2) -> dict[str, str]:
-    """Return texts by name, of which the highest value is bold, as it is shown."""
-    shown = {name: number(value, digits) for name, value in values.items()}
-    best = max((value for value in values.values() if value == value), default=0.0)
-    return {
-        name: f"**{shown[name]}**{more}" if shown[name] == number(best, digits) else f"{shown[name]}{more}"
-        for name in values
-        for more in [(texts or {}).get(name, "")]
-    }
+def shown(table: pd.DataFrame, digits: int = 2) -> pd.DataFrame:
+    """Return numbers as texts, those of rank 1 bold."""
+    columns = {name: Column(name, digits) for name in table}
+    return Section("", "", "", table.reset_index(drop=True), columns).shown(bold).set_axis(table.index)
 
 
-def with_half(row: pd.Series, name: str = "psnr_db") -> str:
-    """Return a mean with half its interval, if it has one."""
-    half = row[f"{name} ±"]
-    return number(row[name], 2) + ("" if half != half else f" ± {half:.2f}")
+def reached(psnr: pd.DataFrame, seconds: pd.DataFrame) -> str:
+    """Return PSNR, the best of a row bold, and seconds as a table of cells such as "17.10, 0.9"."""
+    return block(shown(stats.ranked_rows(psnr)) + ", " + shown(seconds, 1))
 
 
-def change(test: pd.Series, digits: int = 2) -> str:
-    """Return a difference with half its interval over three or more scenes, bold if it is significant."""
-    shown = number(test["mean"], digits, signed=True)
-    shown = f"**{shown}**" if test.significant else shown
-    return f"{shown} ± {number((test.high - test.low) / 2, digits)}"
+def changes(tests: pd.DataFrame, scenes: Sequence[str]) -> pd.DataFrame:
+    """Return tested differences: mean (bold if significant) ± half the interval, and the mean of each scene."""
+    table = pd.DataFrame({"mean": tests["mean"], "mean ±": tests.high - tests["mean"]})
+    table["mean rank"] = tests.significant.astype(int)
+    return table.join(pd.DataFrame(tests["by scene"].tolist(), tests.index, list(scenes)))
+
+
+def price(scenes: list[Values]) -> str:
+    """Return a difference ± half its interval over scenes, bold if significant, and on how many scenes it is positive.
+
+    Args:
+        scenes: for each scene the differences [seeds, views].
+    """
+    of = estimate(scenes)
+    mean = bold(number(of.mean, 2, signed=True), int(of.half_over_scenes < abs(of.mean)))
+    return f"{mean} ± {number(of.half_over_scenes, 2)}, {of.gaining} of {of.scenes}"
 
 
 # ---- mini and frontier
@@ -100,101 +111,62 @@ def change(test: pd.Series, digits: int = 2) -> str:
 def table1(published: Path) -> str:
     """Return the means of `make table1`, PSNR also by scene, with the newer methods last."""
     chapter = only(published, "mini")
-    of = mean(chapter, "psnr_db", "ssim", "lpips_alex", "train_s", "fps", "gaussians").xs("", level="variant")
+    quantities = ["psnr_db", "ssim", "lpips_alex", "train_s", "fps", "gaussians"]
+    of = means(chapter, *quantities).xs("", level="variant")
     scenes = chapter.runs.groupby(["model", "scene"]).psnr_db.mean().unstack()
-    shown = of.loc[
-        [m for m in [*MODELS, *SUCCESSORS] if m in of.index],
-        ["psnr_db", "ssim", "lpips_alex", "train_s", "fps", "gaussians"],
-    ]
-    return markdown(Section("", "", "", scenes.loc[shown.index].join(shown).reset_index(), {"fps": Column("FPS", 0)}))
+    models = [model for model in (*MODELS, *SUCCESSORS) if model in of.index]
+    return block(scenes.loc[models].join(of[quantities]), fps=Column("FPS", 0))
 
 
-def cost(published: Path, lengths: Iterable[str] = ("250", "1,000", "4,000"), models: Iterable[str] = MODELS) -> str:
+def cost(published: Path, lengths: Sequence[str] = ("250", "1,000", "4,000"), models: Sequence[str] = MODELS) -> str:
     """Return PSNR and seconds of models after some lengths of training."""
-    of, names = mean(only(published, "frontier"), "psnr_db", "train_s"), list(models)
-    rows = []
-    for length in lengths:
-        at = of.xs(LENGTHS[length], level="variant").reindex(names)
-        seconds = {m: f", {number(at.train_s[m], 1)}" for m in names}
-        rows.append({"iterations": length} | bold_best(at.psnr_db.to_dict(), seconds))
-    return block(rows, ["iterations", *names])
+    of = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
+    of = of.loc[[LENGTHS[length] for length in lengths]].set_axis(pd.Index(lengths, name="iterations"))
+    return reached(of.psnr_db[list(models)], of.train_s[list(models)])
 
 
 def frontier(published: Path) -> str:
     """Return all lengths of `make frontier`, and the best model within each budget."""
     chapter = only(published, "frontier")
-    best = [
-        {
-            "budget": budget,
-            "best": f"`{table.model.iloc[0]}` {table.variant.iloc[0]}".rstrip(),
-            "PSNR": number(table.psnr_db.iloc[0], 2),
-        }
-        for budget, table in contests(chapter).items()
-    ]
-    newer = [m for m in SUCCESSORS if m in set(chapter.runs.model)]
-    parts = [cost(published, LENGTHS)]
-    parts += [cost(published, ["1,000", "2,000"], newer)] if newer else []
-    return "\n\n".join([*parts, block(best, ["PSNR"])])
+    best = pd.concat({budget: table.head(1) for budget, table in contests(chapter).items()}, names=["budget", ""])
+    best = best.assign(best=("`" + best.model + "` " + best.variant).str.rstrip()).droplevel(1)
+    newer = [model for model in SUCCESSORS if model in set(chapter.runs.model)]
+    parts = [cost(published, list(LENGTHS)), cost(published, ["1,000", "2,000"], newer) if newer else ""]
+    return "\n\n".join([*filter(None, parts), block(best[["best", "psnr_db"]])])
 
 
 def effects(published: Path) -> str:
-    """Return what time, direction and AGR gain and cost, given the other effects."""
+    """Return what time, direction and AGR gain and cost, given the other effects; nested gains where there are any."""
     chapter = only(published, "frontier")
     tests = tested(chapter)
-    of = {quantity: rows.set_index("name") for quantity, rows in tests[tests.section == "effects"].groupby("quantity")}
-    gains = of["psnr_db"]
-    single = [name for name in gains.index if " × " not in name and "mean over" not in name and "nested" not in name]
-    rows = []
-    for name in single:
-        key = f"{name}, nested" if f"{name}, nested" in gains.index else name
-        scenes = zip(sorted(chapter.runs.scene.unique()), gains.loc[key, "by scene"], strict=True)
-        rows.append(
-            {"effect": name.replace(" alone", "").replace(", with", " given"), "PSNR, dB": change(gains.loc[key])}
-            | {scene: number(value, 2, signed=True) for scene, value in scenes}
-            | {
-                title: number(of[quantity].loc[key, "mean"], digits, signed=True)
-                for title, quantity, digits in (
-                    ("training, s", "train_s", 1),
-                    ("frame, ms", "frame_ms", 2),
-                    ("model, MB", "model_mb", 2),
-                )
-            }
-        )
-    return block(rows, list(rows[0])[2:])
+    tests = tests[tests.section == "effects"].set_index("name")
+    gains = tests[tests.quantity == "psnr_db"]
+    single = [name for name in gains.index if is_single(name) and not name.endswith("nested")]
+    names = [f"{name}, nested" if f"{name}, nested" in gains.index else name for name in single]
+    scenes = sorted(chapter.runs.scene.unique())
+    table = changes(gains.loc[names], scenes)
+    for quantity in ("train_s", "frame_ms", "model_mb"):
+        table[quantity] = tests[tests.quantity == quantity]["mean"].loc[names]
+    effect = [name.replace(" alone", "").replace(", with", " given") for name in single]
+    units = {"mean": ("PSNR, dB", 2), "train_s": ("training, s", 1), "frame_ms": ("frame, ms", 2),
+             "model_mb": ("model, MB", 2)}  # fmt: skip
+    columns = {name: Column(name, signed=True) for name in scenes}
+    columns |= {name: Column(title, digits, signed=True) for name, (title, digits) in units.items()}
+    return block(table.set_axis(pd.Index(effect, name="effect")), **columns)
 
 
 def ablation(published: Path) -> str:
     """Return what each part of 7DGS is worth: the first row has its PSNR, the others the differences to it."""
     chapter = only(published, "ablation")
-    tests = tested(chapter)
-    pairs = {
-        key: test for test in tests[tests.section == "pairs"].to_dict("records") for key in [frozenset(test["weights"])]
-    }
-    keys = {
-        variant: (model, variant) for model, variant in chapter.runs[["model", "variant"]].drop_duplicates().to_numpy()
-    }
-    arrays, rows = stats.grids(chapter), []
-    for name, words in ABLATIONS.items():
-        key, whole = keys[f"ablation={name}"], keys["ablation=none"]
-        weights = {key: 1.0} if name == "none" else {key: 1.0, whole: -1.0}
-        of = estimate(stats.contrast(arrays, weights))
-        test = (
-            pd.Series(stats.row_of(of))
-            if name == "none"
-            else pd.Series(stats.row_of(of) | {"significant": pairs[frozenset((key, whole))]["significant"]})
-        )
-        rows.append(
-            {
-                "changed": words,
-                "`+ablation=`": f"`{name}`",
-                "PSNR, dB": number(of.mean, 2) if name == "none" else change(test),
-            }
-            | {
-                scene: number(value, 2, signed=name != "none")
-                for scene, value in zip(sorted(arrays), of.each, strict=True)
-            }
-        )
-    return block(rows, list(rows[0])[3:])
+    keys = {variant: (model, variant) for model, variant in zip(chapter.runs.model, chapter.runs.variant, strict=True)}
+    whole, *parts = [keys[f"ablation={name}"] for name in ABLATIONS]
+    arrays = stats.grids(chapter)
+    tests = [stats.differences(arrays, [{whole: 1.0}]).assign(significant=False),
+             stats.differences(arrays, [{part: 1.0, whole: -1.0} for part in parts])]  # fmt: skip
+    table = changes(pd.concat(tests, ignore_index=True), sorted(arrays))
+    table.insert(0, "`+ablation=`", [f"`{name}`" for name in ABLATIONS])
+    columns = {"mean": Column("PSNR, dB")}
+    return block(table.set_axis(pd.Index(ABLATIONS.values(), name="changed")), **columns)
 
 
 # ---- the suite
@@ -202,40 +174,26 @@ def ablation(published: Path) -> str:
 
 def suite_scenes(published: Path) -> str:
     """Return PSNR of every model on every scene of the suite."""
-    rows = []
-    for kind, chapter in sorted(study(published / "suite").items()):
-        runs = chapter.runs[(chapter.runs.variant == "") & chapter.runs.model.isin(MODELS)]
-        for scene, values in (
-            runs.groupby(["scene", "model"]).psnr_db.mean().unstack().reindex(columns=MODELS).iterrows()
-        ):
-            rows.append({"scene": scene, "kind": kind} | bold_best(values.to_dict()))
-    return block(rows, MODELS)
+    runs = pd.concat([chapter.runs for chapter in study(published / "suite").values()])
+    runs = runs[(runs.variant == "") & runs.model.isin(MODELS)].rename(columns={"dataset": "kind"})
+    psnr = runs.groupby(["kind", "scene", "model"]).psnr_db.mean().unstack()[MODELS]
+    return block(stats.ranked_rows(psnr).reorder_levels(["scene", "kind"]))
 
 
-def suite_kinds(published: Path, changes: Iterable[str] = CHANGES) -> str:
-    """Return what each effect changes in PSNR, by kind of scene: mean ± half the interval, and scenes that gain."""
+def suite_kinds(published: Path, names: Sequence[str] = tuple(CHANGES)) -> str:
+    """Return what each effect changes in PSNR, by kind of scene."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
-    rows = [
-        {"effect": f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}"}
-        | {
-            title: _price([v for kind in kinds for v in stats.contrast(arrays[kind], _minus(name))])
-            for title, kinds in KINDS.items()
-        }
-        for name in changes
-    ]
-    return block(rows, list(KINDS))
+    prices = {
+        title: [price([v for kind in kinds for v in stats.contrast(arrays[kind], _minus(name))]) for name in names]
+        for title, kinds in KINDS.items()
+    }
+    effect = [f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}" for name in names]
+    return block(pd.DataFrame(prices, pd.Index(effect, name="effect")))
 
 
 def _minus(name: str, variant: str = "") -> stats.Weights:
     a, b = CHANGES[name]
     return {(a, variant): 1.0, (b, variant): -1.0}
-
-
-def _price(scenes: list[Any]) -> str:
-    of = estimate(scenes)
-    shown = number(of.mean, 2, signed=True)
-    shown = f"**{shown}**" if of.half_over_scenes < abs(of.mean) else shown
-    return f"{shown} ± {number(of.half_over_scenes, 2)}, {of.gaining} of {of.scenes}"
 
 
 def suite_lengths(published: Path) -> str:
@@ -246,89 +204,54 @@ def suite_lengths(published: Path) -> str:
     runs = runs[runs.model.isin(MODELS) & runs.variant.isin(variants.values())]
     counts = runs.drop_duplicates(["scene", "model", "variant"]).scene.value_counts()
     shared = set(counts.index[counts == len(MODELS) * len(variants)])
-    of = (
-        runs[runs.scene.isin(shared)]
-        .groupby(["variant", "model", "scene"])[["psnr_db", "train_s"]]
-        .mean()
-        .groupby(["variant", "model"])
-        .mean()
-    )
+    by_scene = runs[runs.scene.isin(shared)].groupby(["variant", "model", "scene"])[["psnr_db", "train_s"]].mean()
+    of = by_scene.groupby(["variant", "model"]).mean().unstack("model").loc[list(variants.values())]
+    of = of.set_axis(pd.Index(variants, name="iterations"))
     arrays = {scene: grid for chapter in chapters for scene, grid in stats.grids(chapter).items() if scene in shared}
-    reached = [
-        {"iterations": n}
-        | bold_best(of.loc[v].psnr_db[MODELS].to_dict(), {m: f", {number(of.loc[(v, m)].train_s, 1)}" for m in MODELS})
-        for n, v in variants.items()
-    ]
-    prices = [
-        {"effect": name}
-        | {f"{n} iterations": _price(stats.contrast(arrays, _minus(name, v))) for n, v in variants.items()}
-        for name in CHANGES
-    ]
-    return f"{block(reached, list(reached[0]))}\n\n{block(prices, list(prices[0])[1:])}"
+    prices = {
+        f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in CHANGES]
+        for n, variant in variants.items()
+    }
+    table = pd.DataFrame(prices, pd.Index(CHANGES, name="effect"))
+    return f"{reached(of.psnr_db[MODELS], of.train_s[MODELS])}\n\n{block(table)}"
 
 
 def suite_choices(published: Path) -> str:
     """Return what choices of a model lose in PSNR to the best of six models, over dynamic scenes with val and test."""
-    parts = []
-    for kind in MOVING:
-        chapter = study(published / "suite")[kind]
-        runs = chapter.runs.assign(
-            model=chapter.runs.model.where(chapter.runs.variant == "", chapter.runs.model + "," + chapter.runs.variant)
-        )
-        place = chapter.curves.groupby("run").cumcount() + 1
-        size = chapter.curves.groupby("run").run.transform("size")
-        for part in PARTS:
-            at = chapter.curves[place == (part * size).round()].set_index("run").psnr_val_db
-            runs = runs.assign(**{f"val {part}": at.reindex(runs.index)})
-        parts.append(runs[runs.model.isin([*MODELS, COMPARED])])
-    runs = pd.concat(parts)
+    runs = pd.concat([_val_on_the_way(study(published / "suite")[kind]) for kind in MOVING])
     unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()
     runs = runs[~runs.scene.map(unusable)]
+    psnr = runs.pivot(index=["scene", "seed"], columns="name", values="psnr_db")
     whole = [model for model in MODELS if model != "auto"]
-    psnr = runs.pivot(index=["scene", "seed"], columns="model", values="psnr_db")
     best = psnr[whole].max(axis=1)
-    names = {
-        "4DGS": "4dgs",
-        "7DGS without AGR": "7dgs_noagr",
-        "7DGS": "7dgs",
-        "`model=auto`": "auto",
-        "`model=auto effects.compare=true`": COMPARED,
-    }
-    lost = {title: psnr[model] - best for title, model in names.items()}
+    lost = {title: psnr[name] - best for name, title in CHOICES.items()}
     for part in PARTS:
-        val = runs[runs.model.isin(whole)].pivot(index=["scene", "seed"], columns="model", values=f"val {part}")
+        val = runs[runs.name.isin(whole)].pivot(index=["scene", "seed"], columns="name", values=f"val {part}")
         chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
         lost[f"the best model on val after {100 * part:.0f} % of the iterations"] = chosen - best
-    scenes = pd.DataFrame(lost).groupby("scene").mean()
-    rows = [
-        {
-            "choice": name,
-            "mean, dB": number(of.mean(), 2, signed=True),
-            "worst scene, dB": number(of.min(), 2, signed=True),
-            "at most 0.1 dB below on": f"{(of >= -0.1).sum()} of {len(of)}",
-        }
-        for name, of in scenes.items()
-    ]
-    return block(rows, list(rows[0])[1:])
+    of = pd.DataFrame(lost).groupby("scene").mean()
+    table = pd.DataFrame({"mean": of.mean(), "worst": of.min(), "near": (of >= -0.1).sum(), "of scenes": len(of)})
+    return block(table.rename_axis("choice"), mean=Column("mean, dB", 2, signed=True),
+                 worst=Column("worst scene, dB", 2, signed=True), near=Column("at most 0.1 dB below", 0))  # fmt: skip
+
+
+def _val_on_the_way(chapter: Results) -> pd.DataFrame:
+    """Return runs with their name and with PSNR on val after each of PARTS of the training."""
+    curves = chapter.curves.assign(place=chapter.curves.groupby("run").cumcount() + 1)
+    size = curves.groupby("run").run.transform("size")
+    runs = chapter.runs.assign(name=names_of(chapter.runs))
+    for part in PARTS:
+        at = curves[curves.place == (part * size).round()].set_index("run").psnr_val_db
+        runs[f"val {part}"] = at.reindex(runs.index)
+    return runs[runs.name.isin([*MODELS, *CHOICES])]
 
 
 def lengths(published: Path) -> str:
     """Return PSNR after four lengths, and after the one that `train.lengths=4` keeps."""
-    long = (
-        only(published, "lengths").runs
-        if len(study(published / "lengths")) == 1
-        else pd.concat([c.runs for c in study(published / "lengths").values()])
-    )
-    runs = pd.concat([long, *(c.runs for c in study(published / "suite").values())])
+    runs = pd.concat([of.runs for name in ("lengths", "suite") for of in study(published / name).values()])
     runs = runs[runs.variant.isin(["", "iterations=2000", "iterations=4000", "iterations=8000"])]
-    table = by_length(runs).dropna()
-    rows = [
-        {"scene": scene, "model": model}
-        | bold_best(row.drop(["kept", "tried"]).to_dict())
-        | {"kept": number(row.kept, 2)}
-        for (scene, model, _), row in table.iterrows()
-    ]
-    return block(rows, list(rows[0])[2:])
+    table = by_length(runs).dropna().droplevel("seed")
+    return block(stats.ranked_rows(table.drop(columns=["kept", "tried"])).assign(kept=table.kept))
 
 
 # ---- D-NeRF and recipes
@@ -336,101 +259,50 @@ def lengths(published: Path) -> str:
 
 def trex(published: Path) -> str:
     """Return README's table of trex at the paper's resolution, batch size and iterations."""
-    of = mean(only(published, "dnerf"), "psnr_db", "psnr_best_on_test_db")
-    keys = {"7dgs": ON_GPU, "7dgs_noagr": ON_GPU, "4dgs": AT_PAPER}
-    rows = {model: of.loc[(model, variant)] for model, variant in keys.items()}
-    numbers = {model: paper.average("D-NeRF", ["trex"], model) for model in keys}
-    return block(
-        [
-            {"": "seeds"} | {m: str(int(row.seeds)) for m, row in rows.items()},
-            {"": "last iteration, dB"} | {m: with_half(row) for m, row in rows.items()},
-            {"": "best on test, dB"} | {m: with_half(row, "psnr_best_on_test_db") for m, row in rows.items()},
-            {"": "paper (best on test), dB"}
-            | {m: number(row.psnr_db, 2) for m, row in numbers.items() if row is not None},
-        ],
-        list(keys),
-    )
+    of = means(only(published, "dnerf"), "psnr_db", "psnr_best_on_test_db")
+    of = of.loc[[("7dgs", ON_GPU), ("7dgs_noagr", ON_GPU), ("4dgs", AT_PAPER)]].droplevel("variant")
+    table = of[["seeds", "psnr_db", "psnr_db ±", "psnr_best_on_test_db", "psnr_best_on_test_db ±"]]
+    table = table.assign(paper=[paper.average("D-NeRF", ["trex"], model).psnr_db for model in of.index])
+    return block(table, psnr_db=Column("last iteration, dB"), psnr_best_on_test_db=Column("best on test, dB"),
+                 paper=Column("paper (best on test), dB"))  # fmt: skip
 
 
-def _at_paper(of: pd.Series, *, gpu: bool) -> dict[str, str]:
-    minutes = (of.train_s if gpu else of.train_cpu_s) / 60
-    return {
-        "seeds": str(int(of.seeds)),
-        "PSNR, last iteration": with_half(of),
-        "best on test (leaks)": with_half(of, "psnr_best_on_test_db"),
-        "val": number(of.psnr_val_db, 2),
-        "training views": number(of.psnr_train_db, 1),
-        "SSIM": number(of.ssim, 3),
-        "LPIPS-Alex": number(of.lpips_alex, 3),
-        "minutes of CPU or GPU": f"{minutes:.1f} {'GPU' if gpu else 'CPU'}",
-        "Gaussians": number(of.gaussians, 0),
-    }
-
-
-OF_TREX = (
-    "psnr_db",
-    "psnr_best_on_test_db",
-    "psnr_val_db",
-    "psnr_train_db",
-    "ssim",
-    "lpips_alex",
-    "train_s",
-    "train_cpu_s",
-    "gaussians",
-)
+def _minutes(of: pd.Series, device: str) -> pd.Series:
+    """Return means with the minutes of the processor: CPU-minutes of all threads, or those of the GPU."""
+    seconds = of.train_s if device == "GPU" else of.train_cpu_s
+    return pd.concat([of, pd.Series({f"{device} min": seconds / 60})])
 
 
 def trex400(published: Path) -> str:
     """Return trex as the paper trains it, beside the paper's rows, and with other recipes."""
-    of = mean(load(published / "dnerf").finished, *OF_TREX)  # a chapter has times of one machine
-    rows = []
+    of = means(load(published / "dnerf").finished, *QUANTITIES)  # a chapter has times of one machine
+    rows: dict[str, pd.Series] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
-        for variant, place in ((ON_GPU, "H200"), (AT_PAPER, "CPU")):
+        for variant, place, device in ((ON_GPU, "H200", "GPU"), (AT_PAPER, "CPU", "CPU")):
             if (model, variant) in of.index:
-                rows.append(
-                    {"trex, 400 x 400": f"{model}, {place}"}
-                    | _at_paper(of.loc[(model, variant)], gpu=variant == ON_GPU)
-                )
-        numbers = paper.average("D-NeRF", ["trex"], model)
-        assert numbers is not None
-        minutes = EMPTY if numbers.train_min != numbers.train_min else f"{numbers.train_min:.1f} GPU"
-        rows.append(
-            dict.fromkeys(rows[0], EMPTY)
-            | {
-                "trex, 400 x 400": "paper",
-                "best on test (leaks)": number(numbers.psnr_db, 2),
-                "SSIM": number(numbers.ssim, 3),
-                "LPIPS-Alex": number(numbers.lpips_alex, 3),
-                "minutes of CPU or GPU": minutes,
-                "Gaussians": number(numbers.gaussians, 0),
-            }
-        )
-    others = {
-        ("7dgs_noagr", "paper"): f"recipe=paper,{AT_PAPER}",
-        ("7dgs_noagr", "authors"): f"recipe=authors,{AT_PAPER}",
-    } | {(model, "quick"): "recipe=quick" for model in ("7dgs", "4dgs", "7dgs_noagr")}
-    for (model, name), variant in others.items():
-        row = _at_paper(of.loc[(model, variant)], gpu=False)
-        rows.append({"trex, 400 x 400": f"{model}, `+recipe={name}`, CPU"} | row)
-    return block(rows, list(rows[0])[1:])
+                rows[f"{model}, {place}"] = _minutes(of.loc[(model, variant)], device)
+        names = {"psnr_db": "psnr_best_on_test_db", "train_min": "GPU min"}
+        rows[f"{model}, paper"] = paper.average("D-NeRF", ["trex"], model).rename(names)
+    others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
+              *((model, "quick", "") for model in ("7dgs", "4dgs", "7dgs_noagr"))]  # fmt: skip
+    for model, name, more in others:
+        rows[f"{model}, `+recipe={name}`, CPU"] = _minutes(of.loc[(model, f"recipe={name}{more}")], "CPU")
+    table = pd.DataFrame(rows).T.rename_axis("trex, 400 x 400").astype(float)
+    intervals = ["psnr_db ±", "psnr_best_on_test_db ±"]
+    return block(table[["seeds", *OF_TREX, *intervals]], **OF_TREX)
 
 
 def on_demand(published: Path) -> str:
-    """Return what the removal of effects from Gaussians changes, as a range over scenes."""
-    quantities = {
-        "PSNR on test, dB": ("psnr_db", 2),
-        "frame time, %": ("frame_ms", 0),
-        "size of the model, %": ("model_mb", 0),
-    }
-    columns: dict[str, dict[str, str]] = {}
+    """Return what the removal of effects from Gaussians changes: the least and the largest change over scenes."""
+    rows: dict[str, dict[str, float]] = {}
+    columns: dict[str, Column] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
-        changes = pd.concat([_removal(chapter, model) for chapter in study(published / "effects").values()])
-        title = f"{model}, {len(changes)} scenes"
-        columns[title] = {
-            name: " to ".join(number(value, digits, signed=True) for value in (changes[q].min(), changes[q].max()))
-            for name, (q, digits) in quantities.items()
-        }
-    return block([{"": name} | {title: of[name] for title, of in columns.items()} for name in quantities])
+        of = pd.concat([_removal(chapter, model) for chapter in study(published / "effects").values()])
+        ends = {f"{name} {end}": of[name].agg(end) for name in of for end in ("min", "max")}
+        rows[model] = ends | {"scenes": len(of)}
+    for name, title, digits in (("psnr_db", "dB", 2), ("frame_ms", "frame time, %", 0), ("model_mb", "MB, %", 0)):
+        columns |= {f"{name} {end}": Column(f"{title}, {end}", digits, signed=True) for end in ("min", "max")}
+    return block(pd.DataFrame(rows).T[["scenes", *columns]].rename_axis("model"), **columns)
 
 
 def _removal(chapter: Results, model: str) -> pd.DataFrame:
@@ -439,13 +311,13 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
     runs = chapter.runs[chapter.runs.model == model]
     of = runs.groupby(["variant", "scene"])[names].mean()
     gated = runs.groupby("variant").on_demand.any()
-    rows = []
+    rows = [pd.DataFrame(columns=names)]
     for less in gated.index[gated]:
         words = set(less.split(","))
         full = max(gated.index[~gated], key=lambda variant: len(words & set(variant.split(","))))
         new, old = of.loc[less], of.loc[full].reindex(of.loc[less].index)
         rows.append((100 * (new / old - 1)).assign(psnr_db=new.psnr_db - old.psnr_db))
-    return pd.concat(rows) if rows else pd.DataFrame(columns=names)
+    return pd.concat(rows).astype(float)
 
 
 README: dict[str, Callable[[Path], str]] = {
@@ -453,16 +325,6 @@ README: dict[str, Callable[[Path], str]] = {
     "worth": lambda published: suite_kinds(published, list(CHANGES)[:4]),
     "trex": trex,
 }
-RESULTS: dict[str, Callable[[Path], str]] = {
-    "table1": table1,
-    "frontier": frontier,
-    "effects": effects,
-    "suite_scenes": suite_scenes,
-    "suite_kinds": suite_kinds,
-    "suite_lengths": suite_lengths,
-    "suite_choices": suite_choices,
-    "lengths": lengths,
-    "ablation": ablation,
-    "trex400": trex400,
-    "on_demand": on_demand,
-}
+_OF_RESULTS = (table1, frontier, effects, suite_scenes, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
+               trex400, on_demand)  # fmt: skip
+RESULTS: dict[str, Callable[[Path], str]] = {write.__name__: write for write in _OF_RESULTS}

@@ -84,7 +84,7 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
     """Return the tables of records, sorted by RUN; of two records of one run, the first one is kept."""
     once: dict[tuple[Any, ...], tuple[Path, Record]] = {}
     for path, record in records:
-        if (run := name(record)) in once:
+        if (run := run_name(record)) in once:
             faults = [*faults, printable(f"{path}: the same run as {once[run][0]}; keep one of them")]
         else:
             once[run] = path, record
@@ -102,8 +102,8 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
     return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
 
 
-def name(record: Record) -> tuple[Any, ...]:
-    """Return what names a run."""
+def run_name(record: Record) -> tuple[Any, ...]:
+    """Return what names a run: its values of RUN."""
     return tuple(getattr(record, part) for part in RUN)
 
 
@@ -114,7 +114,7 @@ def _table(rows: list[dict[str, Any]], texts: list[str], numbers: Mapping[str, s
 
 def row(r: Record) -> dict[str, Any]:
     """Return a record as a row of `runs`."""
-    values = {column.name: _at(r, column.place) for column in RUNS if column.place}
+    values = {column.name: value_at(r, column.place) for column in RUNS if column.place}
     values |= {c.name: values[c.name] / c.unit for c in RUNS if c.unit != 1 and values[c.name] is not None}
     values |= {"psnr_val_db": psnr_val(r), "train_min": r.cost.train_s / 60 if r.cost else math.nan}
     values |= {"iterations": iterations(r), "machine": r.provenance.machine}
@@ -124,7 +124,7 @@ def row(r: Record) -> dict[str, Any]:
     return values | {f"stage_{name}": seconds for name, seconds in (r.cost.stage_s if r.cost else {}).items()}
 
 
-def _at(of: Any, place: str) -> Any:
+def value_at(of: Any, place: str) -> Any:
     """Return the value at a dotted place of a record or of its settings; None if a part of it is missing."""
     for name in place.split("."):
         of = of.get(name) if isinstance(of, dict) else getattr(of, name, None)
@@ -154,14 +154,14 @@ def psnr_val(r: Record) -> float:
 
 def iterations(r: Record) -> float:
     """Return the iterations of the training that was kept; NaN if the record does not hold them."""
-    value = r.length_choice.kept if r.length_choice else _at(r.provenance.config, "train.iterations")
+    value = r.length_choice.kept if r.length_choice else value_at(r.provenance.config, "train.iterations")
     return float(value) if isinstance(value, int) else math.nan
 
 
 def gating(r: Record) -> str:
     """Return "gate=end" or the like where a run removes effects otherwise than its model does by default, else ""."""
-    gate = _at(r.provenance.config, "effects.gate") or "off"
-    is_default = gate == (_at(r.provenance.config, "model.gate") or "off")
+    gate = value_at(r.provenance.config, "effects.gate") or "off"
+    is_default = gate == (value_at(r.provenance.config, "model.gate") or "off")
     return f"gate={gate}" if gate in facts("effects.gate").choices and not is_default else ""
 
 

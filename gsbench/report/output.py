@@ -1,16 +1,21 @@
-"""Write what a report leaves in a folder of results: the result tables, the numbers of all runs, and the page."""
+"""Write a report into its folder, once or whenever records arrive, and add runs to a published study."""
 
+import time
 from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
 
+from gsbench.errors import InputError, one_line
+from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
-from gsbench.report.frame import Results
+from gsbench.report import study
+from gsbench.report.frame import Results, load, run_name
 from gsbench.report.render import page, text
 from gsbench.report.section import Section
 from gsbench.report.sections import built
 from gsbench.report.sections.experiment import table
 
+EVERY = 5.0  # seconds after which the folder is read again and an open page reloads itself
 NOT_IN_FILE = ["config", "missing", "path", "record"]  # columns of `runs` that are no values
 
 
@@ -44,3 +49,84 @@ def write(
     write_atomically(folder / "table.md", text.markdown(shown).encode())
     write_atomically(folder / "table.csv", text.csv(results.runs.drop(columns=NOT_IN_FILE)).encode())
     return [folder / "table.md", folder / "table.csv", page.write(results, folder, reload=reload, more=more)]
+
+
+def watch(folder: Path, columns: Sequence[str] = (), *, every: float = EVERY) -> int:
+    """Rewrite the files of `write` whenever run records arrive, until Ctrl-C; return 0.
+
+    If the folder has no record or only damaged ones, the reason is printed, and the function keeps waiting. The page
+    reloads itself in the browser until the function ends.
+
+    Args:
+        folder: the folder where records are or will be.
+        columns: the columns of the result table; empty for those that the runs have.
+        every: seconds between two checks of the folder.
+    """
+    before, printed = frozenset[tuple[Path, int]](), ""
+    try:
+        while True:
+            state = _state(folder)
+            if state != before or not printed:
+                before, line = state, _rewrite(folder, columns, reload=max(1, round(every)))
+                if line != printed:
+                    printed = line
+                    print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
+            time.sleep(every)
+    except KeyboardInterrupt:
+        print(f"\nStopped. {_rewrite(folder, columns, reload=0)}")
+        return 0
+
+
+def _state(folder: Path) -> frozenset[tuple[Path, int]]:
+    """Return the paths of all run records with their times; a record that is just being replaced is skipped."""
+    state = set()
+    for path in files.find(folder) if folder.is_dir() else []:
+        try:
+            state.add((path, path.stat().st_mtime_ns))
+        except FileNotFoundError:
+            continue
+    return frozenset(state)
+
+
+def _rewrite(folder: Path, columns: Sequence[str], reload: int) -> str:
+    """Write the files, and return a line that counts the run records; on failure return the reason."""
+    try:
+        results = load(folder)
+        if results.runs.empty:
+            return f"no record can be read: {results.faults[0]}"
+        *_, page = write(results, folder, tables(results, columns), reload=reload)
+    except (InputError, OSError) as error:
+        return one_line(error)
+    counts = {"records": len(results.runs), "not ok": int((results.runs.status != "ok").sum()),
+              "left out": len(results.faults)}  # fmt: skip
+    return f"{', '.join(f'{n} {what}' for what, n in counts.items() if n)}: {page}"
+
+
+def publish(folder: Path, to: Path) -> str:
+    """Write the runs of a folder, such as ``results/mini``, into a study, such as ``results/published/mini``.
+
+    A run that the study has is replaced, and all others stay. Its result table, ``table.md``, is written anew. The
+    function returns a line that describes the result.
+
+    Raises:
+        InputError: a record of either is damaged or a duplicate, a run did not finish, or its code was not a clean git
+            commit; nothing is written.
+    """
+    results = load(folder)
+    earlier = load(to) if (to / study.RUNS_FILE).exists() else None
+    faults = [*results.faults, *(earlier.faults if earlier else ())]
+    for record in results.runs.record:
+        if record.status != "ok":
+            faults.append(f"{record.path}: {record.status}: {record.reason}")
+        elif (record.provenance.git_commit or "-dirty").endswith("-dirty"):
+            faults.append(f"{record.path}: its commit is {record.provenance.git_commit}, which does not reproduce it")
+    if faults:
+        more = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
+        raise InputError(
+            f"{folder}: expected finished runs of clean commits, got {'; '.join(faults[:3])}{more}", docs="report.md"
+        )
+    runs = {run_name(record): record for part in (earlier, results) if part for record in part.runs.record}
+    records = [runs[key] for key in sorted(runs)]
+    study.write(records, to)
+    write_atomically(to / "table.md", text.markdown(tables(load(to))).encode())
+    return f"Published: {len(results.runs)} runs in {to}, which has {len(records)}; {to / study.RUNS_FILE}"

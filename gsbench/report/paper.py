@@ -1,15 +1,18 @@
-"""Provide the results in Tables 1 and 2 of the 7DGS paper and its protocol, for comparison with measured runs.
+"""Provide the results in Tables 1 and 2 of the 7DGS paper, its protocol, and how a run departs from that protocol.
 
-Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. A cell that is empty in the
-paper is None. The paper's averages over a data set have the scene name "avg".
+Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting", ICCV 2025. Numbers that the paper lacks
+are NaN. The paper's averages over a data set have the scene name "avg".
 """
 
-import csv
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from typing import Any
 
 import pandas as pd
+
+from gsbench.measure.record import Record
+from gsbench.report.frame import iterations, value_at
 
 AVERAGE = "avg"
 MODELS = {"4dgs": False, "7dgs": True, "7dgs_noagr": False}  # the models of Table 1, and whether they have AGR
@@ -25,6 +28,14 @@ class Protocol:
     splits: dict[str, str]  # evaluated split by scene, "*" for all other scenes
     frames: int | None = None  # of each scene; None if the data set defines its frames
     iterations: int = 30_000
+
+    def size(self, scene: str) -> str:
+        """Return the size of a scene's images, such as "400x400"."""
+        return self.sizes.get(scene, self.sizes["*"])
+
+    def split(self, scene: str) -> str:
+        """Return the split on which a scene is evaluated."""
+        return self.splits.get(scene, self.splits["*"])
 
 
 PROTOCOLS = {
@@ -50,81 +61,75 @@ PROTOCOLS = {
 }
 
 
-@dataclass(frozen=True)
-class PaperRow:
-    """One row of Table 1 in the 7DGS paper: the results of a model on a scene."""
-
-    psnr: float  # dB, the best on test during training
-    ssim: float
-    lpips: float  # the paper does not say on which backbone
-    train_min: float | None  # minutes on one V100
-    fps: float  # on one V100
-    num_gaussians: int
-
-
-@dataclass(frozen=True)
-class MethodRow:
-    """One row of Table 2 in the 7DGS paper: the average results of a method over a data set."""
-
-    method: str
-    psnr: float
-    ssim: float | None
-    lpips: float | None
-    source: str  # reproduced by the 7DGS paper; quoted; retrained: quoted from Ex4DGS, which trained the method again
-
-
-def paper_row(dataset: str, scene: str, model: str) -> PaperRow | None:
-    """Return a row of the 7DGS paper's Table 1, or None if there is no such row.
-
-    Example: ``paper_row("D-NeRF", "trex", "7dgs")``.
-    """
-    return table1().get((dataset, scene.lower(), model))  # Technicolor's folders are named Birthday, ..
-
-
-def average(dataset: str, scenes: list[str], model: str) -> pd.Series | None:
-    """Return the paper's numbers of a model, averaged over scenes; None if it lacks one of them."""
-    rows = [paper_row(dataset, scene, model) for scene in scenes]
-    if not rows or None in rows:
-        return None
-    names = {"lpips": "lpips_alex", "psnr": "psnr_db", "num_gaussians": "gaussians"}
-    return pd.DataFrame([vars(row) for row in rows]).astype(float).rename(columns=names).mean(skipna=False)
-
-
 @cache
-def table1() -> dict[tuple[str, str, str], PaperRow]:
-    """Return Table 1 of the 7DGS paper, by data set, scene (or "avg") and model.
+def table1() -> pd.DataFrame:
+    """Return Table 1, a row for each data set, scene in lower case (or "avg") and model, which are the index.
 
-    The data sets are "7DGS-PBR", "D-NeRF" and "Technicolor".
+    PSNR is the best on test during training. The paper does not say on which network its LPIPS is. Minutes and FPS are
+    of one V100.
     """
+    return read_table("paper_table1.csv").set_index(["dataset", "scene", "model"]).sort_index()
+
+
+def average(dataset: str, scenes: list[str], model: str) -> pd.Series:
+    """Return the paper's numbers of a model, averaged over scenes; empty if it lacks one of them.
+
+    Example: ``average("D-NeRF", ["trex"], "7dgs").psnr_db``.
+    """
+    keys = [(dataset, scene.lower(), model) for scene in scenes]  # Technicolor's folders are named Birthday, ..
+    if not keys or not all(key in table1().index for key in keys):
+        return pd.Series(dtype=float)
+    return table1().loc[keys].mean(skipna=False).rename({"lpips": "lpips_alex"})
+
+
+def read_table(name: str) -> pd.DataFrame:
+    """Read a CSV file that lies in the folder of this module."""
+    with (resources.files(__package__) / name).open() as file:
+        return pd.read_csv(file)
+
+
+def departure(record: Record) -> str:
+    """Return the names of the settings in which a run differs from the 7DGS paper's protocol; "" if there are none."""
+    protocol = PROTOCOLS.get(record.dataset)
+    if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
+        return "data"
+    if record.scene not in protocol.scenes:
+        return "scene"
+    frames = value_at(record, "provenance.config.scene.frames")
+    settings: dict[str, tuple[Any, Any]] = _settings_of_images(record, protocol) | {
+        "iterations": (iterations(record), protocol.iterations),
+        "batch size": (value_at(record, "provenance.config.train.batch_size"), protocol.batch_size),
+        "frames": (_count(frames), protocol.frames),
+    }
+    if record.status != "ok" and record.protocol.get("resolution") == "not loaded":
+        del settings["size"]  # a run that failed before it saw an image
+    return ", ".join(name for name, (of_run, of_paper) in settings.items() if of_run != of_paper)
+
+
+def has_images_of_paper(record: Record) -> bool:
+    """Tell whether a run is measured on the images of the 7DGS paper, of the paper's size, split and background.
+
+    Only then can its PSNR be compared with the paper's. The training may be another one.
+    """
+    protocol = PROTOCOLS.get(record.dataset)
+    if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
+        return False
+    return all(of_run == of_paper for of_run, of_paper in _settings_of_images(record, protocol).values())
+
+
+def _settings_of_images(record: Record, protocol: Protocol) -> dict[str, tuple[Any, Any]]:
+    """Return the settings of the images on which a run is measured, by name, each beside that of the paper."""
     return {
-        (row["dataset"], row["scene"], row["model"]): PaperRow(
-            psnr=float(row["psnr_db"]),
-            ssim=float(row["ssim"]),
-            lpips=float(row["lpips"]),
-            train_min=_number(row["train_min"]),
-            fps=float(row["fps"]),
-            num_gaussians=int(row["num_gaussians"]),
-        )
-        for row in _read("paper_table1.csv")
+        "size": (record.protocol.get("resolution"), protocol.size(record.scene)),
+        "filter": (record.protocol.get("resize"), None),
+        "split": (record.protocol.get("eval_split"), protocol.split(record.scene)),
+        "background": (record.protocol.get("background"), "black"),
+        "quantisation": (record.protocol.get("quantise"), False),
     }
 
 
-@cache
-def table2() -> dict[str, list[MethodRow]]:
-    """Return Table 2 of the 7DGS paper: for "D-NeRF" and "Technicolor" the rows of all methods in the paper's order."""
-    table: dict[str, list[MethodRow]] = {}
-    for row in _read("paper_table2.csv"):
-        method = MethodRow(
-            row["method"], float(row["psnr_db"]), _number(row["ssim"]), _number(row["lpips"]), row["source"]
-        )
-        table.setdefault(row["dataset"], []).append(method)
-    return table
-
-
-def _number(cell: str) -> float | None:
-    return float(cell) if cell else None
-
-
-def _read(name: str) -> list[dict[str, str]]:
-    """Read the rows of a CSV file that lies in the folder of this module."""
-    return list(csv.DictReader((resources.files(__package__) / name).read_text().splitlines()))
+def _count(frames: Any) -> int | None:
+    """Return the number of frames in a range [first, last]; None if `frames` is not such a range."""
+    if isinstance(frames, list) and len(frames) == 2 and all(isinstance(n, int) for n in frames):
+        return int(frames[1] - frames[0] + 1)
+    return None

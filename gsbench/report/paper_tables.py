@@ -6,7 +6,6 @@ A measured row is a model with its experiment and its recipe: the training setti
 
 import re
 from collections.abc import Iterator, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,9 @@ import pandas as pd
 from gsbench.errors import printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
-from gsbench.report import frame, paper, stats
-from gsbench.report.frame import Results, of_one_machine, without
-from gsbench.report.paper_protocol import departure
+from gsbench.report import paper, stats
+from gsbench.report.frame import TIMES, Results, iterations, of_one_machine, value_at, without
+from gsbench.report.paper import departure
 from gsbench.report.render import text
 from gsbench.report.section import Column, Section
 
@@ -31,15 +30,22 @@ RECIPE = ["order", "model", "experiment", "recipe"]  # what the runs of a row of
 # Settings of a variant that belong to no recipe: they change what is measured, or a heading or a protocol names them.
 MEASURING = ("iterations", "downscale", "eval_split", "best_on_test", "curve_points")
 IN_THE_PROTOCOL = (*MEASURING, "protocol", "resize", "batch_size")
-SEEDS = 3  # the fewest seeds for a valid interval
 NAMES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS"}  # in the paper's tables
 FILES = [f"{name}.{end}" for name in ("table1", "table2", "table_successors") for end in ("md", "csv")]
 
 TEXT_1 = (
     "“paper”: Table 1 of the 7DGS paper (ICCV 2025). Its PSNR is the best on test seen during training, which leaks: "
     "like stands beside like in the column psnr_best_on_test (leaks). Its times are of a V100, so no difference is "
-    "taken. It does not name the network of its LPIPS. ± is half the width of the 95 % interval over seeds."
+    "taken. It does not name the network of its LPIPS. ± is half the width of the 95 % interval over seeds. Minutes "
+    "and FPS are of the machine of most runs; a time of another one is left out."
 )
+TEXT_OTHER = (
+    "Measured otherwise than in the paper, or on scenes rendered for gsbench in place of the paper's, so the paper's "
+    "rows are not shown. Of each data set these are the runs nearest to the paper's protocol; all others are counted "
+    "in the last table."
+)
+TEXT_SEEDS = "Finished seeds of each model at the paper's protocol. Valid intervals need three."
+TEXT_POOLS = "Runs with one protocol share a row. “Differs in”: the settings that are not the paper's."
 TEXT_2 = (
     "Rows of the paper's Table 2, and measured averages over all scenes of a data set at the paper's protocol. LPIPS "
     "of D-NeRF and 7DGS-PBR is of a network that the paper does not name; of Technicolor it is AlexNet's."
@@ -76,13 +82,14 @@ def of_the_paper(results: Results) -> pd.DataFrame:
     named = [str(record.protocol.get("paper_dataset")) for record in runs.record]
     runs = runs[pd.Series(named, runs.index, dtype=object).isin(list(paper.PROTOCOLS))]
     pools = [(str(r.protocol["paper_dataset"]), r.dataset, r.experiment, str(r.protocol.get("downscale")),
-              str(r.protocol.get("resize")), int(frame.iterations(r)) if frame.iterations(r) > 0 else 0)
+              str(r.protocol.get("resize")), int(iterations(r)) if iterations(r) > 0 else 0)
              for r in runs.record]  # fmt: skip
     recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
+    sizes = [printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record]
     return runs.assign(
         order=runs.model.map(MODELS.index), departs=runs.record.map(departure),
         recipe=[",".join(word for word in recipe.split(",") if word != "protocol=published") for recipe in recipes],
-        pool=pd.Series(pools, runs.index, dtype=object), size=[_size(record) for record in runs.record],
+        pool=pd.Series(pools, runs.index, dtype=object), size=sizes,
     )  # fmt: skip
 
 
@@ -93,28 +100,30 @@ def table1(runs: pd.DataFrame) -> pd.DataFrame:
         runs: the runs of `of_the_paper`. Those at the paper's protocol come first; then those nearest to it; then those
             nearest to it on data that stand in for the paper's.
     """
-    rows = [row for kind, dataset, of in _tables(runs) for row in _rows(kind, dataset, of)]
     numbers = [name + end for name in TABLE_1 for end in ("", " ±", " paper", " difference")]
-    named = ["table", "dataset", "experiment", "scene", "scenes", "model", "recipe", "seeds"]
-    return pd.DataFrame(rows, columns=[*named, *numbers])
+    names = ["table", "dataset", "experiment", "scene", "scenes", "model", "recipe", "seeds", *numbers]
+    rows = [_rows(kind, dataset, of) for kind, dataset, of in _tables(runs) if (of.status == "ok").any()]
+    return pd.concat([pd.DataFrame(columns=names), *rows], ignore_index=True)[names]
 
 
 def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     """Yield the kind, the data set and the runs of each table."""
     for dataset in paper.PROTOCOLS:
-        yield "paper", dataset, runs[(runs.departs == "") & (runs.dataset == dataset)]
+        yield "paper", dataset, _at_paper(runs, dataset)
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
-    for pool, of in sorted(_pools(runs).items(), key=lambda item: (-_effort(item[1]), item[0])):
+    pools = [of for _, of in runs[runs.departs != ""].groupby("pool")]
+    for of in sorted(pools, key=lambda of: -_effort(of)):  # the sort is stable, and groups are in order of their names
         if (of.status == "ok").any():
-            nearest.setdefault(pool[:2], of)
+            nearest.setdefault(of.pool.iloc[0][:2], of)
     for kind in ("other protocol", "other data"):
-        for (named, dataset), of in nearest.items():
-            if (kind == "other protocol") == (named == dataset):
+        for (paper_dataset, dataset), of in nearest.items():
+            if (kind == "other protocol") == (paper_dataset == dataset):
                 yield kind, dataset, of
 
 
-def _pools(runs: pd.DataFrame) -> dict[tuple[Any, ...], pd.DataFrame]:
-    return dict(iter(runs[runs.departs != ""].groupby("pool")))
+def _at_paper(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
+    """Return the runs on a data set at the paper's protocol."""
+    return runs[(runs.departs == "") & (runs.dataset == dataset)]
 
 
 def _effort(runs: pd.DataFrame) -> int:
@@ -123,28 +132,25 @@ def _effort(runs: pd.DataFrame) -> int:
     return int(runs.pool.iloc[0][-1]) * max((int(width) * int(height) for width, height in sizes), default=0)
 
 
-def _size(record: Record) -> str:
-    return printable(record.protocol.get("resolution", "a size not recorded"))
-
-
-def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one table: by scene, and on average over the scenes that all models finished."""
-    ok = _once(of_one_machine(runs)) if len(runs) else runs
-    protocol = paper.PROTOCOLS.get(dataset) if kind == "paper" else None
-    scenes = list(protocol.scenes) if protocol else sorted(set(runs.scene))
-    groups = [(scene, [scene], ok[ok.scene == scene]) for scene in scenes]
+def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of one table: by scene, and on average over the scenes that all models finished."""
+    ok = _once(of_one_machine(runs))
+    scenes = list(paper.PROTOCOLS[dataset].scenes) if kind == "paper" else sorted(set(runs.scene))
+    averaged = {scene: [scene] for scene in scenes}
+    groups = [(scene, ok[ok.scene == scene]) for scene in scenes]
     plain = ok[ok.recipe == ""]
-    finished = plain.drop_duplicates(["scene", *RECIPE]).groupby("scene").size()
-    covered = [scene for scene in scenes if finished.get(scene) == len(plain[RECIPE].drop_duplicates())]
+    models = plain.drop_duplicates(["scene", *RECIPE]).groupby("scene").size()
+    covered = [scene for scene in scenes if models.get(scene) == len(plain[RECIPE].drop_duplicates())]
     if runs.scene.nunique() > 1 and covered:
-        groups.append((paper.AVERAGE, covered, plain[plain.scene.isin(covered)]))
-    for name, of_scenes, of in groups:
-        for row in stats.means(of, RECIPE, TABLE_1).to_dict("records") if len(of) else ():
-            numbers = paper.average(dataset, of_scenes, row["model"]) if kind == "paper" else None
-            values = {} if numbers is None else numbers.to_dict() | {"psnr_best_on_test_db": numbers.psnr_db}
-            row |= {f"{column} paper": value for column, value in values.items()}
-            row |= {f"{c} difference": row[c] - value for c, value in values.items() if c not in frame.TIMES}
-            yield row | {"table": kind, "dataset": dataset, "scene": name}
+        averaged[paper.AVERAGE] = covered
+        groups.append((paper.AVERAGE, plain[plain.scene.isin(covered)]))
+    parts = [stats.means(of, RECIPE, TABLE_1).assign(scene=name) for name, of in groups if len(of)]
+    table = pd.concat(parts, ignore_index=True).assign(table=kind, dataset=dataset)
+    numbers = [paper.average(dataset if kind == "paper" else "", averaged[scene], model)
+               for scene, model in zip(table.scene, table.model, strict=True)]  # fmt: skip
+    of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda of: of.psnr_db)
+    difference = (table[TABLE_1] - of_paper).drop(columns=TIMES, errors="ignore")
+    return table.join(of_paper.add_suffix(" paper")).join(difference.add_suffix(" difference"))
 
 
 def _once(runs: pd.DataFrame) -> pd.DataFrame:
@@ -156,27 +162,28 @@ def _once(runs: pd.DataFrame) -> pd.DataFrame:
 
 def table2(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the paper's averages over each of its data sets, and those of models that finished all its scenes."""
-    rows: list[dict[str, Any]] = []
+    parts = []
     for dataset, protocol in paper.PROTOCOLS.items():
-        methods = [(m.method, m.source, m) for m in paper.table2().get(dataset, [])]
-        averages = [(NAMES[model], "table 1", paper.paper_row(dataset, paper.AVERAGE, model)) for model in paper.MODELS]
-        for method, source, of in methods or averages:
-            if of is not None:
-                leaks = of.psnr if source == "table 1" or method in NAMES.values() else None
-                values = zip(TABLE_2, (of.psnr, leaks, of.ssim, of.lpips), strict=True)
-                rows.append(
-                    {"dataset": dataset, "method": method, "source": f"paper, {source}", "recipe": ""} | dict(values)
-                )
-        at_paper = runs[(runs.departs == "") & (runs.dataset == dataset)]
-        ok = _once(of_one_machine(at_paper)) if len(at_paper) else at_paper
-        ok = ok[ok.scene.isin(protocol.scenes)]
-        if len(ok):
-            means = stats.means(ok, RECIPE, TABLE_2)
-            for row in means[means.scenes == len(protocol.scenes)].to_dict("records"):
-                named = {"method": row["model"], "source": f"measured, experiment {row['experiment']}"}
-                rows.append({"dataset": dataset, **named} | row)
-    numbers = [name + end for name in TABLE_2 for end in ("", " ±")]
-    return pd.DataFrame(rows, columns=["dataset", "method", "source", "recipe", "seeds", *numbers])
+        parts.append(_quoted(dataset))
+        at_paper = _at_paper(runs, dataset)
+        if (at_paper.status == "ok").any():
+            means = stats.means(_once(of_one_machine(at_paper)), RECIPE, TABLE_2)
+            means = means[means.scenes == len(protocol.scenes)]
+            named = {"method": means.model, "source": "measured, experiment " + means.experiment}
+            parts.append(means.assign(dataset=dataset, **named))
+    names = ["dataset", "method", "source", "recipe", "seeds", *(name + end for name in TABLE_2 for end in ("", " ±"))]
+    return pd.concat(parts, ignore_index=True).reindex(columns=names)
+
+
+def _quoted(dataset: str) -> pd.DataFrame:
+    """Return the rows of the paper's Table 2, or the averages of its Table 1 where Table 2 lacks a data set."""
+    rows = paper.read_table("paper_table2.csv")
+    rows = rows[rows.dataset == dataset].rename(columns={"lpips": "lpips_alex"})
+    if rows.empty:
+        averages = paper.table1().loc[(dataset, paper.AVERAGE)].loc[list(NAMES)].rename(columns={"lpips": "lpips_alex"})
+        rows = averages.assign(method=list(NAMES.values()), source="table 1", dataset=dataset)
+    leaks = rows.psnr_db.where((rows.source == "table 1") | rows.method.isin(list(NAMES.values())))
+    return rows.assign(source="paper, " + rows.source, recipe="", psnr_best_on_test_db=leaks)
 
 
 def successors(results: Results) -> pd.DataFrame:
@@ -187,7 +194,11 @@ def successors(results: Results) -> pd.DataFrame:
     """
     runs = results.finished.runs
     runs = runs[runs.model.isin(SUCCESSORS) & runs.dataset.isin(list(SUCCESSOR_SCENES))]
-    kept = [r.scene in SUCCESSOR_SCENES[r.dataset] and r.protocol.get("eval_split") == _split(r) for r in runs.record]
+    kept = [
+        r.scene in SUCCESSOR_SCENES[r.dataset]
+        and r.protocol.get("eval_split") == paper.PROTOCOLS[r.dataset].split(r.scene)
+        for r in runs.record
+    ]
     runs = runs[pd.Series(kept, runs.index, dtype=bool)]
     runs = runs.assign(
         order=runs.model.map(SUCCESSORS.index), protocol=runs.record.map(_protocol),
@@ -213,8 +224,7 @@ def successors(results: Results) -> pd.DataFrame:
 
 def published(dataset: str) -> pd.DataFrame:
     """Return the published numbers of a data set, "D-NeRF" or "7DGS-PBR": a row for each method and scene or mean."""
-    with resources.files(__package__).joinpath("successors.csv").open() as file:
-        table = pd.read_csv(file)
+    table = paper.read_table("successors.csv")
     table = table.assign(gaussians=1000 * table.thousand_gaussians)[table.dataset == dataset]
     return table.drop(columns="thousand_gaussians")
 
@@ -240,21 +250,14 @@ def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict
         yield row | {"protocol": SOURCES[of["source"]] + note, key: of["psnr_db"], "gaussians": of["gaussians"]}
 
 
-def _split(record: Record) -> str:
-    """Return the split on which a scene of a data set is tested: "val" for D-NeRF's lego, else "test"."""
-    splits = paper.PROTOCOLS[record.dataset].splits
-    return splits.get(record.scene, splits["*"])
-
-
 def _protocol(record: Record) -> str:
     """Return the protocol of a run as a text such as "gsbench, 2, 30,000 x 4".
 
     Parts that the name of a protocol does not imply are added: another filter, rounding or background.
     """
     of = record.protocol
-    train = record.provenance.config.get("train")
-    batch = train.get("batch_size") if isinstance(train, dict) else None
-    steps = frame.iterations(record)
+    batch = value_at(record, "provenance.config.train.batch_size")
+    steps = iterations(record)
     name = of.get("name", "protocol not recorded")
     implied = {"resize": "pillow" if name == "dgs2026" else None, "quantise": name == "dgs2026", "background": "black"}
     more = [f"{key} {of.get(key)}" for key, value in implied.items() if of.get(key) != value]
@@ -265,58 +268,64 @@ def sections(results: Results) -> dict[str, list[Section]]:
     """Return the sections of each table by the name of its file."""
     runs = of_the_paper(results)
     return {
-        "table1": list(_sections1(runs)),
+        "table1": [*_sections1(runs), pools(runs)],
         "table2": list(_sections2(runs)),
-        "table_successors": list(_newer(results)),
+        "table_successors": list(_sections_of_successors(results)),
     }
 
 
 def _sections1(runs: pd.DataFrame) -> Iterator[Section]:
+    """Yield the tables of measured rows, each with the paper's row and the difference below it."""
     rows = table1(runs)
-    shown = [_heading(of) for kind, _, of in _tables(runs) if kind != "paper"]
     for kind, dataset, of in _tables(runs):
-        lines = []
-        for row in rows[(rows.table == kind) & (rows.dataset == dataset)].to_dict("records"):
-            label = " ".join(
-                filter(None, [row["model"], row["recipe"], row["experiment"] * (of.experiment.nunique() > 1)])
-            )
-            scene = row["scene"] if row["scenes"] == 1 else f"average over {row['scenes']} scenes"
-            beside = (
-                {"paper": " paper", "difference": " difference"} if row["psnr_db paper"] == row["psnr_db paper"] else {}
-            )
-            for name, end in {label: "", **beside}.items():
-                lines.append({"scene": scene, "model": name} | {column: row[column + end] for column in TABLE_1})
-            lines[-1 - len(beside)] |= {f"{column} ±": row[f"{column} ±"] for column in TABLE_1} | {
-                "seeds": row["seeds"]
-            }
-        order = [name for column in TABLE_1 for name in (column, f"{column} ±")]
-        table = pd.DataFrame(lines, columns=["scene", "model", *order, "seeds"])
-        title = f"Table 1, {dataset}, at the paper's protocol" if kind == "paper" else f"{kind.upper()}, {_heading(of)}"
-        yield Section(f"table1-{kind}-{dataset}", title, TEXT_1 if kind == "paper" else "", table,
-                      notes=tuple(_notes(kind, dataset, of, runs, shown)))  # fmt: skip
+        table = _with_paper(rows[(rows.table == kind) & (rows.dataset == dataset)])
+        is_paper = kind == "paper"
+        title = f"Table 1, {dataset}, at the paper's protocol" if is_paper else f"{kind.upper()}, {_heading(of)}"
+        if len(table):
+            yield Section(f"table1-{kind}-{dataset}", title, TEXT_1 if is_paper else TEXT_OTHER, table)
+        if is_paper:
+            yield Section(f"seeds-{dataset}", f"Seeds, {dataset}", TEXT_SEEDS, seeds(of, dataset))
 
 
-def _notes(kind: str, dataset: str, of: pd.DataFrame, runs: pd.DataFrame, shown: list[str]) -> Iterator[str]:
-    """Yield what is missing, which runs are in no table, how runs depart, and which failed."""
-    if kind == "paper":
-        yield missing(dataset, of)
-        left = [pool for pool in _pools(runs).items() if pool[0][0] == dataset and _heading(pool[1]) not in shown]
-        if left:
-            named = [f"{len(pool)} run{'s' * (len(pool) > 1)} of {_heading(pool)}" for _, pool in left]
-            more = f"; and {len(left) - 5} more" if len(left) > 5 else ""
-            yield f"Left out, at another protocol than the paper's: {'; '.join(named[:5])}{more}."
-    elif kind == "other data":
-        yield "Rendered for this project in place of the paper's scenes; the paper's rows are not shown."
-    else:
-        what = sorted({word for departs in of.departs for word in departs.split(", ")})
-        yield f"Measured otherwise than in the paper (in {', '.join(what)}), so the paper's rows are not shown."
-    machines = of[of.status == "ok"].machine.value_counts()
-    if len(machines) > 1:
-        timed = of_one_machine(of).timed_on.iloc[0]
-        named = [f"{name} ({n} run{'s' * (n > 1)})" for name, n in machines.items() if name != timed]
-        yield printable(f"train min and FPS are of one machine, {timed}. Left out: {'; '.join(sorted(named))}.")
-    for run in of[of.status != "ok"].itertuples():
-        yield printable(f"{run.scene}, {run.model} {run.recipe} seed {run.seed} {run.status}: {run.reason}")
+def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of Table 1 as lines: measured, and the paper's line and the difference below it, where they are."""
+    several = rows.experiment.nunique() > 1
+    label = [" ".join(filter(None, (r.model, r.recipe, r.experiment * several))) for r in rows.itertuples()]
+    averages = "average over " + rows.scenes.astype(str) + " scenes"
+    rows = rows.assign(scene=rows.scene.where(rows.scenes == 1, averages))
+    has_paper = rows["psnr_db paper"].notna()
+    halves = [f"{name} ±" for name in TABLE_1]
+    parts = [rows[["scene", *TABLE_1, *halves, "seeds"]].assign(model=label)]
+    for end in ("paper", "difference"):
+        lines = rows.loc[has_paper, [f"{name} {end}" for name in TABLE_1]].set_axis(TABLE_1, axis=1)
+        parts.append(lines.assign(scene=rows.scene[has_paper], model=end))
+    order = [name for column in TABLE_1 for name in (column, f"{column} ±")]
+    table = pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
+    return table[["scene", "model", *order, "seeds"]].astype(dict.fromkeys([*order, "seeds"], float))
+
+
+def seeds(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
+    """Count the finished seeds of each model (rows) on each scene (columns), with the experiment's recipe."""
+    plain = runs[(runs.status == "ok") & (runs.recipe == "")]
+    scenes = list(paper.PROTOCOLS[dataset].scenes)
+    counts = plain.groupby(["model", "scene"]).seed.nunique().unstack().reindex(index=list(MODELS), columns=scenes)
+    return counts.fillna(0).astype(int).rename_axis(index="model", columns=None).reset_index()
+
+
+def pools(runs: pd.DataFrame) -> Section:
+    """Count the runs of each protocol, and tell whether a table shows them."""
+    rows = []
+    shown = [set(of.index) for _, _, of in _tables(runs)]
+    for (pool, differs), of in runs.groupby(["pool", runs.departs != ""]):
+        _, dataset, experiment, _, resize, steps = pool
+        settings = sorted({word for departs in of.departs for word in departs.split(", ")}) if differs else []
+        rows.append({
+            "data": dataset, "experiment": experiment, "size": ", ".join(sorted(set(of["size"]))),
+            "filter": resize.removesuffix("None"), "iterations": steps, "runs": len(of),
+            "failed": int((of.status != "ok").sum()), "machines": of.machine.nunique(),
+            "differs in": ", ".join(settings), "shown": any(set(of.index) <= table for table in shown),
+        })  # fmt: skip
+    return Section("pools", "All runs on the paper's data or stand-ins", TEXT_POOLS, pd.DataFrame(rows))
 
 
 def _heading(runs: pd.DataFrame) -> str:
@@ -327,47 +336,25 @@ def _heading(runs: pd.DataFrame) -> str:
     return printable(f"{dataset}: experiment {experiment}, {sizes}{resized}, {steps:,} iterations")
 
 
-def missing(dataset: str, runs: pd.DataFrame) -> str:
-    """Return a line that lists which scenes, models and seeds of a data set still have to be run at its protocol."""
-    plain = runs[(runs.status == "ok") & (runs.recipe == "")]
-    scenes = paper.PROTOCOLS[dataset].scenes
-    seeds = {(s, m): plain.seed[(plain.scene == s) & (plain.model == m)].nunique() for s in scenes for m in MODELS}
-    none = [s for s in scenes if not any(seeds[s, m] for m in MODELS)]
-    if len(none) == len(scenes):
-        return f"Missing: all {len(scenes)} scenes ({', '.join(scenes)})."
-    parts = [f"all models of {', '.join(none)}"] if none else []
-    for s in scenes:
-        lacking = [m for m in MODELS if not seeds[s, m]]
-        parts += [f"{s}: {', '.join(lacking)}"] if lacking and s not in none else []
-    few = [f"{s} {m} has {n}" for (s, m), n in seeds.items() if 0 < n < SEEDS]
-    parts += [f"seeds, of {SEEDS}: {', '.join(few)}"] if few else []
-    return f"Missing: {'; '.join(parts)}." if parts else f"Complete: all scenes and models, {SEEDS} seeds or more."
-
-
 def _sections2(runs: pd.DataFrame) -> Iterator[Section]:
     rows = table2(runs)
     for dataset, protocol in paper.PROTOCOLS.items():
         of = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
-        sources = {source.removeprefix("paper, "): source for source in of.source if source.startswith("paper, ")}
-        notes = [missing(dataset, runs[(runs.departs == "") & (runs.dataset == dataset)])]
-        notes += [f"{name}: {SOURCES_2[name]}" for name in sources]
+        notes = tuple(f"{name}: {text}" for name, text in SOURCES_2.items() if f"paper, {name}" in set(of.source))
         title = f"Table 2, {dataset}, average over {len(protocol.scenes)} scenes, at the paper's protocol"
-        yield Section(f"table2-{dataset}", title, TEXT_2, of, notes=tuple(notes))
+        yield Section(f"table2-{dataset}", title, TEXT_2, of, notes=notes)
 
 
-def _newer(results: Results) -> Iterator[Section]:
+def _sections_of_successors(results: Results) -> Iterator[Section]:
     rows = successors(results)
     for dataset in SUCCESSOR_SCENES:
         of = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
         sources = list(of.protocol[of.row == "published"].unique())
         of["protocol"] = [f"published ({sources.index(p) + 1})" if p in sources else p for p in of.protocol]
-        measured = set(of.method[of.row == "measured"])
-        lacking = [model for model in SUCCESSORS if model not in measured]
-        notes = [f"({i}) {source}" for i, source in enumerate(sources, 1)]
-        notes += [f"No finished run here of {', '.join(lacking)}."] if lacking else []
+        notes = tuple(f"({i}) {source}" for i, source in enumerate(sources, 1))
         columns = {"scenes": Column("scenes", 0), "seeds": Column("seeds", 0)}
         table, title = of.drop(columns="row"), f"Successors of 7DGS, {dataset}"
-        yield Section(f"successors-{dataset}", title, TEXT_SUCCESSORS, table, columns, notes=tuple(notes))
+        yield Section(f"successors-{dataset}", title, TEXT_SUCCESSORS, table, columns, notes=notes)
 
 
 def numbers(results: Results) -> dict[str, pd.DataFrame]:

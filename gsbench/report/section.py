@@ -133,12 +133,18 @@ class Section:
 
 
 def number(value: float, digits: int, *, signed: bool = False) -> str:
-    """Format a number with commas; a difference has a sign, unless it rounds to zero; infinity is "never"."""
+    """Format a number with commas; a difference has a sign; what rounds to zero has none; infinity is "never"."""
     if not math.isfinite(value):
         return EMPTY if math.isnan(value) else "never"
     zero = f"{0:.{digits}f}"
     shown = f"{value:{'+' if signed else ''},.{digits}f}"
-    return zero if signed and shown[1:] == zero else shown
+    return zero if shown.lstrip("+-") == zero else shown
+
+
+def span(values: pd.Series, digits: int, *, signed: bool = False) -> str:
+    """Return the least and the largest number, such as "0.8 to 1.2", or one of them if they look alike."""
+    ends = (number(float(value), digits, signed=signed) for value in (values.min(), values.max()))
+    return " to ".join(dict.fromkeys(ends))
 
 
 def text(value: Any) -> str:

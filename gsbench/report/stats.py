@@ -180,6 +180,12 @@ def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, show: Callab
     return places
 
 
+def ranked_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Add columns of ranks, 1 for the highest value of each row to two decimals, as they are shown."""
+    rounded = table.round(2)
+    return table.join(rounded.eq(rounded.max(axis=1), axis=0).astype(int).add_suffix(" rank"))
+
+
 def factorial(cells: dict[tuple[bool, ...], Key], factors: Sequence[str]) -> list[tuple[str, Weights]]:
     """Return the name and the weights of every effect and interaction of `factors` whose models were all run.
 

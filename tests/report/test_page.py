@@ -37,7 +37,7 @@ from gsbench.errors import InputError
 from gsbench.measure import record as files
 from gsbench.measure.images import strip, write_png
 from gsbench.measure.record import Region
-from gsbench.report import live, output, select
+from gsbench.report import output, select
 from gsbench.report.__main__ import main
 from gsbench.report.frame import load
 from gsbench.report.render import page, palette, text
@@ -434,7 +434,7 @@ def test_live_writes_again_when_a_record_arrives(tmp_path, capsys, monkeypatch):
             raise KeyboardInterrupt from None
 
     monkeypatch.setattr(time, "sleep", sleep)
-    assert live.watch(tmp_path / "mini") == 0
+    assert output.watch(tmp_path / "mini") == 0
     printed = capsys.readouterr().out.splitlines()
     for part, line in zip(("expected a folder of results", "1 records", "2 records"), printed, strict=False):
         assert part in line

@@ -13,7 +13,7 @@ from gsbench.measure import record as files
 from gsbench.measure.curve import Point
 from gsbench.measure.record import LengthChoice, OnDemand, Record, Region, Stop, ViewScore
 from gsbench.report import frame, study
-from gsbench.report.publish import publish
+from gsbench.report.output import publish
 
 TEXTS = ("", "1", "1e5", "1.0 ", "true", "null", "NaN", "[1", '"', "=1+1", "-2", "+3", "@x", " a,b\n\t", "ü\u202e",
          HOSTILE)  # fmt: skip

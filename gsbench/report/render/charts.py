@@ -41,25 +41,23 @@ def spec(
         width: pixels, or "container".
         legend: whether the chart has a legend of its own; a page has one above its figures.
     """
-    show = {
-        name: _rounded if is_float_dtype(of) else text for name, of in figure.table.items() if not is_bool_dtype(of)
-    }
-    table = figure.table.assign(**{name: figure.table[name].map(function) for name, function in show.items()})
+    table = figure.table.copy()
+    for name, of in figure.table.items():
+        if not is_bool_dtype(of):
+            table[name] = of.map(_rounded if is_float_dtype(of) else text)
     chart = DRAWINGS[figure.draw](table, look, **figure.options)
     if "scene" in table:
-        chart = chart.add_params(alt.param("scene", value=scene or table.scene.iloc[0])).transform_filter(
-            "datum.scene == scene"
-        )
+        chart = chart.add_params(alt.param("scene", value=scene or table.scene.iloc[0]))
+        chart = chart.transform_filter("datum.scene == scene")
     if "series" in table:
         chart = chart.add_params(alt.param("hidden", value=[])).transform_filter("indexof(hidden, datum.series) < 0")
     axis = {"labelColor": MUTED, "titleColor": MUTED, "domainColor": LINE, "gridColor": LINE, "tickColor": LINE,
             "titleFontWeight": "normal", "labelFontSize": 12, "titleFontSize": 12, "labelLimit": 220}  # fmt: skip
     shown = {"labelColor": INK, "titleColor": INK, "labelFontSize": 12} if legend else {"disable": True}
     chart = chart.configure(background="transparent", font=FONT, axis=axis, legend=shown, view={"stroke": None})
-    described = chart.properties(description=f"{figure.caption}; the table has the numbers", width=width)
-    plain: dict[str, Any] = described.properties(autosize=alt.AutoSizeParams(type="fit-x", contains="padding")).to_dict(
-        validate=False
-    )
+    fit = alt.AutoSizeParams(type="fit-x", contains="padding")
+    described = chart.properties(description=f"{figure.caption}; the table has the numbers", width=width, autosize=fit)
+    plain: dict[str, Any] = described.to_dict(validate=False)
     return plain
 
 
@@ -87,9 +85,8 @@ def write(figure: Figure, look: Look, stem: Path) -> list[Path]:
 def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerChart:
     """Draw PSNR against a cost: means with intervals, a line through those on the frontier, single runs, the paper."""
     halves = table.get("psnr_db ±", pd.Series(0.0, table.index)).fillna(0.0)
-    table = table.assign(best=table[f"best {x}"], low=table.psnr_db - halves, high=table.psnr_db + halves).dropna(
-        subset=[x, "psnr_db"]
-    )
+    table = table.assign(best=table[f"best {x}"], low=table.psnr_db - halves, high=table.psnr_db + halves)
+    table = table.dropna(subset=[x, "psnr_db"])
     names = ["scene", "series", "model", "variant", "kind", "seeds", x, "psnr_db", "low", "high", "best"]
     base = alt.Chart(table.reindex(columns=names).astype({"seeds": str}))
     at = {"x": alt.X(x, type="quantitative", title=title, scale=_scale(table[x])), "y": _y("psnr_db", "PSNR, dB")}
@@ -201,20 +198,13 @@ def _y(name: str, title: str) -> alt.Y:
 
 
 def _scale(values: pd.Series) -> alt.Scale:
-    low, high = values.min(), values.max()
-    return (
-        alt.Scale(type="log", nice=False, padding=12)
-        if low > 0 and high / low > LOG_FROM
-        else alt.Scale(zero=False, padding=12)
-    )
+    is_wide = values.min() > 0 and values.max() / values.min() > LOG_FROM
+    return alt.Scale(type="log", nice=False, padding=12) if is_wide else alt.Scale(zero=False, padding=12)
 
 
 def _tip(**titles: str) -> list[alt.Tooltip]:
     """Return the lines of a tooltip: columns with their titles, numbers with at most four digits."""
     texts = ("series", "model", "variant", "seeds", "event", "name", "pair", "label", "part", "significant")
-    return [
-        alt.Tooltip(name, type="nominal", title=title)
-        if name in texts
-        else alt.Tooltip(name, type="quantitative", title=title, format=",.4~g")
-        for name, title in titles.items()
-    ]
+    kinds = {name: {"type": "nominal"} if name in texts else {"type": "quantitative", "format": ",.4~g"}
+             for name in titles}  # fmt: skip
+    return [alt.Tooltip(name, title=title, **kinds[name]) for name, title in titles.items()]

@@ -96,19 +96,13 @@ def figures(results: Results, folder: Path) -> list[Path]:
 
 def _article(key: str, chapter: Results) -> Article:
     runs = chapter.runs
-    counts = {
-        "run": len(runs),
-        "model": runs.model.nunique(),
-        "scene": runs.scene.nunique(),
-        "seed": runs.seed.nunique(),
-    }
+    counts = {"run": len(runs)} | {name: runs[name].nunique() for name in ("model", "scene", "seed")}
     words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
     title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])[:60]}"
+    summary = " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]])
     mean = runs.groupby("model").psnr_db.mean()
-    return Article(
-        key, title, " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]]), built(chapter),
-        sorted(runs.series.unique()), "" if mean.isna().all() else str(mean.idxmax()),
-    )  # fmt: skip
+    best = "" if mean.isna().all() else str(mean.idxmax())
+    return Article(key, title, summary, built(chapter), sorted(runs.series.unique()), best)
 
 
 def table(of: Section) -> dict[str, Any]:
@@ -117,26 +111,19 @@ def table(of: Section) -> dict[str, Any]:
     A column without any text is left out.
     """
     shown = of.shown().iloc[:MOST_ROWS]
-    names = [name for name, title in zip(of.shown_columns, shown, strict=True) if shown[title].ne("").any()]
-    shown = shown[[of.column(name).title for name in names]]
-    kinds = ["number" if of.is_number(name) else "" for name in names]
-    columns = [
-        [
-            (title, kind),
-            *(
-                (cell, f"{kind} best" if rank == 1 else kind)
-                for cell, rank in zip(shown[title], of.rank(name), strict=False)
-            ),
-        ]
-        for name, title, kind in zip(names, shown, kinds, strict=True)
-    ]
-    turned = len(names) > TURNED > len(shown)
+    columns = []
+    for name, title in zip(of.shown_columns, shown, strict=True):
+        if shown[title].ne("").any():
+            kind = "number" if of.is_number(name) else ""
+            ranked = zip(shown[title], of.rank(name), strict=False)
+            columns.append([(title, kind), *((cell, f"{kind} best" if rank == 1 else kind) for cell, rank in ranked)])
+    turned = len(columns) > TURNED > len(shown)
     if columns and not turned:  # a group is named in its first row
         texts = [text for text, _ in columns[0]]
         columns[0] = [(text, "repeated" if text == above else kind)
                       for (text, kind), above in zip(columns[0], [None, *texts], strict=False)]  # fmt: skip
     rows = columns if turned else list(zip(*columns, strict=True))
-    return {"rows": rows, "turned": turned, "count": len(of.table), "more": len(of.table) - len(shown)}
+    return {"rows": rows, "turned": turned, "more": len(of.table) - len(shown)}
 
 
 def _keys(figure: Figure) -> dict[str, list[str]]:
@@ -147,12 +134,8 @@ def _keys(figure: Figure) -> dict[str, list[str]]:
 
 def _swatches(of: Section) -> list[tuple[str, str]]:
     """Return the legend of the stacked bars of a section: each part with the variable of its colour."""
-    options = [figure.options for figure in of.figures if figure.draw == "bars"]
-    return [
-        (part, hue)
-        for option in options
-        for part, hue in zip(option["parts"], charts.part_colours(option["parts"], option["colours"]), strict=True)
-    ]
+    bars = [(figure.options["parts"], figure.options["colours"]) for figure in of.figures if figure.draw == "bars"]
+    return [pair for parts, hues in bars for pair in zip(parts, charts.part_colours(parts, hues), strict=True)]
 
 
 @functools.cache

@@ -68,10 +68,15 @@ def markdown(sections: Sequence[Section]) -> str:
 
 def table(section: Section) -> str:
     """Return the table of a section as Markdown, as the blocks of README and docs have it."""
-    shown = section.shown(lambda text, rank: f"**{text}**" if rank == 1 else text)
+    shown = section.shown(bold)
     marks = ["---:" if section.is_number(name) else "---" for name in section.shown_columns]
     rows = [list(shown), marks, *shown.to_numpy().tolist()]
     return "\n".join(f"| {' | '.join(map(escaped, row))} |" for row in rows) if len(shown) else ""
+
+
+def bold(text: str, rank: int) -> str:
+    """Mark the best number of a column or row."""
+    return f"**{text}**" if rank == 1 else text
 
 
 def escaped(text: str) -> str:
@@ -126,27 +131,11 @@ def tex(text: str) -> str:
 
 
 def plain(sections: Sequence[Section]) -> list[dict[str, Any]]:
-    """Return sections as plain values, the numbers not rounded; a number that is missing is None."""
+    """Return sections as plain values, the numbers not rounded; `as_json` writes a number that is missing as null."""
     return [
-        {"key": of.key, "title": of.title, "text": of.text, "notes": list(of.notes), "rows": rows(of.table)}
+        {"key": of.key, "title": of.title, "text": of.text, "notes": of.notes, "rows": of.table.to_dict("records")}
         for of in sections
     ]
-
-
-def rows(of: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows of a table as plain values; infinity, which is a target never reached, is None too."""
-    values = of.astype(object).where(of.notna() & ~of.isin([float("inf"), -float("inf")]), None)
-    return [{str(name): _plain(value) for name, value in row.items()} for row in values.to_dict("records")]
-
-
-def _plain(value: Any) -> Any:
-    return (
-        value.item()
-        if hasattr(value, "item")
-        else value
-        if isinstance(value, bool | int | float | None)
-        else str(value)
-    )
 
 
 def csv(of: pd.DataFrame) -> str:

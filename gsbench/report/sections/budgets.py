@@ -1,10 +1,12 @@
 """PSNR against seconds, milliseconds and MB: the best model within each budget, and the frontier of each model."""
 
+import math
+
 import pandas as pd
 
 from gsbench.report import paper, stats
 from gsbench.report.frame import Results, covered
-from gsbench.report.paper_protocol import has_images_of_paper
+from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Asked, Column, Figure, Section, section
 
 COSTS = {"train_s": "training s", "frame_ms": "ms a frame", "model_mb": "MB"}
@@ -52,39 +54,26 @@ def asked(chapter: Results) -> Asked:
 @section(asked)
 def budgets(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table of the best model within each budget."""
-    rows = []
-    for budget, table in contests(chapter).items():
-        of = tests[tests.name == budget]
-        counts = {"better than": of.significant & (of["mean"] > 0), "undecided": ~of.significant & of.p_holm.notna(),
-                  "worse than": of.significant & (of["mean"] < 0), "untested": of.p_holm.isna()}  # fmt: skip
-        rows.append(table.head(1).assign(**{name: int(of_kind.sum()) for name, of_kind in counts.items()}))
-        rows[-1] = rows[-1].assign(budget=budget) if len(table) else pd.DataFrame({"budget": [budget]})
-    order = [
-        "budget",
-        "model",
-        "variant",
-        "psnr_db",
-        "psnr_db ±",
-        *COSTS,
-        "better than",
-        "undecided",
-        "worse than",
-        "untested",
-    ]
+    counts = pd.DataFrame({
+        "better than": tests.significant & (tests["mean"] > 0), "undecided": ~tests.significant & tests.p_holm.notna(),
+        "worse than": tests.significant & (tests["mean"] < 0), "untested": tests.p_holm.isna(),
+    }).groupby(tests.name).sum()  # fmt: skip
+    best = {budget: table.head(1).reset_index(drop=True) for budget, table in contests(chapter).items()}
+    table = pd.concat([of.reindex([0]).assign(budget=budget) for budget, of in best.items()], ignore_index=True)
+    table = table.join(counts, on="budget").fillna(dict.fromkeys(counts, 0))
+    table.loc[table.model.isna(), list(counts)] = math.nan
     text = (
         "The model with the highest PSNR on val of those within the budget, and its PSNR on the evaluated views, which "
         "choose too where val is missing or evaluated. The last columns count the other models within the budget that "
         "it differs from significantly, after Holm's correction for all comparisons of this report, or not."
     )
-    scenes, beside = basis(chapter), is_beside_others(chapter.finished.runs).sum()
-    notes = [f"Mean over {', '.join(scenes)}."] if scenes else ["No run has finished."]
-    if beside:
-        notes.append(
-            f"{beside} of {len(chapter.finished.runs)} runs were measured beside other work, which makes times longer."
-        )
-    columns = {name: Column(name, 0) for name in order[-4:]}
-    return Section("budgets", "Which model to use", text, pd.concat(rows, ignore_index=True).reindex(columns=order),
-                   columns, notes=tuple(notes))  # fmt: skip
+    runs, scenes = chapter.finished.runs, basis(chapter)
+    notes = [f"Mean over {', '.join(scenes)}." if scenes else "No run has finished."]
+    if beside := int(is_beside_others(runs).sum()):
+        notes.append(f"{beside} of {len(runs)} runs were measured beside other work, which makes times longer.")
+    columns = {name: Column(name, 0) for name in counts}
+    order = ["budget", "model", "variant", "psnr_db", "psnr_db ±", *COSTS, *counts]
+    return Section("budgets", "Which model to use", text, table.reindex(columns=order), columns, notes=tuple(notes))
 
 
 def is_beside_others(runs: pd.DataFrame) -> pd.Series:
@@ -123,13 +112,10 @@ def _frontier(chapter: Results, scenes: list[str]) -> pd.DataFrame:
     """Return the points of some scenes, which of them are dominated, and which are on the frontier of their model."""
     table = points(chapter, scenes)
     name = scenes[0] if len(scenes) == 1 else f"mean of {len(scenes)} scenes"
-    best = {
-        f"best {cost}": pd.concat(
-            [stats.is_on_frontier(of, cost) for _, of in table.groupby("series")] or [pd.Series()]
-        )
-        for cost in COSTS
-    }
-    return table.assign(scene=name, dominated=stats.is_dominated(table, "train_s"), **best)
+    series = [of for _, of in table.groupby("series")]
+    for cost in COSTS:
+        table[f"best {cost}"] = pd.concat([stats.is_on_frontier(of, cost) for of in series] or [pd.Series()])
+    return table.assign(scene=name, dominated=stats.is_dominated(table, "train_s"))
 
 
 def _single_runs(chapter: Results) -> list[pd.DataFrame]:
@@ -148,7 +134,7 @@ def _of_paper(chapter: Results) -> list[pd.DataFrame]:
     rows = []
     for run in first.to_dict("records"):
         numbers = paper.average(run["dataset"], [run["scene"]], run["model"])
-        if numbers is not None and has_images_of_paper(run["record"]):
+        if len(numbers) and has_images_of_paper(run["record"]):
             cost = {"train_s": numbers.train_min * 60, "frame_ms": 1000 / numbers.fps}
             rows.append(
                 {name: run[name] for name in ("scene", "series", "model")} | {"psnr_db": numbers.psnr_db} | cost

@@ -14,7 +14,7 @@ from gsbench.measure.record import Record
 from gsbench.reading import parse
 from gsbench.report import paper
 from gsbench.report.frame import Results
-from gsbench.report.paper_protocol import has_images_of_paper
+from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Column, Figure, Section, section
 from gsbench.schedule import Schedule
 
@@ -68,7 +68,7 @@ def _rules(runs: pd.DataFrame, ends: pd.Series) -> Iterator[tuple[str, float]]:
     for target in round_numbers(ends.min(), ends.max()):
         yield f"{target:g} dB", target
     numbers = paper.average(runs.dataset.iloc[0], [runs.scene.iloc[0]], "7dgs")
-    if numbers is not None and all(map(has_images_of_paper, runs.record)):
+    if len(numbers) and all(map(has_images_of_paper, runs.record)):
         yield "paper's 7dgs", float(numbers.psnr_db)
 
 
@@ -114,17 +114,14 @@ def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
     solved = seconds[np.isfinite(seconds.min(axis=1))].fillna(math.inf)
     if solved.empty:
         return pd.DataFrame()
+    fastest = solved.min(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = solved.div(solved.min(axis=1), axis=0)
-    ratios = ratios.mask(solved.eq(solved.min(axis=1), axis=0), 1.0)
-    finite = ratios.to_numpy()[np.isfinite(ratios.to_numpy())]
-    end = max(2.0, 1.15 * max(finite, default=1.0))
+        ratios = solved.div(fastest, axis=0).mask(solved.eq(fastest, axis=0), 1.0)
+    end = max(2.0, 1.15 * ratios.where(np.isfinite(ratios)).max(axis=None))
     rows = []
     for name, column in ratios.items():
-        reached = np.sort(column[np.isfinite(column)].to_numpy())
-        at = [1.0, *reached, end]
-        share = [100 * float((reached <= factor).sum()) / len(solved) for factor in at]
-        rows += [{"series": name, "factor": x, "share": y} for x, y in zip(at, share, strict=True)]
+        factors = [1.0, *sorted(column[np.isfinite(column)]), end]
+        rows += [{"series": name, "factor": x, "share": 100 * float((column <= x).mean())} for x in factors]
     table = pd.DataFrame(rows, columns=["series", "factor", "share"])
     table.attrs["targets"] = len(solved)
     return table
@@ -193,10 +190,9 @@ def _rates(record: Record) -> dict[str, Any]:
     model = record.provenance.config["model"]
     if model.get("candidates"):
         comparison = record.on_demand.comparison if record.on_demand else None
-        choices = {
-            choice.get("name"): choice for key in ("compared", "candidates") for choice in model.get(key, {}).values()
-        }
+        choices = [*model.get("compared", {}).values(), *model["candidates"].values()]
         by_screen = model["candidates"]["moving" if record.effects.time else "static"]
-        model = choices.get(comparison.chosen, by_screen) if comparison else by_screen
+        chosen = [choice for choice in choices if comparison and choice.get("name") == comparison.chosen]
+        model = next(reversed(chosen), by_screen)
     rates: dict[str, Any] = model["lr"]
     return rates

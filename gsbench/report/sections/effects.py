@@ -55,18 +55,19 @@ def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
     if gains.empty:
         return None
     table = pd.DataFrame({"effect": gains.index, "computed from": gains.weights.map(_words)})
-    columns, figures = {}, []
-    for quantity, (unit, digits) in UNITS.items():
+    columns = {unit: Column(unit, digits, signed=True) for unit, digits in UNITS.values()}
+    figures = []
+    for quantity, (unit, _) in UNITS.items():
         of = by_unit[quantity].loc[gains.index]
-        significant = f"{unit}: significant"
-        table[unit], table[f"{unit} ±"] = of["mean"], of["high"] - of["mean"]
-        table[significant] = [verdict(test) for test in of.to_dict("records")]
-        columns[unit] = Column(unit, digits, signed=True)
-        drawn = of.reset_index().assign(significant=table[significant].to_numpy()).rename(columns={"mean": unit})
+        of = of.assign(significant=[verdict(test) for test in of.to_dict("records")])
+        table[unit], table[f"{unit} ±"], table[f"{unit}: significant"] = (
+            of["mean"],
+            of["high"] - of["mean"],
+            of.significant,
+        )
+        drawn = of.drop(columns="weights").rename(columns={"mean": unit}).reset_index()
         if drawn[unit].notna().any():
-            figures.append(
-                Figure(f"in {unit}", "intervals", drawn.drop(columns="weights"), {"label": "name", "value": unit})
-            )
+            figures.append(Figure(f"in {unit}", "intervals", drawn, {"label": "name", "value": unit}))
     table["± over scenes"], table["scenes that gain"] = gains["± over scenes"], gains.gaining
     table["scenes that lose"] = [sum(mean < 0 for mean in means) for means in gains["by scene"]]
     text = (
@@ -84,15 +85,11 @@ def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
 def _absent(chapter: Results) -> list[str]:
     """List which combinations of effects no model has, and which models are left out."""
     cells, nested = models(chapter)
-    main = chapter.finished.runs[chapter.finished.runs.main]
-    shown = {model for model, _ in (*cells.values(), *nested.values())}
-    lacking = 8 - len(cells)
-    notes = [f"{lacking} of 8 combinations of effects were not run."] if lacking else []
-    if others := sorted(set(main.model) - shown):
-        notes.append(
-            f"Left out, as another model has these effects or each Gaussian keeps what it needs: {', '.join(others)}."
-        )
-    return notes
+    runs = chapter.finished.runs
+    others = sorted(set(runs.model[runs.main]) - {model for model, _ in (*cells.values(), *nested.values())})
+    notes = [f"{8 - len(cells)} of 8 combinations of effects were not run."] if len(cells) < 8 else []
+    reason = "Left out, as another model has these effects or each Gaussian keeps what it needs"
+    return notes + [f"{reason}: {', '.join(others)}."] * bool(others)
 
 
 def _words(weights: stats.Weights) -> str:

@@ -43,12 +43,8 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
         parts.append(_means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
     rows = pd.concat(parts, ignore_index=True)
     rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
-    order = [
-        "scene",
-        "label",
-        *(c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows),
-        "seeds",
-    ]
+    shown = [c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows]
+    order = ["scene", "label", *shown, "seeds"]
     rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
     title = f"experiment {runs.experiment.iloc[0]}, data {text(runs.dataset.iloc[0])[:60]}"
     return Section("experiment", f"Results: {title}", TEXT, rows, notes=tuple(_notes(chapter)))
@@ -76,7 +72,7 @@ def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> 
         of = first.loc[[(name, label) for name in scenes]]
         named = of.protocol_paper_dataset.iloc[0] if "protocol_paper_dataset" in of else None
         numbers = paper.average(str(named), scenes, of.model.iloc[0])
-        if numbers is not None:
+        if len(numbers):
             title = "paper" if (of.dataset == named).all() else "paper, other data"
             yield pd.DataFrame([numbers.to_dict() | {"scene": scene, "label": title}], index=[i])
 

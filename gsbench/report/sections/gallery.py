@@ -139,18 +139,18 @@ def _has_blocks(image: Pixels, factor: int) -> bool:
 
 def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quality: int, most: int) -> list[View]:
     """Encode the views that the image files of all models contain."""
+    models = dict(sorted(models.items()))
     shared = min(len(strip) for _, strip in models.values())
-    first, strip = next(iter(models.values()))
+    record, strip = next(iter(models.values()))
+    names = [printable(view.name)[:60] for view in _spaced(record, shared)]
     shown = []
     for i in range(min(shared, most)):
-        encode = lambda kind: {m: _encode(s[i][kind], side, quality) for m, (_, s) in sorted(models.items())}  # noqa: B023, E731
-        height, width = strip[i][1].shape[:2]
-        spaced = _spaced(first, shared)
-        name = printable(spaced[i].name)[:60] if i < len(spaced) else f"view {i + 1}"
-        scores = {model: _score(record, len(rows), i) for model, (record, rows) in models.items()}
-        shown.append(
-            View(scene, name, _encode(strip[i][1], side, quality), encode(0), encode(2), scores, width, height)
-        )
+        render, error = ({model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()}
+                         for kind in (0, 2))  # fmt: skip
+        scores = {model: _score(of, len(rows), i) for model, (of, rows) in models.items()}
+        truth, (height, width) = _encode(strip[i][1], side, quality), strip[i][1].shape[:2]
+        name = names[i] if i < len(names) else f"view {i + 1}"
+        shown.append(View(scene, name, truth, render, error, scores, width, height))
     return shown
 
 
@@ -165,11 +165,8 @@ def _score(record: Record, rows: int, i: int) -> str:
     if i >= len(views) or views[i].psnr is None:
         return ""
     regions = {"moving": views[i].psnr_moving, "object": views[i].psnr_object}
-    texts = [
-        f"{name} {EMPTY if value is None else number(value, 2)}"
-        for name, value in regions.items()
-        if name in record.regions
-    ]
+    texts = [f"{name} {EMPTY if psnr is None else number(psnr, 2)}"
+             for name, psnr in regions.items() if name in record.regions]  # fmt: skip
     return ", ".join([f"PSNR {number(views[i].psnr or 0.0, 2)} dB", *texts])
 
 

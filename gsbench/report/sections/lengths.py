@@ -2,6 +2,7 @@
 
 import pandas as pd
 
+from gsbench.report import stats
 from gsbench.report.frame import Results, without
 from gsbench.report.section import Column, Section, section
 
@@ -22,8 +23,8 @@ def lengths(chapter: Results, tests: pd.DataFrame) -> Section | None:
     )
     means = table.groupby(["scene", "model"]).mean().reset_index()
     columns = {name: Column(name, 2) for name in table} | {"tried": Column("iterations tried", 0)}
-    ranked = _ranked(means, [name for name in table if name not in ("kept", "tried")])
-    return Section("lengths", "How long to train", text, ranked, columns)
+    ranks = stats.ranked_rows(means[[name for name in table if name not in ("kept", "tried")]]).filter(like=" rank")
+    return Section("lengths", "How long to train", text, means.join(ranks), columns)
 
 
 def by_length(runs: pd.DataFrame) -> pd.DataFrame:
@@ -41,9 +42,3 @@ def by_length(runs: pd.DataFrame) -> pd.DataFrame:
     kept = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
     tried = [sum(psnr.columns[: rise + 2]) for rise in rises]
     return psnr.rename(columns="{:,.0f}".format).rename_axis(columns=None).assign(kept=kept, tried=tried)
-
-
-def _ranked(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    """Mark the highest values of each row as they are shown."""
-    shown = table[names].round(2)
-    return table.join(shown.eq(shown.max(axis=1), axis=0).astype(int).add_suffix(" rank"))

@@ -2,18 +2,15 @@
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from gsbench.gates.messages import EFFECT_SETS, of_comparison
 from gsbench.measure.record import Gate, Record
-from gsbench.report import stats
-from gsbench.report.frame import Results
-from gsbench.report.intervals import Estimate, over_seeds
+from gsbench.report.frame import Results, names_of
+from gsbench.report.intervals import over_seeds
 from gsbench.report.section import COLUMNS, Column, Figure, Section, section
 from gsbench.report.sections.gallery import images
 
@@ -31,6 +28,8 @@ SHOWN = {
     "ms_before": Column("ms before", 2), "ms": Column("ms", 2, signed=True),
     "mb_before": Column("MB before"), "mb": COLUMNS["model_mb"],
 }  # fmt: skip
+TEXTS = ["decision", "why", "compared", "split", "checked_on"]  # of a run, beside SHOWN
+LOSSES = ["predicted", "evaluated", "checked"]  # dB: predicted, on the evaluated views, and on those of the check
 
 
 @section()
@@ -40,10 +39,8 @@ def on_demand(chapter: Results, tests: pd.DataFrame) -> Section | None:
     runs = runs[runs.on_demand]
     if runs.empty:
         return None
-    groups = runs.groupby(["scene", "model", "variant"], sort=True)
-    rows = [dict(zip(("scene", "model", "variant"), key, strict=True)) | _mean(of) for key, of in groups]
-    table = pd.DataFrame(rows)
-    names = table.model if table.variant.nunique() == 1 else (table.model + " " + table.variant).str.rstrip()
+    table = _means(runs)
+    names = table.model if table.variant.nunique() == 1 else names_of(table)
     drawn = table.assign(label=table.scene + ", " + names)[table.gated > 0].head(MOST_BARS)
     figures = () if drawn.empty else (
         _figure("Gaussians before the gates, by effect set, %", drawn, [*EFFECT_SETS, REMOVED], "effect set"),
@@ -54,59 +51,55 @@ def on_demand(chapter: Results, tests: pd.DataFrame) -> Section | None:
         "PSNR and ms are those of the gate after training. A gate during training changes the training too: compare "
         "runs with and without gates in “What accuracy costs”."
     )
-    where = [(f"{scene}, {model}", of.path) for (scene, model, _), of in groups]
-    pictures = [(caption, _picture(paths)) for caption, paths in where]
+    groups = runs.groupby(["scene", "model", "variant"])
+    pictures = [(f"{scene}, {model}", _picture(of.path)) for (scene, model, _), of in groups]
     notes, shown = tuple(_notes(runs)), tuple(images(pictures))
     return Section("on_demand", "Effects on demand", text, table, SHOWN, figures, notes, images=shown)
 
 
-def _mean(runs: pd.DataFrame) -> dict[str, Any]:
-    """Return the row of a model on a scene: means over the seeds that have a number."""
-    of = pd.DataFrame(
-        [_run(r, r.provenance.machine == timed) for r, timed in zip(runs.record, runs.timed_on, strict=True)]
-    )
-    evaluated = of.dB_evaluated[of.ends].notna().all()
-    of["dB"] = of.dB_evaluated if evaluated else of.dB_checked
-    screens = [r.on_demand.screen for r in runs.record if r.on_demand.screen]
-    decisions = Counter(screen.decision for screen in screens)
-    comparison = next((r.on_demand.comparison for r in runs.record if r.on_demand.comparison), None)
-    estimates = {name: _estimate(of[name]) for name in SHOWN}
-    numbers = {name: estimate.mean for name, estimate in estimates.items()}
-    halves = {f"{name} ±": estimates[name].half for name in ("dB", "ms")}
-    split = of.split if evaluated else of.checked_on
-    texts = {
-        "seeds": len(runs),
-        "screen": ", ".join(f"{decision} {n}" for decision, n in sorted(decisions.items())),
-        "why": screens[0].reason if screens else "",
-        "compared": of_comparison(comparison) if comparison else "",
-        "gated": int(of.before.notna().sum()),
-        "measured on": next(
-            (value for value, ends in zip(split, of.ends, strict=True) if ends and isinstance(value, str)), ""
-        ),
-    }
-    order = [*texts, *(c for name in SHOWN for c in (name, f"{name} ±") if c in numbers or c in halves)]
-    return {name: (texts | numbers | halves)[name] for name in order} | {"p": of.p.max()}
+def _means(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each configuration on a scene: means over the seeds that have a number, and the largest p.
+
+    The change of PSNR is that on the evaluated views, or on the views of the gate's check if a run lacks the first.
+    """
+    rows = [_numbers(run.record, is_timed=run.machine == run.timed_on) for run in runs.itertuples()]
+    names = [*SHOWN, "evaluated", "checked"]
+    of = pd.DataFrame(rows, runs.index).reindex(columns=["ends", *TEXTS, *names])
+    of = of.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))
+    of[["free", "asleep"]] *= 100
+    of[LOSSES] *= -1
+    of["ms"] -= of.ms_before
+    key = [runs[name] for name in ("scene", "model", "variant")]
+    is_evaluated = (of.evaluated.notna() | ~of.ends).groupby(key).transform("all")
+    of["dB"] = of.evaluated.where(is_evaluated, of.checked)
+    of["measured on"] = of.split.where(is_evaluated, of.checked_on).where(of.ends)
+    groups = of.groupby(key)
+    table = pd.DataFrame({
+        "seeds": groups.size(), "screen": groups.decision.agg(_counted), "why": groups.why.first(),
+        "compared": groups.compared.first(), "gated": groups.before.count(),
+        "measured on": groups["measured on"].first(),
+    })  # fmt: skip
+    table = table.join(groups[list(SHOWN)].mean()).assign(p=groups.p.max())
+    for name in ("dB", "ms"):
+        half = groups[name].agg(lambda values: over_seeds(values.dropna()).half if values.notna().any() else math.nan)
+        table.insert(table.columns.get_loc(name) + 1, f"{name} ±", half)
+    return table.reset_index()
 
 
-def _estimate(values: pd.Series) -> Estimate:
-    """Estimate a mean over the seeds that have a number."""
-    known = values[np.isfinite(values.to_numpy(float))].tolist()
-    return over_seeds(known) if known else stats.NOTHING
+def _counted(decisions: pd.Series) -> str:
+    """Count the decisions of time screens, such as "off 1, on 2"."""
+    return ", ".join(f"{decision} {n}" for decision, n in decisions.value_counts().sort_index().items())
 
 
-def _run(r: Record, is_timed: bool) -> dict[str, Any]:
-    """Return the numbers of a run; what it lacks, or took on another machine, is NaN."""
+def _numbers(r: Record, *, is_timed: bool) -> dict[str, Any]:
+    """Return numbers and texts of a run as its record has them; times of another machine are left out."""
     assert r.on_demand is not None
-    gates, screen = r.on_demand.gates, r.on_demand.screen
-    row: dict[str, Any] = {
-        "ends": bool(gates) and gates[-1].step is None,
-        "split": r.protocol.get("eval_split"),
-        "checked_on": "",
-    }
-    row |= dict.fromkeys([*SHOWN, "dB_evaluated", "dB_checked"], math.nan)
+    gates, screen, comparison = r.on_demand.gates, r.on_demand.screen, r.on_demand.comparison
+    row: dict[str, Any] = {"ends": bool(gates) and gates[-1].step is None}
+    row |= {"compared": of_comparison(comparison)} if comparison else {}
     if screen:
-        row |= {"p": _number(screen.p), "free": 100 * _number(screen.free)}
-        row |= {"screen_s": screen.seconds if is_timed else math.nan}
+        row |= {"decision": screen.decision, "why": screen.reason, "p": screen.p, "free": screen.free}
+        row |= {"screen_s": screen.seconds} if is_timed else {}
     if gates:
         last = gates[-1]
         row |= {name: max(0, last.rows.get(name, 0)) for name in EFFECT_SETS}
@@ -115,19 +108,11 @@ def _run(r: Record, is_timed: bool) -> dict[str, Any]:
         row |= {name: _of_degree(last, name) for name in DEGREES}
         row |= {"mb_before": gates[0].bytes_before / 1e6, "mb": last.bytes / 1e6}
     if row["ends"]:
-        row |= {
-            "dB_evaluated": -_number(last.eval_loss_db),
-            "dB_checked": -last.measured_db,
-            "checked_on": last.checked_on,
-        }
-        row |= {"predicted": -last.predicted_db, "asleep": 100 * (last.asleep or 0.0)}
+        row |= {"evaluated": last.eval_loss_db, "checked": last.measured_db, "predicted": last.predicted_db}
+        row |= {"asleep": last.asleep or 0.0, "split": r.protocol.get("eval_split"), "checked_on": last.checked_on}
         if is_timed and last.frame_ms is not None:
-            row |= {"ms_before": _number(last.frame_ms_before), "ms": last.frame_ms - _number(last.frame_ms_before)}
+            row |= {"ms_before": last.frame_ms_before, "ms": last.frame_ms}
     return row
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _of_degree(gate: Gate, degree: str) -> int:

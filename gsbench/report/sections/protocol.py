@@ -9,7 +9,7 @@ from gsbench.errors import printable
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
 from gsbench.report.frame import Results, without
-from gsbench.report.section import Section, number, section
+from gsbench.report.section import Section, number, section, span
 
 WARNING = "WARNING"
 SILENT = {"resize": "area", "repaired": "none", "val_every": "none"}  # what a record means that lacks it
@@ -56,8 +56,7 @@ def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> It
     by_scene = values[compared].groupby(runs.scene[compared]).nunique()
     is_mixed = (by_scene > 1).any() or (setting in OF_ALL and values.nunique() > 1)
     for value, of in runs.groupby(values):
-        where = "all" if of.scene.nunique() == runs.scene.nunique() else ", ".join(sorted(of.scene.unique()))
-        yield [WARNING if is_mixed and warn else "", printable(setting), value, where, len(of)]
+        yield [WARNING if is_mixed and warn else "", printable(setting), value, _scenes(of, runs), len(of)]
 
 
 def _short(setting: str, value: object) -> str:
@@ -69,50 +68,28 @@ def _short(setting: str, value: object) -> str:
     return digits[:12] + "".join(dirty) if setting in ("commit", "data") and " " not in text else text
 
 
-def _facts(runs: pd.DataFrame) -> Iterator[tuple[str, str, str, int]]:
+def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
     """Yield what else the numbers depend on: name, value, scenes and number of runs."""
-    yield "seeds", ", ".join(map(str, sorted(runs.seed.unique()))), "all", len(runs)
-    timed = runs[runs.load.notna() & (runs.machine == runs.timed_on)]
-    if len(timed):
-        yield "load of the machine, with the run itself", _span(timed.load, 1), "all", len(timed)
-    rounded = runs[runs.psnr_float32_db.notna()]
-    if len(rounded):
-        yield (
-            "most that float32 changes PSNR of a view, dB",
-            f"{rounded.psnr_float32_db.max():.1e}",
-            "all",
-            len(rounded),
-        )
-    early = runs[[bool(r.stop and r.stop.kept < r.stop.iteration) for r in runs.record]]
-    if len(early):
-        kept = pd.Series([r.stop.kept for r in early.record])
-        yield "measured at the best iteration on val (train.patience)", _span(kept, 0), _scenes(early), len(early)
-    averaged = runs[runs.averaged > 0]
-    if len(averaged):
-        yield (
-            "iterations of averaged parameters (train.average_from)",
-            _span(averaged.averaged, 0),
-            _scenes(averaged),
-            len(averaged),
-        )
-    chosen = runs[[r.length_choice is not None for r in runs.record]]
-    if len(chosen):
-        kept = pd.Series([r.length_choice.kept for r in chosen.record])
-        yield (
-            "iterations chosen on val; times are those of all lengths (train.lengths)",
-            _span(kept, 0),
-            _scenes(chosen),
-            len(chosen),
-        )
+    yield ["seeds", ", ".join(map(str, sorted(runs.seed.unique()))), "all", len(runs)]
+    early = [r.stop.kept if r.stop and r.stop.kept < r.stop.iteration else None for r in runs.record]
+    chosen = [r.length_choice.kept if r.length_choice else None for r in runs.record]
+    facts = (
+        ("load of the machine, with the run itself", runs.load.where(runs.machine == runs.timed_on), 1),
+        ("most that float32 changes PSNR of a view, dB", runs.psnr_float32_db, 6),
+        ("measured at the best iteration on val (train.patience)", early, 0),
+        ("iterations of averaged parameters (train.average_from)", runs.averaged.where(runs.averaged > 0), 0),
+        ("iterations chosen on val; times are those of all lengths (train.lengths)", chosen, 0),
+    )
+    for name, values, digits in facts:
+        known = pd.Series(values, runs.index, dtype=float).dropna()
+        if len(known):
+            yield [name, span(known, digits), _scenes(runs.loc[known.index], runs), len(known)]
 
 
-def _span(values: pd.Series, digits: int) -> str:
-    """Return the least and the largest number, or one of them if they look alike."""
-    return " to ".join(dict.fromkeys(number(float(value), digits) for value in (values.min(), values.max())))
-
-
-def _scenes(runs: pd.DataFrame) -> str:
-    return ", ".join(sorted(runs.scene.unique()))
+def _scenes(some: pd.DataFrame, runs: pd.DataFrame) -> str:
+    """Name the scenes of some of the runs."""
+    names = sorted(some.scene.unique())
+    return "all" if len(names) == runs.scene.nunique() else ", ".join(names)
 
 
 def _notes(runs: pd.DataFrame) -> Iterator[str]:

@@ -37,11 +37,7 @@ def stages(chapter: Results, tests: pd.DataFrame) -> Section | None:
     )
     shown = [name for name in (*names, REST) if name in table]
     drawn = table.melt("model", shown, "part", "size")
-    figure = Figure(
-        "Seconds of training by stage",
-        "bars",
-        drawn,
-        {"label": "model", "parts": shown, "title": "training seconds", "colours": "stage"},
-    )
+    options = {"label": "model", "parts": shown, "title": "training seconds", "colours": "stage"}
+    figure = Figure("Seconds of training by stage", "bars", drawn, options)
     columns = {name: Column(f"{name} s", 2) for name in ("total", *shown)}
     return Section("stages", "Where the seconds go", text, table, columns, (figure,))
