@@ -22,11 +22,10 @@ from gsbench.train.checkpoint import Checkpoint
 
 
 def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
-    """Remove time, direction or AGR from a finished run's Gaussians that do not need them.
+    """Remove AGR, or also time and direction, from a finished run's Gaussians that do not need them.
 
-    The setting `effects.gate=end` does the same at the end of a training, but it never removes only one of time and
-    direction from a Gaussian. This function may do that. Return the record and the folder of the new run; `folder` is
-    not changed. At most `budget_db` dB of PSNR on val are lost.
+    The setting `effects.gate=end` does the same at the end of a training. Return the record and the folder of the new
+    run; `folder` is not changed. At most `budget_db` dB of PSNR on val are lost.
 
     Raises:
         InputError: the run is not finished, effects were already removed at its end, or its data do not exist or have
@@ -61,7 +60,7 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     if trainer.step < config.train.iterations:
         raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
                          f"{config.train.iterations}: run it again, it continues from there")  # fmt: skip
-    trainer.hook(Gating).finish(by_halves=True)
+    trainer.hook(Gating).finish()
     content = Checkpoint(training_hash(plain), former.data, trainer.state_dict(), plain, former.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)
     record = execution.measure(trainer)

@@ -1,9 +1,9 @@
 """Choose a simplification for each Gaussian of a model, and apply as many as a loss of PSNR allows.
 
-A simplified Gaussian is independent of time, direction or AGR (the neural refinement), has a lower SH degree, or is
-removed. For each Gaussian i, the rule takes the simplification s that minimises cost(i, s) + lambda error(i, s). The
-cost is the rendering time of the Gaussian in a frame, and the error is the predicted growth of the images' squared
-error (gsbench.gates.sensitivity). lambda is the same for all Gaussians.
+A simplified Gaussian is independent of AGR (the neural refinement), or also of time and direction, has a lower SH
+degree, or is removed. For each Gaussian i, the rule takes the simplification s that minimises cost(i, s) + lambda
+error(i, s). The cost is the rendering time of the Gaussian in a frame, and the error is the predicted growth of the
+images' squared error (gsbench.gates.sensitivity). lambda is the same for all Gaussians.
 """
 
 import copy
@@ -19,7 +19,7 @@ from gsbench.measure.exact_views import decides
 from gsbench.measure.record import Gate
 from gsbench.models import GaussianModel
 from gsbench.models.appearance import MOST_PACKED, at_most, order_of
-from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
 from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC
 
@@ -29,8 +29,6 @@ REFINING = 195.0  # AGR
 SLICING = 28.0
 COSTS = {CONDITIONED: SLICING, STATIC: 8.0, REMOVED: -60.0}  # without the 60 that the rasterizer takes for a Gaussian
 COLORING = (13.0, 19.0, 23.0, 28.0)  # by SH degree, for each frequency of time
-LESS_TO_READ = 1.0  # saved if a Gaussian depends on only one of time and direction: it has fewer parameters to read
-BITS = {"time": TIME, "direction": DIRECTION}
 BISECTIONS = 32
 SHARES = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)  # shares of the squared error, tried in this order
 MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the allowed one: few views may underestimate it
@@ -123,8 +121,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     none = torch.zeros_like(live)
     ways, errors = sensitivity.simplifications, sensitivity.errors
     geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.order is None}
-    costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS.get(name, SLICING - LESS_TO_READ))
-                         for name in geometry])  # fmt: skip
+    costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS[name]) for name in geometry])
     forms = torch.stack(list(geometry.values()))
     removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
     assert now.orders is not None
@@ -166,8 +163,6 @@ def _geometry_cost(model: GaussianModel, now: EffectSets) -> Tensor:
     """Return the nanoseconds that conditioning and AGR take for each Gaussian in a frame, [N]."""
     cost = torch.full_like(model.splats["opacities"].detach(), COSTS[STATIC])
     cost[: now.conditioned] = SLICING
-    assert now.frozen is not None
-    cost -= LESS_TO_READ * (now.frozen > 0)
     cost[: now.refined] += REFINING
     return cost
 
@@ -179,14 +174,13 @@ def _color_cost(orders: Tensor) -> Tensor:
 
 
 def effect_sets_of(model: GaussianModel) -> EffectSets:
-    """Return what each Gaussian of a model depends on, with no part of it None, but for `intervals`."""
+    """Return what each Gaussian of a model depends on; `orders` is not None."""
     if model.effect_sets is not None:
         return model.effect_sets
     rows = model.count_by_effects()
     conditioned = rows["refined"] + rows["conditioned"]
-    device = model.splats["opacities"].device
-    orders = torch.full((len(model),), model.full_order(), dtype=torch.int32, device=device)
-    return EffectSets(rows["refined"], conditioned, orders, torch.zeros(len(model), dtype=torch.uint8, device=device))
+    opacities = model.splats["opacities"].detach()
+    return EffectSets(rows["refined"], conditioned, torch.full_like(opacities, model.full_order(), dtype=torch.int32))
 
 
 @torch.no_grad()
@@ -209,7 +203,6 @@ def apply(
     """
     now = effect_sets_of(model)
     assert now.orders is not None
-    assert now.frozen is not None
     for way in sensitivity.simplifications:
         if way.raw is None:
             continue
@@ -218,20 +211,12 @@ def apply(
         for key, value in way.raw.items():
             model.splats[key].data[rows] = value[rows]
     place = torch.arange(len(model), device=now.orders.device)
-    refined, static = place < now.refined, place >= now.conditioned
-    frozen = now.frozen.clone()
-    for name, rows in choice.geometry.items():
-        if name != LIVE:
-            refined = refined & ~rows
-        if name in BITS:
-            frozen[rows] |= BITS[name]
-    frozen[now.conditioned :] = 0
-    static = static | choice.geometry.get(STATIC, torch.zeros_like(static)) | (frozen == sum(BITS.values()))
-    frozen[static] = 0
+    static = (place >= now.conditioned) | choice.geometry.get(STATIC, torch.zeros_like(place, dtype=torch.bool))
+    refined = (place < now.refined) & choice.geometry[LIVE]
     kind = torch.where(refined, 0, torch.where(static, 2, 1))
     # Gaussians are sorted by the effects that remain, then by the order of their colours, so that neighbours need the
     # same work. Otherwise their order does not change.
-    rank = (kind * 4 + frozen) * (MOST_PACKED + 1) + MOST_PACKED - choice.orders
+    rank = kind * (MOST_PACKED + 1) + MOST_PACKED - choice.orders
     if intervals is None:
         order = rank.argsort(stable=True)
     else:  # Gaussians that AGR changes at the same times are neighbours too, so that whole warps of a GPU can skip
@@ -243,7 +228,6 @@ def apply(
     n_refined, n_conditioned = (int((kind[rows] <= most).sum()) for most in (0, 1))
     active = now.intervals if intervals is None else intervals
     active = None if active is None else active[rows[:n_refined]].contiguous()
-    orders, frozen = choice.orders[rows].contiguous(), frozen[rows].contiguous()
-    model.effect_sets = EffectSets(n_refined, n_conditioned, orders, frozen, active)
+    model.effect_sets = EffectSets(n_refined, n_conditioned, choice.orders[rows].contiguous(), active)
     model.fill(model.effect_sets)
     return rows, changed

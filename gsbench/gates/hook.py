@@ -22,7 +22,7 @@ from gsbench.measure.quality import evenly
 from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 from gsbench.measure.speed import synchroniser, time_in_turns
 from gsbench.models import CameraTime, GaussianModel
-from gsbench.models.effect_sets import DIRECTION, EffectSets
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import as_gated, has_gates
 from gsbench.models.simplifications import STATIC, shares_of
 from gsbench.reading import parse
@@ -100,39 +100,33 @@ class Gating(Hook):
                                   f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
                 return
             most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
-            # Static Gaussians do not learn unused parameters. Those independent of only time or direction would.
-            self.simplify(step + 1, most, VIEWS_IN_TRAINING, by_halves=False)
+            self.simplify(step + 1, most, VIEWS_IN_TRAINING)
 
     def at_end(self) -> None:
         """Simplify Gaussians after the training, unless `effects.gate=off`."""
         if self.config.effects.gate != "off":
             self.finish()
 
-    def finish(self, by_halves: bool = False) -> None:
+    def finish(self) -> None:
         """Simplify the Gaussians of a finished training, and measure PSNR and frame time before and after.
 
         The measurement does not count as training time.
-
-        Args:
-            by_halves: whether a Gaussian may become independent of only one of time and direction. This saves bytes but
-                no frame time, and nearly doubles the time of this function.
         """
         training = self.training
         self.model.set_active(training.schedule.active(training.step - 1))
         before = gaussians_of(self.model)
         with training.effort, training.stages("gate"):
-            self.simplify(None, self.config.effects.budget_db, MOST_VIEWS, by_halves)
+            self.simplify(None, self.config.effects.budget_db, MOST_VIEWS)
         self.compare(before, training.views)
 
     @torch.no_grad()
-    def simplify(self, step: int | None, budget_db: float, most: int, by_halves: bool) -> None:
+    def simplify(self, step: int | None, budget_db: float, most: int) -> None:
         """Simplify Gaussians if the loss of PSNR is allowed; otherwise note why not.
 
         Args:
             step: the step of the training; None at its end.
             budget_db: the largest allowed loss of PSNR, dB.
             most: the largest number of views from which errors are predicted.
-            by_halves: whether a Gaussian may become independent of only one of time and direction.
         """
         started = time.perf_counter()
         model, when = as_gated(self.model), "at the end" if step is None else f"at step {step}"
@@ -140,7 +134,7 @@ class Gating(Hook):
         intervals = visible_times(model, self.probed) if step is None else None
         hidden = None if intervals is None else intervals[:, 0].isinf()
         sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
-                            antialias=self.renderer.antialias, by_halves=by_halves, hidden=hidden)  # fmt: skip
+                            antialias=self.renderer.antialias, hidden=hidden)  # fmt: skip
         gated = gate_within(model, sensitivity, budget_db, lambda x: self.renderer.psnr(x, self.checked), intervals)
         if gated is None:
             before = self.renderer.psnr(model, self.checked)
@@ -235,6 +229,4 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
 
 def share_with_direction(model: GaussianModel) -> float:
     """Return the share of a model's Gaussians whose mean or opacity depends on the view direction."""
-    effect_sets = effect_sets_of(model)
-    assert effect_sets.frozen is not None
-    return float((effect_sets.frozen[: effect_sets.conditioned] & DIRECTION == 0).sum()) / max(1, len(model))
+    return effect_sets_of(model).conditioned / max(1, len(model))

@@ -6,8 +6,6 @@ from gsbench.measure.record import Candidate, Direction, Gate, LengthChoice, Mod
 EFFECT_SETS = {  # the names of gsbench.models.effect_sets, in the same order, and their names in the legend
     "refined": "refined by AGR",
     "conditioned": "conditioned",
-    "time": "time frozen",
-    "direction": "direction frozen",
     "static": "static",
 }
 

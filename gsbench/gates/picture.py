@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsbench.gates.gate import cost_of, effect_sets_of, most_cost
+from gsbench.gates.gate import cost_of, most_cost
 from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure.images import Pixels, inferno, to_bytes
 from gsbench.models import CameraTime, GaussianModel
@@ -22,8 +22,6 @@ from gsbench.scenes import Camera
 COLOURS = {
     "refined": (0xB3, 0x47, 0x00),
     "conditioned": (0x9C, 0x3D, 0x82),
-    "time": (0x00, 0x73, 0x4F),
-    "direction": (0x00, 0x69, 0xA8),
     "static": (0x5C, 0x60, 0x66),
 }
 LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels; smaller images are enlarged by an integer factor, larger ones reduced
@@ -78,13 +76,9 @@ def cost_colors(model: GaussianModel, most: float) -> Tensor:
 
 
 def kinds_of(model: GaussianModel) -> Tensor:
-    """Return what each Gaussian depends on (AGR's network, time, direction, nothing) as an index into NAMES, [N]."""
-    effect_sets = effect_sets_of(model)
-    assert effect_sets.frozen is not None
-    kinds = 1 + effect_sets.frozen.long()  # TIME and DIRECTION follow one another as in NAMES, and both are static
-    kinds[: effect_sets.refined] = NAMES.index("refined")
-    kinds[effect_sets.conditioned :] = NAMES.index("static")
-    return kinds
+    """Return what each Gaussian depends on (AGR's network, time or direction, nothing) as an index into NAMES, [N]."""
+    counts = [model.count_by_effects()[name] for name in NAMES]
+    return torch.arange(len(NAMES)).repeat_interleave(torch.tensor(counts))
 
 
 def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:

@@ -67,7 +67,6 @@ def probe(
     most: int = MOST_VIEWS,
     draws: int = 1,
     antialias: bool = False,
-    by_halves: bool = True,
     hidden: Tensor | None = None,  # [N] bool
 ) -> Sensitivity:
     """Predict how much the squared error of training views grows if a Gaussian is simplified, for each Gaussian.
@@ -80,14 +79,13 @@ def probe(
         most: the largest number of views that are used, evenly spaced.
         draws: the number of random images g for each view; more draws reduce the variance.
         antialias: whether to scale opacities by the 2D filter of Mip-Splatting, as in `gsbench.raster.rasterize`.
-        by_halves: whether to include Gaussians that are independent of only one of time and direction.
         hidden: which Gaussians no training view shows.
     """
     used = evenly(views, most)
     queries = [CameraTime.of(view.camera, view.time) for view in used]
     workers = model.backend.workers(model.splats["means"])
     slices = list(side_by_side(model.slice, queries, workers))
-    simplifications = simplifications_of(model, queries, slices, by_halves)
+    simplifications = simplifications_of(model, queries, slices)
     random = torch.Generator().manual_seed(seed)
     seeds = torch.randint(2**62, (len(used),), generator=random).tolist()
 

@@ -285,12 +285,12 @@ class GaussianModel(nn.Module, ABC):
         return None if self.effect_sets is None else self.effect_sets.orders
 
     def count_by_effects(self) -> dict[str, int]:
-        """Count Gaussians by what they depend on: AGR (a network), time and direction, only one of them, nothing."""
+        """Count Gaussians by what they depend on: AGR (a network), time or direction, nothing."""
         N, effect_sets = len(self), self.effect_sets
         if effect_sets is not None:
             return effect_sets.by_name(N)
         refined, conditioned = N if self.refines else 0, N if self.observes else 0
-        counts = refined, conditioned - refined if conditioned else 0, 0, 0, N - max(refined, conditioned)
+        counts = refined, conditioned - refined if conditioned else 0, N - max(refined, conditioned)
         return dict(zip(NAMES, counts, strict=True))
 
     @property

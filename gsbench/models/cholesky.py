@@ -13,7 +13,7 @@ from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime, times_inside, unit
-from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, CholeskyLayout, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, JointModel
 from gsbench.models.gaussian_batch import Conditioned
@@ -193,19 +193,18 @@ class CholeskyModel(JointModel):
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         """Return masks of the parameter entries that are used: a static Gaussian uses none of time and direction."""
         masks = super().kept(effect_sets)
-        if effect_sets.frozen is None:
+        if effect_sets.orders is None:
             return masks
-        static = torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device) >= effect_sets.conditioned
-        gone = {"p": torch.zeros_like(static), "t": static | (effect_sets.frozen & TIME > 0),
-                "d": static | (effect_sets.frozen & DIRECTION > 0)}  # fmt: skip
+        static = torch.arange(len(effect_sets.orders), device=effect_sets.orders.device) >= effect_sets.conditioned
+        gone = {"p": torch.zeros_like(static), "t": static, "d": static}
         masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.layout.letters], -1)
         for kind in self.layout.kinds[1:]:  # all but shape
             pairs = [self.layout.pair(place) for place in self.layout.places[kind]]
             masks[kind] = ~torch.stack([gone[a] | gone[b] for a, b in pairs], -1)
         if "direction" in self.observes:
-            masks["directions"] = ~gone["d"][:, None]
+            masks["directions"] = ~static[:, None]
         if "time" in self.observes:
-            masks["times"] = ~gone["t"][:, None]
+            masks["times"] = ~static[:, None]
         return masks
 
     def constant(self, name: str) -> float:

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-TIME, DIRECTION = 1, 2  # in EffectSets.frozen
-NAMES = ("refined", "conditioned", "time", "direction", "static")  # groups; "time" are Gaussians independent of time
+NAMES = ("refined", "conditioned", "static")  # groups of Gaussians
 
 
 class EffectSets(NamedTuple):
@@ -22,15 +21,9 @@ class EffectSets(NamedTuple):
     refined: int  # AGR changes the first `refined` Gaussians
     conditioned: int  # the first `conditioned` >= `refined` Gaussians change with time or direction
     orders: Tensor | None  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`; None: all
-    frozen: Tensor | None = None  # [N] uint8: TIME + DIRECTION, variables that a row does not depend on; None: nothing
     intervals: Tensor | None = None  # [refined, 2]: the first and last time at which AGR changes a row; None: always
 
     def by_name(self, rows: int) -> dict[str, int]:
-        """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians.
-
-        The groups are: changed by AGR (a network); dependent on time and direction; independent of time; independent of
-        direction; static.
-        """
-        frozen = [0, 0] if self.frozen is None else [int((self.frozen == bit).sum()) for bit in (TIME, DIRECTION)]
-        conditioned = self.conditioned - self.refined - sum(frozen)
-        return dict(zip(NAMES, (self.refined, conditioned, *frozen, rows - self.conditioned), strict=True))
+        """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians."""
+        counts = (self.refined, self.conditioned - self.refined, rows - self.conditioned)
+        return dict(zip(NAMES, counts, strict=True))

@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.models.appearance import MOST_PACKED, ColorOrder, coefficients_within
 from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.effect_sets import DIRECTION, TIME, EffectSets
+from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_exponents
 from gsbench.models.slicing import reduce
 
@@ -105,14 +105,12 @@ class GatedModel(GaussianModel):
         if effect_sets is None:
             return state
         assert effect_sets.orders is not None
-        assert effect_sets.frozen is not None
         for name, mask in self.kept(effect_sets).items():
             value = state[f"splats.{name}"]
             state[f"splats.{name}"] = value[mask.expand_as(value)]
         counts = torch.tensor([effect_sets.refined, effect_sets.conditioned])
         intervals = {} if effect_sets.intervals is None else {f"{_STATE}intervals": effect_sets.intervals}
-        return state | intervals | {f"{_STATE}counts": counts, f"{_STATE}orders": effect_sets.orders.to(torch.uint8),
-                                f"{_STATE}frozen": effect_sets.frozen}  # fmt: skip
+        return state | intervals | {f"{_STATE}counts": counts, f"{_STATE}orders": effect_sets.orders.to(torch.uint8)}
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Load the tensors that `pack` returned, for any number of Gaussians; see `GaussianModel.load_state`."""
@@ -193,10 +191,9 @@ def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
         return value
 
     refined, conditioned = part("counts", (2,), torch.int64).tolist()
-    orders, frozen = part("orders", (N,), torch.uint8).to(torch.int32), part("frozen", (N,), torch.uint8)
+    orders = part("orders", (N,), torch.uint8).to(torch.int32)
     intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in stored else None
-    known = bool((orders <= MOST_PACKED).all()) and bool((frozen <= TIME + DIRECTION).all())
-    if stored or not known or not 0 <= refined <= conditioned <= N:
-        raise InputError(f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders or "
-                         f"frozen effects that there are not")  # fmt: skip
-    return EffectSets(refined, conditioned, orders, frozen, intervals)
+    if stored or not bool((orders <= MOST_PACKED).all()) or not 0 <= refined <= conditioned <= N:
+        raise InputError(f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders "
+                         f"that there are not")  # fmt: skip
+    return EffectSets(refined, conditioned, orders, intervals)

@@ -140,20 +140,15 @@ class Gaussians4DModel(JointModel, gates=True):
         A static Gaussian does not use its right quaternion and its scale in time. It uses its mean time only if its
         colour changes with time.
         """
-        masks = {}
-        if effect_sets.orders is not None:
-            stored = coefficients_within(effect_sets.orders, self.sh_degree, self.time_degree + 1)
-            masks["shN"] = stored.flatten(1)[:, 1:, None]  # the constant coefficient is stored in sh0
-        if effect_sets.frozen is not None:
-            changes = (
-                torch.arange(len(effect_sets.frozen), device=effect_sets.frozen.device)[:, None]
-                < effect_sets.conditioned
-            )
-            space = torch.tensor([[True, True, True, False]], device=changes.device)
-            assert effect_sets.orders is not None
-            timed = changes | (order_of(effect_sets.orders).waves > 1)[:, None]
-            masks |= {"times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
-        return masks
+        orders = effect_sets.orders
+        if orders is None:
+            return {}
+        stored = coefficients_within(orders, self.sh_degree, self.time_degree + 1)
+        changes = torch.arange(len(orders), device=orders.device)[:, None] < effect_sets.conditioned
+        space = torch.tensor([[True, True, True, False]], device=orders.device)
+        timed = changes | (order_of(orders).waves > 1)[:, None]
+        others = stored.flatten(1)[:, 1:, None]  # the constant coefficient is stored in sh0
+        return {"shN": others, "times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
 
     def constant(self, name: str) -> float:
         return LOG_SIZE_MAX if name == "scales" else 0.0

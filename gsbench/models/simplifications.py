@@ -37,11 +37,10 @@ def simplifications_of(
     model: GatedModel,
     queries: Sequence[CameraTime],  # of the views over which constants are averaged
     slices: Sequence[Gaussians3D],  # of the model for these views; their opacities are the weights of the average
-    by_halves: bool = True,  # whether to include Gaussians that are independent of only one of time and direction
 ) -> list[Simplification]:
     """Return the parameters of a model's Gaussians after each possible simplification.
 
-    A simplified Gaussian is independent of AGR (the neural refinement), time, direction or all of them, or has a lower
+    A simplified Gaussian is independent of AGR (the neural refinement), or also of time and direction, or has a lower
     SH degree, or is removed.
     """
     weights = shares_of([gaussians.opacities for gaussians in slices])
@@ -56,10 +55,8 @@ def simplifications_of(
     raw = raw | refined
     if rows["refined"]:
         simplified.append(Simplification(CONDITIONED, refined, rows["refined"]))
-    for name, frozen in model.frozen(raw, queries, weights).items():
-        if name != STATIC and not by_halves:
-            continue
-        simplified.append(Simplification(name, {key: raw[key] for key in names} | frozen, conditioned))
+    if frozen := model.frozen(raw, queries, weights):
+        simplified.append(Simplification(STATIC, {key: raw[key] for key in names} | frozen[STATIC], conditioned))
     simplified.append(Simplification(REMOVED, None, len(model)))
     for (order, less), missing in zip(fewer.items(), lost, strict=True):
         constant = less["sh0"].clone()

@@ -25,7 +25,6 @@ from gsbench.gates.hook import (
     gaussians_of,
     without_direction,
 )
-from gsbench.gates.sensitivity import probe
 from gsbench.measure import record
 from gsbench.measure.record import Gate
 from gsbench.run.load import load_run
@@ -124,12 +123,11 @@ def test_when_a_model_is_gated() -> None:
 
 @pytest.mark.parametrize(("model", "loss"), [("7dgs", LOSS_WITH_AGR), ("7dgs_noagr", LOSS_IN_TRAINING)])
 def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches models without AGR, which do not make up for it, gated as freely as those with it, and a training that
-    looks at half freezes, which saves no time of a frame."""
-    asked: list[tuple[int | None, float, bool]] = []
-    monkeypatch.setattr(Gating, "simplify", lambda _, step, db, __, by_halves: asked.append((step, db, by_halves)))
+    """Catches models without AGR, which do not make up for it, gated as freely as those with it."""
+    asked: list[tuple[int | None, float]] = []
+    monkeypatch.setattr(Gating, "simplify", lambda _, step, db, __: asked.append((step, db)))
     end(trainer("effects.gate=both", model=model))
-    assert asked == [(60, loss, False), (None, 0.05, False)]
+    assert asked == [(60, loss), (None, 0.05)]
 
 
 @pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
@@ -170,7 +168,7 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
     ):
         training.config.scene.eval_split = split
         of = Trainer(training.model, replace(square, val=val, train=train), [], training.config)
-        of.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
+        of.hook(Gating).simplify(None, 0.05, 10)
         names = [[view.name for view in asked] for asked in (probed.pop(), checked.pop())]
         assert names == [[view.name for view in asked] for asked in expected]
         assert len(of.hook(Gating).notes) == notes
@@ -188,7 +186,7 @@ def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
     training = trainer("effects.gate=end")
     shown = iter([*scores, *[scores[-1]] * 20, scores[0]])
     monkeypatch.setattr(Renderer, "psnr", lambda *_: scores[0] if len(scores) < 2 else next(shown))
-    training.hook(Gating).simplify(None, 0.05, 10, by_halves=False)
+    training.hook(Gating).simplify(None, 0.05, 10)
     assert not training.hook(Gating).gates
     assert line in training.hook(Gating).notes[-1]
 
@@ -217,9 +215,7 @@ def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     assert direction.loss_db != 0
 
 
-def test_auto_and_a_gate_after_the_fact(
-    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches model=auto that says nothing of what it chose, a loaded run of another model, a gate that spoils the old.
 
     The scene has six views, which are too few to tell: it is simulated, and that is said.
@@ -244,12 +240,9 @@ def test_auto_and_a_gate_after_the_fact(
     assert plain.returncode == 0, plain.stderr
     (old,) = tmp_path.glob("dnerf/square/7dgs,*/seed0")
     kept = {path.name: path.read_bytes() for path in old.iterdir()}
-    halves: list[bool] = []
-    monkeypatch.setattr(hook, "probe", lambda *x, **y: (halves.append(y["by_halves"]), probe(*x, **y))[1])
     capsys.readouterr()
     assert command.main(["--checkpoint", str(old), "--budget-db", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    assert halves == [True]  # a finished model has the time
     assert {path.name: path.read_bytes() for path in old.iterdir()} == kept
     (new,) = tmp_path.glob("dnerf/square/7dgs,*,gate=end,budget_db=1.0/seed0")
     gated = record.read(new / record.FILE_NAME)

@@ -10,15 +10,16 @@ from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.gates import picture
 from gsbench.gates.__main__ import main
-from gsbench.gates.gate import COLORING, COSTS, LESS_TO_READ, REFINING, SLICING, cost_of, most_cost
+from gsbench.gates.gate import COLORING, COSTS, REFINING, SLICING, cost_of, most_cost
 from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
 from gsbench.models import GaussianModel, build
-from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
+from gsbench.models.effect_sets import NAMES, EffectSets
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.simplifications import STATIC
 from gsbench.report.render.palette import SETS, THEMES
+from gsbench.report.sections import on_demand
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents
 
@@ -41,10 +42,8 @@ def five(name: str = "7dgs", *, agr: bool = True, effect_sets: EffectSets | None
 
 
 def one_of_each() -> GaussianModel:
-    """One Gaussian of each effect set, in the order of NAMES, with harmonics of degrees 3, 3, 2, 1, 0."""
-    orders, frozen = torch.tensor([3, 3, 2, 1, 0], dtype=torch.int32), torch.zeros(5, dtype=torch.uint8)
-    frozen[2], frozen[3] = TIME, DIRECTION
-    return five(effect_sets=EffectSets(1, 4, orders, frozen))
+    """Gaussians of each effect set, in the order of NAMES, with harmonics of degrees 3, 3, 2, 1, 0."""
+    return five(effect_sets=EffectSets(1, 3, torch.tensor([3, 3, 2, 1, 0], dtype=torch.int32)))
 
 
 def panel(image: Pixels, number: int) -> list[list[int]]:
@@ -57,10 +56,11 @@ def test_each_class_has_its_colour() -> None:
     """Catches rows taken for those of another effect set, swapped red and blue, and panels in another order."""
     model = one_of_each()
     image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
-    assert picture.kinds_of(model).tolist() == list(range(5))
+    assert picture.kinds_of(model).tolist() == [0, 1, 1, 2, 2]
     assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == model.count_by_effects()
     assert np.abs(np.array(panel(image, 0)) - 127.5).max() < 3
-    assert np.abs(np.array(panel(image, 1)) - [picture.COLOURS[name] for name in NAMES]).max() < 6
+    colours = [picture.COLOURS[NAMES[kind]] for kind in picture.kinds_of(model)]
+    assert np.abs(np.array(panel(image, 1)) - colours).max() < 6
     corner = image[picture.LINE, ENLARGED * 100 + picture.GAP]
     assert corner.tolist() == [255, 255, 255], "the effect sets stand on white, whatever the background is"
 
@@ -69,10 +69,9 @@ def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a count beside the wrong name, a swatch of another colour than its Gaussians, and one of none."""
     written = []
     monkeypatch.setattr(cv2, "putText", lambda *arguments: written.append(arguments[1]))
-    frozen = torch.tensor([0, 0, 0, TIME, 0], dtype=torch.uint8)
-    model = five(effect_sets=EffectSets(2, 4, torch.zeros(5, dtype=torch.int32), frozen))
+    model = five(effect_sets=EffectSets(0, 4, torch.zeros(5, dtype=torch.int32)))
     image = picture.draw(model, CAMERA, 0.5, torch.ones(3))
-    counts = {"refined": 2, "conditioned": 1, "time": 1, "static": 1}
+    counts = {"conditioned": 4, "static": 1}
     assert written[3:] == [f"{EFFECT_SETS[name]}: {number}" for name, number in counts.items()]
     assert written[1] == "5 Gaussians by effect set"
     legend = image[picture.LINE + ENLARGED * 20 :]
@@ -84,8 +83,7 @@ def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_a_pixel_pays_for() -> None:
     """Catches costs of other Gaussians than those that are seen, without colours, or on a scale of their own."""
     model = one_of_each()
-    frozen = SLICING - LESS_TO_READ
-    geometry = [REFINING + SLICING, SLICING, frozen, frozen, COSTS[STATIC]]
+    geometry = [REFINING + SLICING, SLICING, SLICING, COSTS[STATIC], COSTS[STATIC]]
     expected = [g + COLORING[degree] for g, degree in zip(geometry, (3, 3, 2, 1, 0), strict=True)]
     assert cost_of(model).tolist() == pytest.approx(expected)
     assert most_cost(model) == REFINING + SLICING + COLORING[3]
@@ -112,14 +110,15 @@ def test_large_images_are_made_smaller() -> None:
     wide = Camera(CAMERA.viewmat, CAMERA.K, 2000, 500)
     image = picture.draw(one_of_each(), wide, 0.5, torch.zeros(3))
     assert image.shape[1] == 3 * picture.MOST_WIDTH + 2 * picture.GAP
-    assert image.shape[0] == 160 + 3 * picture.LINE
+    assert image.shape[0] == 160 + 2 * picture.LINE
 
 
 def test_the_page_has_the_same_colours() -> None:
     """Catches an effect set that has one colour in the picture and another in the figure above it."""
-    page = dict(zip(EFFECT_SETS, (THEMES[variable][0] for variable in SETS), strict=False))
-    assert {name: f"#{r:02x}{g:02x}{b:02x}" for name, (r, g, b) in picture.COLOURS.items()} == page
-    assert tuple(page) == tuple(EFFECT_SETS) == NAMES
+    page = dict(zip(on_demand.SETS, (THEMES[variable][0] for variable in SETS), strict=False))
+    for name, (r, g, b) in picture.COLOURS.items():
+        assert f"#{r:02x}{g:02x}{b:02x}" == page[name]
+    assert tuple(picture.COLOURS) == tuple(EFFECT_SETS) == NAMES
 
 
 @pytest.fixture(scope="module")

@@ -106,8 +106,7 @@ def with_effect_sets(model: GaussianModel, refined: int, conditioned: int) -> Ga
     """The model, of whose rows some are static, and have colours from one constant to more than there is."""
     if has_gates(model):
         orders = torch.randint(0, 16, (len(model),), generator=seeded(3), dtype=torch.int32)
-        frozen = torch.zeros(len(model), dtype=torch.uint8)
-        model.effect_sets = EffectSets(refined if model.agr else 0, conditioned, orders, frozen)
+        model.effect_sets = EffectSets(refined if model.agr else 0, conditioned, orders)
     return model
 
 

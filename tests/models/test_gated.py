@@ -229,7 +229,6 @@ def test_a_model_that_lacks_a_method(monkeypatch: pytest.MonkeyPatch) -> None:
 FAULTS = {
     "counts": lambda state: state["effect_sets.counts"][1:].add_(10_000),
     "orders": lambda state: state["effect_sets.orders"].fill_(77),
-    "frozen": lambda state: state.update({"effect_sets.frozen": state["effect_sets.frozen"][1:]}),
     "intervals": lambda state: state.update({"effect_sets.intervals": torch.zeros(10_000, 2)}),
     "short": lambda state: state.update({"splats.motion": state["splats.motion"][:-1]}),
     "extra": lambda state: state.update({"effect_sets.more": torch.zeros(1)}),
@@ -252,7 +251,7 @@ def test_effect_sets_of_a_checkpoint_are_checked(fault: str) -> None:
 def test_a_checkpoint_with_gates_of_a_model_without_them() -> None:
     """Catches a checkpoint that loads and then fails at its first image."""
     model = started(Gaussians3DModel())
-    model.effect_sets = EffectSets(0, 0, torch.full((N,), 3, dtype=torch.int32), torch.zeros(N, dtype=torch.uint8))
+    model.effect_sets = EffectSets(0, 0, torch.full((N,), 3, dtype=torch.int32))
     started(Gaussians3DModel()).load_state(model.pack())
     with pytest.raises(InputError, match=r"not of this model: expected effect_sets\.counts of shape none"):
         started(Balls()).load_state(model.pack())

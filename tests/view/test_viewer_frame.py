@@ -20,7 +20,7 @@ from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import Pixels, rounding_image, to_bytes
 from gsbench.models import CameraTime
-from gsbench.models.effect_sets import DIRECTION, NAMES, TIME, EffectSets
+from gsbench.models.effect_sets import NAMES, EffectSets
 from gsbench.models.render import rasterize_slice, render
 from gsbench.run.load import LoadedRun, SceneDescription
 from gsbench.scenes import Camera
@@ -59,10 +59,8 @@ def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> 
 
 
 def of_every_effect_set() -> EffectSets:
-    """Of 80 Gaussians, 16 of each effect set."""
-    frozen = torch.zeros(80, dtype=torch.uint8)
-    frozen[32:48], frozen[48:64] = TIME, DIRECTION
-    return EffectSets(16, 64, torch.full((80,), 3, dtype=torch.int32), frozen)
+    """Of 80 Gaussians, 16 that AGR changes, 16 that change without it, and 48 static ones."""
+    return EffectSets(16, 32, torch.full((80,), 3, dtype=torch.int32))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +125,7 @@ def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets
         panel = panels[: factor * SIZE : factor, i * step :][:, : factor * SIZE : factor]
         assert (gated.render(camera, FrameRequest(0.4, colours=colours)).image == panel).all()
     assert gated.counts == gated.run.model.count_by_effects()
-    assert all(gated.counts[name] == 16 for name in NAMES) == (effect_sets is not None)
+    assert ([gated.counts[name] for name in NAMES] == [16, 16, 48]) == (effect_sets is not None)
 
 
 @pytest.mark.parametrize(

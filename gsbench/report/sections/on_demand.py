@@ -16,6 +16,8 @@ from gsbench.report.sections.gallery import images
 
 PICTURES = ("effect_sets.png", "classes.png")  # older runs have the second name
 REMOVED = "removed"
+# Older runs also have Gaussians that are independent of only time, or only direction.
+SETS = {x: EFFECT_SETS.get(x, f"{x} frozen") for x in ("refined", "conditioned", "time", "direction", "static")}
 DEGREES = [f"degree {i}" for i in range(4)]  # of spherical harmonics
 MOST_BARS = 24
 MOST_NOTES = 12
@@ -23,7 +25,7 @@ SHOWN = {
     "p": Column("largest p", 3), "free": Column("% free of the camera", 0), "screen_s": Column("screen s", 1),
     "before": Column("Gaussians before", 0), REMOVED: Column("removed", 0),
     "asleep": Column("% of AGR left out of a frame", 0),
-    **{name: Column(title, 0) for name, title in EFFECT_SETS.items()}, **{name: Column(name, 0) for name in DEGREES},
+    **{name: Column(title, 0) for name, title in SETS.items()}, **{name: Column(name, 0) for name in DEGREES},
     "predicted": Column("predicted dB", 3, signed=True), "dB": Column("PSNR dB", 3, signed=True),
     "ms_before": Column("ms before", 2), "ms": Column("ms", 2, signed=True),
     "mb_before": Column("MB before"), "mb": COLUMNS["model_mb"],
@@ -43,7 +45,7 @@ def on_demand(chapter: Results, tests: pd.DataFrame) -> Section | None:
     names = table.model if table.variant.nunique() == 1 else names_of(table)
     drawn = table.assign(label=table.scene + ", " + names)[table.gated > 0].head(MOST_BARS)
     figures = () if drawn.empty else (
-        _figure("Gaussians before the gates, by effect set, %", drawn, [*EFFECT_SETS, REMOVED], "effect set"),
+        _figure("Gaussians before the gates, by effect set, %", drawn, [*SETS, REMOVED], "effect set"),
         _figure("Gaussians left, by degree of harmonics, %", drawn, DEGREES, "degree"),
     )  # fmt: skip
     text = (
@@ -102,9 +104,9 @@ def _numbers(r: Record, *, is_timed: bool) -> dict[str, Any]:
         row |= {"screen_s": screen.seconds} if is_timed else {}
     if gates:
         last = gates[-1]
-        row |= {name: max(0, last.rows.get(name, 0)) for name in EFFECT_SETS}
+        row |= {name: max(0, last.rows.get(name, 0)) for name in SETS}
         row |= {REMOVED: sum(max(0, gate.rows.get(REMOVED, 0)) for gate in gates)}
-        row |= {"before": sum(row[name] for name in (*EFFECT_SETS, REMOVED))}
+        row |= {"before": sum(row[name] for name in (*SETS, REMOVED))}
         row |= {name: _of_degree(last, name) for name in DEGREES}
         row |= {"mb_before": gates[0].bytes_before / 1e6, "mb": last.bytes / 1e6}
     if row["ends"]:
