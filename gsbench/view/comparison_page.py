@@ -12,7 +12,6 @@ from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ERROR_SCALE, Pixels, data_url, error_image
 from gsbench.run.checks import evaluated_views
 from gsbench.run.load import LoadedRun, scene_of
-from gsbench.scenes import View
 from gsbench.view.frame import FrameRequest, renderers_of
 from gsbench.view.training_views import ViewComparison, compare
 
@@ -54,7 +53,7 @@ oninput="this.previousElementSibling.style.setProperty('--at', this.value + '%')
 """
 
 
-def write_page(runs: list[LoadedRun], path: Path, data_root: str | None = None) -> None:
+def write_page(runs: Sequence[LoadedRun], path: Path, data_root: str | None = None) -> None:
     """Write an HTML file with both models' renders of each evaluated view; it needs no other file and no network.
 
     Raises:
@@ -62,27 +61,20 @@ def write_page(runs: list[LoadedRun], path: Path, data_root: str | None = None) 
     """
     if len(runs) != 2:
         raise InputError(f"--page: expected two runs to compare, got {len(runs)}")
-    first, second = runs
-    if first.scene.fingerprint != second.scene.fingerprint:
-        raise InputError(f"--page: expected runs of one scene, got {first.scene.name} in {first.folder} and other data "
-                         f"in {second.folder}")  # fmt: skip
-    views = evaluated_views(scene_of(first, data_root), first.config.scene.eval_split)
-    write_atomically(path, _page(runs, views).encode())
-
-
-def _page(runs: list[LoadedRun], views: Sequence[View]) -> str:
-    left, right = renderers_of(runs)
-    lefts, rights = ([compare(side, view, FrameRequest(view.time)) for view in views] for side in (left, right))
+    renderers = renderers_of(runs)
+    views = evaluated_views(scene_of(runs[0], data_root), runs[0].config.scene.eval_split)
+    lefts, rights = ([compare(side, view, FrameRequest(view.time)) for view in views] for side in renderers)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.globals["url"] = data_url
-    return environment.from_string(_PAGE).render(
+    page = environment.from_string(_PAGE).render(
         scene=runs[0].scene.name,
         count=len(views),
-        names=[left.name, right.name],
+        names=[renderer.name for renderer in renderers],
         means=[statistics.fmean(comparison.psnr for comparison in side) for side in (lefts, rights)],
         scale=ERROR_SCALE,
         views=zip(views, lefts, rights, map(_difference, lefts, rights), strict=True),
     )
+    write_atomically(path, page.encode())
 
 
 def _difference(left: ViewComparison, right: ViewComparison) -> Pixels:

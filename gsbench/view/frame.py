@@ -210,7 +210,16 @@ class FrameRenderer:
 
 
 def renderers_of(runs: Sequence[LoadedRun]) -> list[FrameRenderer]:
-    """Return a renderer for each of several runs that are compared: distinct names, one colour scale of costs."""
+    """Return a renderer for each of several runs that are compared: distinct names, one colour scale of costs.
+
+    Raises:
+        InputError: the runs are of different scenes.
+    """
+    first = runs[0]
+    for run in runs:
+        if run.scene.fingerprint != first.scene.fingerprint:
+            data = f"{first.scene.name} in {first.folder} and other data in {run.folder}"
+            raise InputError(f"expected runs of one scene to look at together, got {data}")
     most = max(most_cost(run.model) for run in runs)
     return [FrameRenderer(run, name, most) for run, name in zip(runs, short_names(runs), strict=True)]
 

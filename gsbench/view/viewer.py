@@ -246,12 +246,8 @@ class Viewer:
         Raises:
             InputError: the runs are of different scenes, or it is not possible to listen on this host.
         """
-        guard, first = RequestGuard(host, port), runs[0]
-        for run in runs:
-            if run.scene.fingerprint != first.scene.fingerprint:
-                raise InputError(f"expected runs of one scene to look at together, got {first.scene.name} in "
-                                 f"{first.folder} and other data in {run.folder}")  # fmt: skip
-        self.renderers = renderers_of(runs)
+        self.renderers, first = renderers_of(runs), runs[0]
+        guard = RequestGuard(host, port)
         self.scene: Scene | str = _scene_or_reason(first, data_root)
         self.browsers: dict[int, Browser] = {}
         self.wake = threading.Event()  # a browser needs a frame
