@@ -52,7 +52,7 @@ def traced(
         if ended:
             plan.write_ended(at_plan, 0, ended)
     if progress_of is not None:
-        at = Progress(WORDS, **HERE, job=None, step=100, steps=400, seconds=50.0, psnr_val=21.5)  # type: ignore[arg-type]
+        at = Progress(WORDS, **HERE, job=None, step=100, steps=400, seconds=50.0, psnr_val=21.5)
         at = replace(at, **progress_of)
         progress.write(folder, at)
         if stops:

@@ -164,7 +164,6 @@ def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, mon
     monkeypatch.setattr(atomic.os, "link", link)
     assert progress.take_claim(tmp_path, Progress(["a=1"])) is None
     holder = progress.take_claim(tmp_path, Progress(["a=1"], host="elsewhere"))
-    assert holder is not None
     assert holder.pid == os.getpid()
     assert names(tmp_path) == [FILE_NAME]
 
@@ -186,7 +185,6 @@ def test_a_run_that_another_process_does_is_left_to_it(
     progress.write(spec.folder, Progress([], host="elsewhere", updated=0.0))
     (spec.folder / progress.STOPPED).write_bytes(progress.encode(Progress([])))
     record = execution.execute(spec)
-    assert record is not None
     assert record.status == "ok"
     assert claims == [spec.folder / FILE_NAME]
     assert not {FILE_NAME, progress.STOPPED} & {*names(spec.folder)}

@@ -128,8 +128,6 @@ def test_a_tracker_is_sent_the_curve_and_the_results(
 ) -> None:
     """Catches a point or a result that does not arrive, steps that are off by one, and settings of another run."""
     record, folder = run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
-    assert record.metrics
-    assert record.cost
     by_step, settings, end = sent_to(name, packages)
     assert [line["iteration"] for line in lines(folder)] == [point.iteration for point in record.curve] == [15, 30]
     for point in record.curve:

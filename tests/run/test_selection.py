@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -94,9 +95,7 @@ def chosen_in(record: Record) -> tuple[str, int, list[Candidate]]:
     if record.length_choice is not None:
         kept = record.length_choice.kept
         return length_name(kept), kept, record.length_choice.tried
-    assert record.on_demand is not None
     comparison = record.on_demand.comparison
-    assert comparison is not None
     return comparison.chosen, comparison.iteration, comparison.candidates
 
 
@@ -129,7 +128,6 @@ def test_the_best_on_val_has_the_bits_of_its_training_alone(
     assert [psnr[best]] == [point.psnr_val for point in alone.curve if point.iteration == after]
     assert logged(folder) == [point.iteration for point in record.curve]
     loaded = load.load_run(folder)
-    assert record.cost is not None
     assert (loaded.step, len(loaded.model)) == (choice.iterations, record.cost.num_gaussians)
     assert loaded.model.active.sh_degree == 2
     assert events(record)[0][0] < choice.iterations
@@ -166,18 +164,10 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
 ) -> None:
     """Catches a second call that trains, a record that loses the choice when images are measured again, and a tracker
     that lacks the steps before the choice."""
-    words, sent = overrides(square, tmp_path, *choice.words, "log=json"), list[int]()
-
-    class Tracked:
-        def __init__(self, _: object) -> None: ...
-
-        def add(self, step: int, _: object) -> None:
-            sent.append(step)
-
-        def end(self, _: str) -> None: ...
-
-    monkeypatch.setitem(log.TRACKERS, "json", Tracked)
+    words, tracker = overrides(square, tmp_path, *choice.words, "log=json"), MagicMock()
+    monkeypatch.setitem(log.TRACKERS, "json", tracker)
     record, folder = run_here(*words)
+    sent = [step for (step, _), _ in tracker().add.call_args_list]
     assert sent == [*(point.iteration for point in record.curve), choice.iterations]
     name = choice.best.removeprefix("iterations=")
     assert re.search(rf"{name} (iterations is kept|is trained to the end)", capsys.readouterr().err)
@@ -249,8 +239,6 @@ def test_a_scene_without_times_is_static_and_not_compared(tmp_path: Path) -> Non
         path.write_text(json.dumps(content))
     record, folder = run_here(*overrides(data, tmp_path / "results", *MODELS.words, "effects.gate=off"))
     assert (record.status, record.reason) == ("ok", None)
-    assert record.on_demand is not None
-    assert record.on_demand.screen is not None
     assert (record.on_demand.screen.decision, record.on_demand.screen.reason) == ("off", "the views have no times")
     assert record.on_demand.comparison is None
     assert (record.effects.time, record.effects.refinement) == (False, False)
@@ -307,6 +295,5 @@ def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, mon
     best, _, tried = chosen_in(record)
     assert (best, len(tried)) == ("iterations=80", 4)
     assert not record.effects.time
-    assert record.cost is not None
     assert record.cost.stage_s["screen"] == 5.0
     assert load.load_run(folder).config.model.name == "6dgs"

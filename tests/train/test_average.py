@@ -84,8 +84,6 @@ def test_parameters_are_averaged_where_val_may_choose(split: str, views: int, ke
     fitted = trainer("7dgs", "train.average_from=15000", f"scene.eval_split={split}", "train.patience=null")
     fitted.scene = replace(fitted.scene, val=fitted.scene.val[:views])
     scores = [10.0, 20.0]
-    fitted.psnr = lambda views: (  # type: ignore[method-assign]
-        scores.pop(0) if fitted.step == 99 and scores and views is fitted.scene.val else 1.0
-    )
+    fitted.psnr = lambda views: scores.pop(0) if fitted.step == 99 and scores and views is fitted.scene.val else 1.0
     train(fitted)
     assert (fitted.hook(Average).kept, fitted.hook(Average).count) == (kept, 0)

@@ -126,11 +126,11 @@ def test_the_rule_is_called_as_the_schedule_says() -> None:
         resets.append(has_reset)
         return 0
 
-    rule.accumulate, rule.densify = lambda *_: counted.append(fitted.step), densify  # type: ignore[method-assign]
+    rule.accumulate, rule.densify = lambda *_: counted.append(fitted.step), densify
     for fitted.step in (stop - 2, stop - 1, stop, stop + 1):
         fitted.train_step()
     assert (counted, len(draws)) == ([stop - 2, stop - 1], 1)
-    schedule.densifies, schedule.resets = lambda _: True, lambda _: False  # type: ignore[method-assign]
+    schedule.densifies, schedule.resets = lambda _: True, lambda _: False
     draws.clear()
     for fitted.config.seed, fitted.step in ((0, 3), (0, 4), (1, 3), (0, 3)):
         fitted.train_step()
@@ -150,7 +150,7 @@ def test_what_is_long_in_time_is_split_along_its_path_near_the_clip() -> None:
     sizes[:, 4:], sizes[:, 3] = math.log(1e-3), math.log(1e4)  # small, in space they would be cloned; long
     model.splats["motion"].data[0, 3] = 100.0
     model.splats["opacities"].data.fill_(2.0)
-    rule.gradient[:2], rule.times_visible[:2] = 1.0, 1.0  # type: ignore[attr-defined]
+    rule.gradient[:2], rule.times_visible[:2] = 1.0, 1.0
     times, N = model.splats["times"].detach()[:2].clone(), len(model)
     rule.densify(generator(0), has_reset=False, most=100)
     assert len(model) == N + 2
@@ -174,7 +174,6 @@ def test_the_limit_follows_from_the_training_pixels(number: int, side: int, init
 def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
     """Catches a limit that no round of densification gets, and a training that is silent about what it left out."""
     square = moving_square()
-    assert square.points is not None
     points = replace(square.points, means=square.points.means[:20], colors=square.points.colors[:20])
     words = ("train.densify.grad_threshold=0", "train.densify.every=5", "effects.gate=off")
     fitted = trainer("3dgs", *words, scene=replace(square, points=points))

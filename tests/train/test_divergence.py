@@ -54,7 +54,7 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
     finite_check.every = 4
     fitted = nn.Parameter(torch.zeros(3))
     adam = torch.optim.Adam([fitted], lr=0.1, fused=True)
-    adam.found_inf = finite_check.skip  # type: ignore[attr-defined]
+    adam.found_inf = finite_check.skip
     before = []
 
     def train() -> None:
@@ -90,19 +90,18 @@ def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
     real = run.gradients
 
     def poisoned(batch: Sequence[View], *penalties: object) -> list[ViewResult]:
-        views = real(batch, *penalties)  # type: ignore[arg-type]
+        views = real(batch, *penalties)
         if run.step == 5:
             run.model.splats["log_diagonal"].grad[POISONED, -1] = math.nan
         return views
 
-    run.gradients = poisoned  # type: ignore[assignment]
+    run.gradients = poisoned
     path = tmp_path / "checkpoint.pt"
     with pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
         run.run(lambda state: checkpoint.save(path, Checkpoint("training", "data", state)), "poisoned")
     assert divergence.explain(run.model) == "the first is Gaussian 7 of 80 in 'log_diagonal' (1 in all)"
     assert all(p.isfinite().all() for p in run.model.parameters())
     state = checkpoint.load(path, "training", "data", "cpu")
-    assert state is not None
     assert state["step"] == 5
     assert all(value.isfinite().all() for value in state["model"].values())
 
@@ -111,12 +110,11 @@ def test_without_harmonics() -> None:
     """Catches a diagnosis that takes the largest of no coefficients, so that the run leaves no record, and one without
     any Gaussian to blame."""
     model, points = models.build("3dgs", sh_degree=0), moving_square().points
-    assert points is not None
     model.initialise(points, 4.4, generator(0))
     for p in model.splats.values():
         p.grad = torch.zeros_like(p)
     assert "learning rates" in divergence.explain(model)
     assert "networks" in divergence.explain(trainer("7dgs").model)
     model.splats["sh0"].data[POISONED] = 1e4
-    model.splats["sh0"].grad[POISONED].view(-1)[-1] = math.nan  # type: ignore[index]
+    model.splats["sh0"].grad[POISONED].view(-1)[-1] = math.nan
     assert "Gaussian 7 of 80 in 'sh0' (1 in all)" in divergence.explain(model)

@@ -19,7 +19,7 @@ def with_val(psnr: dict[int, float], *more: str) -> Trainer:
     """A trainer of 100 iterations whose PSNR on val, by iteration, is given: it rises where nothing is given."""
     fitted = trainer("7dgs", *PATIENT, *more)
     real = fitted.psnr
-    fitted.psnr = lambda views: (  # type: ignore[method-assign]
+    fitted.psnr = lambda views: (
         psnr.get(fitted.step + 1, fitted.step / 100) if views is fitted.scene.val else real(views)
     )
     return fitted
@@ -42,7 +42,6 @@ def test_a_training_stops_after_its_best_and_keeps_it(
     fitted, saved = with_val(psnr, "effects.gate=off", *words), list[dict[str, Any]]()
     fitted.run(saved.append, "square")
     stop = fitted.hook(EarlyStop).stop
-    assert stop is not None
     assert (stop.kept, stop.iteration) == (kept, min(100, max(kept, fitted.schedule.densify_stop) + 20))
     assert fitted.curve.points[-1].iteration == stop.iteration
     assert fitted.step == 100  # so that the run is finished for all who ask

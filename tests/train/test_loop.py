@@ -10,7 +10,6 @@ from tiny_training import train, trainer
 
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam_all
-from gsbench.measure.curve import Point
 from gsbench.measure.speed import StageClock
 from gsbench.train.hooks import Hook
 from gsbench.train.hooks.best import Best
@@ -21,12 +20,11 @@ def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
     """Catches a curve measured on test, and a best on val that stores val's own score."""
     fitted = trainer()
     scores = {id(fitted.scene.val): [20.0, 21.0, 20.5], id(fitted.views): [15.0, 14.0, 16.0]}
-    fitted.psnr = lambda views: scores[id(views)].pop(0)  # type: ignore[method-assign]
+    fitted.psnr = lambda views: scores[id(views)].pop(0)
     for step in (0, 1, 2):
         fitted.step = step
         fitted._measure()
     assert [point.psnr_val for point in fitted.curve.points] == [20.0, 21.0, 20.5]
-    assert isinstance(fitted.curve.last, Point)
     best = fitted.hook(Best).scores
     assert (best.val, best.eval_at_best_val, best.eval) == (21.0, 14.0, None)
 
@@ -35,10 +33,10 @@ def test_opacities_are_reset_when_the_schedule_says_and_after_measuring() -> Non
     """Catches a reset that is never called, is called every step, leaves any of Adam's two moments, or lowers far, and
     a curve, and a best on val, of models whose opacities were lowered a moment ago."""
     fitted, measured = trainer(), list[float]()
-    fitted.schedule.resets, fitted.schedule.measures = lambda step: step == 1, lambda _: True  # type: ignore[method-assign]
+    fitted.schedule.resets, fitted.schedule.measures = lambda step: step == 1, lambda _: True
     opacities = fitted.model.splats["opacities"]
     opacities.data.fill_(2.0)
-    fitted.psnr = lambda _: measured.append(opacities.max().sigmoid().item()) or 1.0  # type: ignore[method-assign, func-returns-value]
+    fitted.psnr = lambda _: measured.append(opacities.max().sigmoid().item()) or 1.0
     ceiling = 2 * fitted.config.model.min_opacity
     for step in (0, 1):
         fitted.run(lambda _: None, "a step", goes_on=lambda: False)
@@ -72,9 +70,7 @@ def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
 ) -> None:
     """Catches a bar that says neither, and one that waits for a GPU at every step to say it."""
     fitted = trainer("3dgs", "train.curve_points=4")
-    reads = []
-    seconds = StageClock.seconds.fget
-    assert seconds is not None
+    reads, seconds = [], StageClock.seconds.fget
     monkeypatch.setattr(StageClock, "seconds", property(lambda clock: reads.append(1) or seconds(clock)))
     train(fitted)
     assert len(reads) == 4 + 1  # the points of the curve, and the checkpoint at the end
@@ -102,7 +98,7 @@ def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: 
     settings = ("3dgs", "train.iterations=10", "train.curve_points=5", "train.densify.stop=0")
     for _ in range(2):  # the second training continues the first, which ends after three steps
         fitted = trainer(*settings)
-        fitted.train_step, fitted.psnr = step, lambda _: after(100.0, 20.0)  # type: ignore[method-assign]
+        fitted.train_step, fitted.psnr = step, lambda _: after(100.0, 20.0)
         if saved:
             fitted.load_state_dict(saved[-1])
         fitted.run(

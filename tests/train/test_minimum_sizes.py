@@ -45,15 +45,16 @@ def flat(name: str) -> tuple[GaussianModel, Tensor, list[int]]:
 @pytest.mark.parametrize(
     ("cameras", "pixel"),
     [
-        ([camera(4.0), camera(2.0), camera(2.5, focal=(100.0, 100.0))], 2.5 / 100),
-        ([camera(2.0, focal=(80.0, 50.0))], 2.0 / 80),
-        ([camera(2.0, focal=(50.0, 80.0))], 2.0 / 80),
+        ([camera(4.0), camera(2.0), camera(2.5, focal=(100.0, 100.0))], 3.5 / 100),
+        ([camera(2.0, focal=(80.0, 50.0))], 3.0 / 80),
+        ([camera(2.0, focal=(50.0, 80.0))], 3.0 / 80),
     ],
 )
 def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras: list[Camera], pixel: float) -> None:
-    """Catches the farthest camera, a mean over cameras, and a focal length that is left out, or the smaller of two."""
+    """Catches the farthest camera, a mean over cameras, one on the other side, and a focal length that is left out, or
+    the smaller of two."""
     model = flat("3dgs")[0]
-    model.splats["means"].data.zero_()
+    model.splats["means"].data[:] = torch.tensor([0.0, 0.0, 1.0])  # behind what the cameras are `distance` away from
     least = MinimumScale(training_of(model, camera=cameras)).least
     torch.testing.assert_close(least, torch.full((200,), LEAST_PIXELS * pixel))
 

@@ -42,7 +42,6 @@ class Deformed(Gaussians3DModel):
         return super().initial_geometry(points, distances, generator)
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
-        assert query.time is not None
         time = torch.as_tensor(query.time).reshape(1)
         moved = raw if self.active.warms_up else raw | {"means": raw["means"] + self.field(time)}
         return self.static(moved)
@@ -52,7 +51,6 @@ def deformed(*words: str) -> Trainer:
     config = compose("3dgs", 100, "effects.gate=off", *words)
     config.model.lr["field"] = LearningRate(1e-2)
     model, square = Deformed(), moving_square()
-    assert square.points is not None
     points = replace(square.points, times=torch.linspace(0, 1, len(square.points.means)))
     model.initialise(points, square.extent, generator(0))
     return Trainer(model, replace(square, val=square.train[:3]), square.train[3:5], config)

@@ -73,7 +73,6 @@ def test_scores_are_the_sums_by_hand() -> None:
         least, most = min(errors), max(errors)
         weights = weights_of_pixels(model, view).reshape(-1, 4)
         c = sum(w for w, error in zip(weights, errors, strict=True) if (error - least) / (most - least) > 0.1)
-        assert isinstance(c, torch.Tensor)
         assert 0.1 * weights.sum() < c.sum() < 0.9 * weights.sum()
         counts += c / 3
         weighed += photometric(image[None], view.image[None], 0.2) * c
@@ -163,5 +162,5 @@ def test_every_model_trains_by_it(name: str) -> None:
     before = len(fitted.model)
     model = train(fitted, until=21).model
     assert len(model) > before
-    assert len(model) == len(fitted.hook(MinimumScale).least) == len(fitted.density.rule.unseen)  # type: ignore[attr-defined]
+    assert len(model) == len(fitted.hook(MinimumScale).least) == len(fitted.density.rule.unseen)
     assert all(parameter.isfinite().all() for parameter in model.parameters())

@@ -25,7 +25,6 @@ def fitted(
 
 def descend(model: GaussianModel, optimizer: Optimizer, step: int, drawn: torch.Tensor | None = None) -> None:
     loss = sum(((p + 1) * (i + 1)).square().sum() for i, p in enumerate(model.splats.values()))
-    assert isinstance(loss, torch.Tensor)
     loss.backward()
     optimizer.step(step, torch.ones(len(model), dtype=torch.bool) if drawn is None else drawn)
 

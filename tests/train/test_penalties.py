@@ -38,9 +38,9 @@ def moving(positions: torch.Tensor, velocities: torch.Tensor) -> FreeTimeModel:
     return model
 
 
-def prepared(model: GaussianModel, step: int = 0, seed: int = 0) -> Strain:
-    penalty = Strain(model, seed, FRAMES)
-    penalty.prepare(step, VIEW)
+def prepared(model: GaussianModel) -> Strain:
+    penalty = Strain(model, 0, FRAMES)
+    penalty.prepare(0, VIEW)
     return penalty
 
 
@@ -92,11 +92,10 @@ def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
     model = lively(name, agr)
     penalty, asked = prepared(model), []
     real = penalty._visible_means
-    penalty._visible_means = lambda query: asked.append(query) or real(query)  # type: ignore[method-assign, func-returns-value]
+    penalty._visible_means = lambda query: asked.append(query) or real(query)
     value = penalty(QUERY, 1)
     value.backward()
     neighbours, (now, later) = penalty.neighbours, asked
-    assert neighbours is not None
     assert sorted(penalty.rows.tolist()) == list(range(len(model)))
     pairs = neighbours.long()
     means, visible = real(now)
@@ -112,7 +111,6 @@ def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
     assert any("refinement" in key for key in learns) == agr
     assert "splats.opacities" not in learns
     for x in learns.values():
-        assert x.grad is not None
         step, ends = 1e-8 * torch.randn(x.shape, generator=seeded(3)).double(), []
         for sign in (1, -1):
             x.data += sign * step
@@ -144,10 +142,8 @@ def test_neighbours_are_searched_again() -> None:
     """Catches neighbours of rows that have moved to other indices, and ones that are never or always searched."""
     fitted = trainer("freetime", *WEIGHT)
     (penalty,), view = fitted.hook(Penalties).active.values(), fitted.scene.train[0]
-    assert isinstance(penalty, Strain)
     penalty.prepare(5, view)
     first = penalty.neighbours
-    assert first is not None
     itself = torch.arange(len(first))[:, None]
     assert not (first == itself).any()
     distances = torch.cdist(fitted.model.splats["means"].double(), fitted.model.splats["means"].double()).detach()
@@ -156,7 +152,6 @@ def test_neighbours_are_searched_again() -> None:
     assert penalty.neighbours is first
     fitted.rows.select(torch.arange(len(first)).flip(0))
     penalty.prepare(104, view)
-    assert penalty.neighbours is not None
     assert torch.equal(penalty.neighbours.flip(0), len(first) - 1 - first)
     second = penalty.neighbours
     penalty.prepare(204, view)
@@ -168,7 +163,6 @@ def test_neighbours_at_the_edge(place: str) -> None:
     """Catches an index beyond the Gaussians where there are too few, and a Gaussian that is its own neighbour."""
     x = grid(8) if place == "few" else torch.zeros(30, 3, dtype=torch.float64)
     penalty = prepared(moving(x, grid(len(x))))
-    assert penalty.neighbours is not None
     assert not (penalty.neighbours == torch.arange(len(x))[:, None]).any()
     assert penalty(QUERY, 0).detach() >= 0
     assert (len(penalty.rows) == 0) == (place == "few")

@@ -20,7 +20,6 @@ def larger(scene: Scene) -> Scene:
         viewmat[:3, 3] *= TIMES
         return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
-    assert scene.points is not None
     points = Points(TIMES * scene.points.means, scene.points.colors)
     train, test = [away(v) for v in scene.train], [away(v) for v in scene.test]
     return replace(scene, train=train, test=test, points=points, extent=TIMES * scene.extent)
