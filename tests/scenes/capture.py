@@ -31,9 +31,9 @@ class Capture:
         quaternions = Rotation.from_matrix(self.viewmats[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
         return np.concatenate([quaternions, self.viewmats[:, :3, 3]], 1).tolist()
 
-    def write(self, root: Path, kind: str) -> Path:
-        """Write sparse/0 of the folder `root`; kind: bin or txt. Return `root`."""
-        folder = root / "sparse" / "0"
+    def write(self, root: Path, kind: str, where: str = "sparse/0") -> Path:
+        """Write a folder of the folder `root`; kind: bin or txt. Return `root`."""
+        folder = root / where
         folder.mkdir(parents=True, exist_ok=True)
         for part, data in (self.binary() if kind == "bin" else self.text()).items():
             (folder / f"{part}.{kind}").write_bytes(data)
@@ -76,10 +76,12 @@ WIDTH, HEIGHT, COUNT = 16, 12, 9  # of the small capture
 NAMES = [f"frame_{i:03d}.png" for i in range(COUNT)]
 
 
-def small_model(root: Path, names: list[str] = NAMES, viewmats: np.ndarray | None = None) -> Path:
+def small_model(
+    root: Path, names: list[str] = NAMES, viewmats: np.ndarray | None = None, where: str = "sparse/0"
+) -> Path:
     """Write the model of the small capture, as text, with these images and cameras; return `root`."""
     viewmats = circle(COUNT)[: len(names)] if viewmats is None else viewmats
-    return Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, viewmats).write(root, "txt")
+    return Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), names, viewmats).write(root, "txt", where)
 
 
 def small_capture(root: Path) -> Path:

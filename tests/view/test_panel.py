@@ -50,18 +50,15 @@ def test_the_table_splits_a_frame_by_stage() -> None:
     assert "90 x 60" in text
 
 
-def test_the_legend_counts_the_classes_that_there_are() -> None:
-    """Catches a count beside the name of another effect set or colour, and effect sets that nothing shown has."""
+def test_the_legend_explains_the_colours_that_there_are() -> None:
+    """Catches a count beside the name of another effect set or colour, effect sets that nothing shown has, a scale that
+    is not the one the image was drawn on, and a legend of colours that need none."""
     text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0, {})
     table = rows(text)
     assert list(table) == ["Gaussians", EFFECT_SETS["refined"], EFFECT_SETS["conditioned"], EFFECT_SETS["static"]]
     assert list(table.values()) == [["7dgs", "4dgs"], ["1,200", "0"], ["5", "700"], ["30", "0"]]
     colours = re.findall(r"color:rgb(\(.*?\))", text)
     assert colours == [str(COLOURS[name]) for name in ("refined", "conditioned", "static")]
-
-
-def test_the_legend_of_costs_has_its_scale() -> None:
-    """Catches a scale that is not the one the image was drawn on, and a legend of colours that need none."""
     assert "251 ns" in (both := legend([shown(CLASS, "a"), shown(COST, "a")], 251.0, {}))
     assert EFFECT_SETS["refined"] in both
     assert EFFECT_SETS["refined"] not in legend([shown(IMAGE, "a"), shown(COST, "a")], 251.0, {})

@@ -22,12 +22,8 @@ EXTENT = 4.0
 def camera(x: float, *, towards: float = 0.0) -> Camera:
     """At x on a line, looking along y and as far aside."""
     eye = torch.tensor([x, -5.0, 0.0])
-    return Camera(
-        cameras.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0]), torch.tensor(cameras.UP)),
-        cameras.intrinsics(8, 8),
-        8,
-        8,
-    )
+    viewmat = cameras.look_at(eye, eye + torch.tensor([towards, 1.0, 0.0]), torch.tensor(cameras.UP))
+    return Camera(viewmat, cameras.intrinsics(8, 8), 8, 8)
 
 
 def scene(*cameras_and_times: tuple[Camera, float | None]) -> Scene:
@@ -47,21 +43,14 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
     assert nearest.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
 
 
-def test_places_count_in_extents() -> None:
-    """Catches metres added to radians: 0.6 of an extent of 4 is less than the 17 degrees of the other view."""
+def test_the_nearest_view_in_a_rig_and_in_extents() -> None:
+    """Catches metres added to radians, a rig whose first frame is always shown, a time that outweighs the place, and
+    one that has to be there."""
     views = scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0))
-    assert nearest_view(views, camera(0.4), 0.0).view.name == "0"
-
-
-def test_of_views_of_one_camera_the_nearest_in_time_is_chosen() -> None:
-    """Catches a rig whose first frame is always shown, and a time that outweighs the place."""
+    assert nearest_view(views, camera(0.4), 0.0).view.name == "0"  # 0.6 of an extent of 4 is less than 17 degrees
     views = scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)])
     assert [nearest_view(views, camera(0.1), time).view.name for time in (0.0, 0.4, 0.9)] == ["0", "2", "4"]
     assert nearest_view(views, camera(0.9), 0.4).view.name == "3"
-
-
-def test_a_scene_without_times_has_a_nearest_view() -> None:
-    """Catches a time that has to be there."""
     assert nearest_view(scene((camera(0.0), None), (camera(1.0), None)), camera(0.9), None).view.name == "1"
 
 
