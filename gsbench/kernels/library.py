@@ -21,6 +21,8 @@ Slots = dict[str, Any]  # kernel arguments by name: a number, an address as an i
 class Library:
     """The compiled kernels for tensors on the CPU."""
 
+    needs_scratch = False  # whether torch must provide scratch memory; the kernels of the CPU allocate their own
+
     def __init__(self, extension: ModuleType) -> None:
         """Store the compiled extension and read the argument names of its kernels."""
         self.extension = extension
@@ -45,11 +47,6 @@ class Library:
         """Return whether a kernel has an argument with this name."""
         return field in self._fields[name]
 
-    @property
-    def needs_scratch(self) -> bool:
-        """Return whether kernels need scratch memory from torch; the CPU kernels allocate their own."""
-        return False
-
     def similarity_parts(self, height: int, width: int) -> int:
         """Return the number of partial sums that the kernel of `l1_ssim` writes: 1 on the CPU."""
         return 1
@@ -57,6 +54,8 @@ class Library:
 
 class CudaLibrary(Library):
     """The compiled kernels for tensors on a GPU; they are enqueued on torch's current stream."""
+
+    needs_scratch = True  # by torch's caching allocator
 
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
         """Enqueue a kernel on the device of `like`."""
@@ -67,11 +66,6 @@ class CudaLibrary(Library):
             return
         with torch.cuda.device_of(like):
             self._run(name, *values, torch.cuda.current_stream(like.device).cuda_stream)
-
-    @property
-    def needs_scratch(self) -> bool:
-        """Return True: on a GPU, torch's caching allocator also provides the kernels' scratch memory."""
-        return True
 
     def similarity_parts(self, height: int, width: int) -> int:
         """Return the number of partial sums that the kernel of `l1_ssim` writes: one per thread block."""

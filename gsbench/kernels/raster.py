@@ -98,7 +98,8 @@ def project(inputs: RasterInputs, viewport: Viewport) -> Splats:
     return splats._replace(beta_exponents=beta_exponents)
 
 
-def _of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+def _sizes_of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+    """Return the numbers of channels, of lists of tiles, and of numbers that a backward kernel adds for each splat."""
     colors = tensors["colors"]
     C, D, sets = tensors["means2d"].shape[0], colors.shape[-1], colors.shape[0] if colors.dim() == 3 else 1
     if sets not in (1, C):
@@ -127,7 +128,7 @@ _blend = Operation(
         "stop": Output("C state", gradient=False),
     },
     numbers={"width": int, "height": int},
-    derive=_of_images,
+    derive=_sizes_of_images,
     scratch="C N sums",
     memory="images",
 )
@@ -184,7 +185,7 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
         return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda value: value == 0)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
     *total, flagged = ends[-2:].tolist()
-    pairs = _countable(total[0] if total else 0)
+    pairs = _checked_count(total[0] if total else 0)
     return _list_on_gpu(library, splats, viewport, (order, ends), _room(splats, pairs)), flagged
 
 
@@ -203,7 +204,8 @@ def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> 
     return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
 
 
-def _countable(pairs: int) -> int:
+def _checked_count(pairs: int) -> int:
+    """Return the number of tile intersections; raise InputError if int32 cannot count them."""
     if pairs > MAX_PAIRS:
         raise InputError(f"{pairs} pairs of a tile and a Gaussian are more than {MAX_PAIRS}: "
                          "draw fewer cameras at once, a smaller image, or fewer large Gaussians")  # fmt: skip
@@ -211,6 +213,7 @@ def _countable(pairs: int) -> int:
 
 
 def _splat_slots(splats: Splats, viewport: Viewport) -> dict[str, Any]:
+    """Return sizes and addresses of splats by the names of the arguments of `count_tiles` and `fill_tiles`."""
     C, N = splats.depths.shape
     addresses = dict(zip(("means2d", "roots", "depths", "half_sizes", "shapes"), map(address, splats), strict=True))
     return {"N": N, "C": C, "width": viewport.width, "height": viewport.height} | addresses
@@ -221,7 +224,9 @@ def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = _countable(recording.read(total, lambda value: value <= room))  # the memory of a recording stays as it is
+    pairs = _checked_count(
+        recording.read(total, lambda value: value <= room)
+    )  # the memory of a recording stays as it is
     room = pairs if recording.current() is None else int(ROOM * pairs)
     require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
     ids = like.new_empty(room, dtype=torch.int32)

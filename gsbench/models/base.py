@@ -119,7 +119,6 @@ class GaussianModel(nn.Module, ABC):
 
         Positions, velocities and lifetimes do not change. The relocation of 3DGS-MCMC calls this method.
         """
-        return
 
     def spread(self, rows: Tensor) -> Tensor:
         """Return factors F of the conditional covariances F F^T of the Gaussians `rows` [M], [M, 3, 3].
@@ -161,11 +160,9 @@ class GaussianModel(nn.Module, ABC):
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""
-        return
 
     def hold_lifetimes(self, least: float) -> None:
         """Raise the lifetime s (see `lifetimes`) of each Gaussian to at least `least`; by default do nothing."""
-        return
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
         """Return covariance parameters for which the spatial covariance is that of trained 3D Gaussians.

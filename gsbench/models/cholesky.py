@@ -195,7 +195,7 @@ class CholeskyModel(JointModel):
         masks = super().kept(effect_sets)
         if effect_sets.orders is None:
             return masks
-        static = torch.arange(len(effect_sets.orders), device=effect_sets.orders.device) >= effect_sets.conditioned
+        static = ~effect_sets.is_conditioned
         gone = {"p": torch.zeros_like(static), "t": static, "d": static}
         masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.layout.letters], -1)
         for kind in self.layout.kinds[1:]:  # all but shape

@@ -6,6 +6,7 @@ constant, do not learn, and are not stored.
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 NAMES = ("refined", "conditioned", "static")  # groups of Gaussians
@@ -22,6 +23,12 @@ class EffectSets(NamedTuple):
     conditioned: int  # the first `conditioned` >= `refined` Gaussians change with time or direction
     orders: Tensor | None  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`; None: all
     intervals: Tensor | None = None  # [refined, 2]: the first and last time at which AGR changes a row; None: always
+
+    @property
+    def is_conditioned(self) -> Tensor:
+        """Which Gaussians change with time or direction, [N] bool."""
+        assert self.orders is not None
+        return torch.arange(len(self.orders), device=self.orders.device) < self.conditioned
 
     def by_name(self, rows: int) -> dict[str, int]:
         """Return the number of Gaussians in each group of NAMES, for a model of `rows` Gaussians."""

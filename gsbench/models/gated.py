@@ -125,15 +125,13 @@ class GatedModel(GaussianModel):
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.kept(effect_sets).items():
-            packed, key = state.get(f"splats.{name}"), f"splats.{name}"
-            shape = (len(effect_sets.orders), *self.splats[name].shape[1:])
-            there = mask.expand(shape)
-            if not isinstance(packed, Tensor) or tuple(packed.shape) != (int(there.sum()),):
-                raise InputError(f"checkpoint: expected {key} as the {int(there.sum())} entries that matter to its "
+            key, shape = f"splats.{name}", (len(effect_sets.orders), *self.splats[name].shape[1:])
+            packed, used = state.get(key), mask.expand(shape)
+            if not isinstance(packed, Tensor) or tuple(packed.shape) != (int(used.sum()),):
+                raise InputError(f"checkpoint: expected {key} as the {int(used.sum())} entries that matter to its "
                                  f"effect sets")  # fmt: skip
-            value = packed.new_full(shape, self.constant(name))
-            value[there] = packed
-            whole[key] = value
+            whole[key] = packed.new_full(shape, self.constant(name))
+            whole[key][used] = packed
         return whole
 
 

@@ -144,7 +144,7 @@ class Gaussians4DModel(JointModel, gates=True):
         if orders is None:
             return {}
         stored = coefficients_within(orders, self.sh_degree, self.time_degree + 1)
-        changes = torch.arange(len(orders), device=orders.device)[:, None] < effect_sets.conditioned
+        changes = effect_sets.is_conditioned[:, None]
         space = torch.tensor([[True, True, True, False]], device=orders.device)
         timed = changes | (order_of(orders).waves > 1)[:, None]
         others = stored.flatten(1)[:, 1:, None]  # the constant coefficient is stored in sh0

@@ -67,8 +67,7 @@ class MovingGaussians3D(Gaussians3DModel):
     def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         masks = super().kept(effect_sets)
         if effect_sets.orders is not None:
-            rows = torch.arange(len(effect_sets.orders), device=effect_sets.orders.device)[:, None]
-            masks |= dict.fromkeys(self.moving, rows < effect_sets.conditioned)
+            masks |= dict.fromkeys(self.moving, effect_sets.is_conditioned[:, None])
         return masks
 
 

@@ -1,6 +1,6 @@
 """Load captures: images, a COLMAP model of their cameras (.bin or .txt), and times from file names or times.csv.
 
-A damaged file, or a camera that is not read, raises `InputError`, which names the file and the record.
+What is missing, damaged or contradictory raises `InputError`, which names the file and the record.
 """
 
 import math
@@ -78,9 +78,6 @@ def load(root: Path, rendition: Rendition) -> Scene:
 
     The distortion of lenses is undone by OpenCV. The principal point may lie anywhere. Every eighth image in the order
     of time and then of name is a test view, from the eighth on; the others are for training.
-
-    Raises:
-        InputError: something is missing, damaged or contradictory; the message names the file.
     """
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()

@@ -1,7 +1,7 @@
 """Load scenes from JSON files of cameras: transforms_{train,val,test}.json (Blender) or transforms.json (nerfstudio).
 
 The Blender layout is that of NeRF-synthetic, D-NeRF and 7DGS-PBR.
-A value that is not read raises `InputError`; `where` is the file and the field.
+What is missing, damaged or contradictory raises `InputError`; `where` is the file and the field.
 """
 
 import json
@@ -128,9 +128,6 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
 
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
     each pixel (`View.regions`). Masks are not used in training or measurement.
-
-    Raises:
-        InputError: something is missing, damaged or contradictory; the message names the file and field.
     """
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
@@ -169,11 +166,8 @@ def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
     The file has what `load_blender` reads from each of its files. `train_filenames`, `val_filenames` and
     `test_filenames` may list the images of each split by their `file_path`. Otherwise every eighth image in the order
     of time and then of name is a test view, from the eighth on. Times come from times.csv, otherwise from `time` in the
-    frames, otherwise from the names of the images (`gsbench.scenes.times`). The points of
-    `ply_file_path` are the initial points.
-
-    Raises:
-        InputError: something is missing, damaged or contradictory; the message names the file and field.
+    frames, otherwise from the names of the images (`gsbench.scenes.times`). The points of `ply_file_path` are the
+    initial points.
     """
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
