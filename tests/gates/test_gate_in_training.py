@@ -74,21 +74,18 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     assert_same_bits(end(second), expected)
 
 
-def test_off_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a gate that acts, or draws a random number, where none was asked for."""
-    monkeypatch.setattr(Gating, "simplify", lambda *_, **__: pytest.fail("a gate was asked"))
-    plain = trainer("effects.gate=off")
-    end(plain)
-    assert plain.model.effect_sets is None
-
-
-def test_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a gate in training of a model that needs all of its Gaussians, and one that is left out in silence."""
+def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a gate that acts where none was asked for, one in training of a model that needs all of its Gaussians,
+    and one that is left out in silence."""
     training = trainer("effects.gate=both")
     monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", len(training.model) * 100)
     end(training)
     assert [gate.step for gate in training.hook(Gating).gates if gate.step is not None] == []
     assert "at step 60 the model has" in training.hook(Gating).notes[0]
+    monkeypatch.setattr(Gating, "simplify", lambda *_, **__: pytest.fail("a gate was asked"))
+    plain = trainer("effects.gate=off")
+    end(plain)
+    assert plain.model.effect_sets is None
 
 
 def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,7 +53,8 @@ def panel(image: Pixels, number: int) -> list[list[int]]:
 
 
 def test_each_class_has_its_colour() -> None:
-    """Catches rows taken for those of another effect set, swapped red and blue, and panels in another order."""
+    """Catches rows taken for those of another effect set, swapped red and blue, panels in another order, and a file of
+    many megabytes for a scene of full size."""
     model = one_of_each()
     image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
     assert picture.kinds_of(model).tolist() == [0, 1, 1, 2, 2]
@@ -63,6 +64,8 @@ def test_each_class_has_its_colour() -> None:
     assert np.abs(np.array(panel(image, 1)) - colours).max() < 6
     corner = image[picture.LINE, ENLARGED * 100 + picture.GAP]
     assert corner.tolist() == [255, 255, 255], "the effect sets stand on white, whatever the background is"
+    wide = picture.draw(model, Camera(CAMERA.viewmat, CAMERA.K, 2000, 500), 0.5, torch.zeros(3))
+    assert wide.shape[:2] == (160 + 2 * picture.LINE, 3 * picture.MOST_WIDTH + 2 * picture.GAP)
 
 
 def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,14 +108,6 @@ def test_a_model_without_classes_is_of_one_class(name: str, agr: bool, kind: str
     assert np.abs(np.array(shown) - picture.COLOURS[kind]).max() < 6
 
 
-def test_large_images_are_made_smaller() -> None:
-    """Catches a file of many megabytes for a scene of full size."""
-    wide = Camera(CAMERA.viewmat, CAMERA.K, 2000, 500)
-    image = picture.draw(one_of_each(), wide, 0.5, torch.zeros(3))
-    assert image.shape[1] == 3 * picture.MOST_WIDTH + 2 * picture.GAP
-    assert image.shape[0] == 160 + 2 * picture.LINE
-
-
 def test_the_page_has_the_same_colours() -> None:
     """Catches an effect set that has one colour in the picture and another in the figure above it."""
     page = dict(zip(on_demand.SETS, (THEMES[variable][0] for variable in SETS), strict=False))
@@ -132,17 +127,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path.parent
 
 
-def test_a_run_that_chose_effects_leaves_its_picture(folder: Path) -> None:
-    """Catches a picture that is not written, or not where the report looks."""
+def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a run that leaves no picture, or not where the report looks; a command that draws another view or moment
+    than it was asked for, or than the run itself drew."""
     assert record.read(folder / record.FILE_NAME).on_demand
     assert cv2.imread(str(folder / "effect_sets.png")).shape[1] == 3 * 304 + 2 * picture.GAP
-
-
-def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a command that draws another view or moment than it was asked for, or than the run itself drew."""
     out = [tmp_path / f"{i}.png" for i in range(3)]
-    asked = [[], ["--camera", "1"], ["--camera", "1", "--time", "0.2"]]
-    for path, more in zip(out, asked, strict=True):
+    for path, more in zip(out, ([], ["--camera", "1"], ["--camera", "1", "--time", "0.2"]), strict=True):
         assert main(["--picture", str(folder), "--out", str(path), *more]) == 0
     assert out[0].read_bytes() == (folder / "effect_sets.png").read_bytes()
     assert len({path.read_bytes() for path in out}) == 3
