@@ -117,8 +117,6 @@ class GatedModel(GaussianModel):
         effect_sets = effect_sets_in(state)
         super().load_state(state if effect_sets is None else self._unpacked(state, effect_sets))
         self.effect_sets = effect_sets
-        if effect_sets is not None:
-            self.fill(effect_sets)
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
         """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""

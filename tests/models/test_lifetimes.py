@@ -31,8 +31,11 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
         torch.testing.assert_close(times, torch.sigmoid(model.splats["times"][:, 0]))
         S_t = joint(model)[:, -1, -1] / (2 if variant == "ndgs" else 1) / model.lambda_of("time")
         torch.testing.assert_close(lifetimes, S_t.sqrt())
+    elif variant not in ("dgs", "dbs"):
+        model.splats["times"].data[:4, 0] = torch.tensor([-9.0, -9.0, 10.0, 10.0])  # visible never
     intervals = model.visible_intervals()
     assert intervals is not None
+    assert variant in ("dgs", "dbs", "ndgs") or "," in variant or intervals[:4].isinf().all()
     first, last = intervals.unbind(1)
     hidden, times = 0, torch.linspace(0, 1, 41, dtype=torch.float64)
     for time in times:
