@@ -66,7 +66,8 @@ def test_the_record_has_the_protocol(square: Path, tmp_path: Path) -> None:
     plain, other = run_here(*words)
     assert "resize" not in plain.protocol
     assert other != folder
-    assert "scene.resize" in (run_here(*words, "scene.resize=pilow")[0].reason or "")
+    with pytest.raises(InputError, match=r"scene\.resize"):
+        run_here(*words, "scene.resize=pilow")
 
 
 def test_the_record_names_a_replaced_image(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.render import rasterize_slice, render
 from gsbench.scenes.scene import Points, View
 from gsbench.train.batches import generator
-from gsbench.train.density.multiview import LEAST_IMPORTANCE, ErrorScore, MultiviewDensification
+from gsbench.train.density.multiview import LEAST_IMPORTANCE, VIEWS, ErrorScore, MultiviewDensification, drawn_once
 from gsbench.train.density.rule import Scores
 from gsbench.train.hooks.minimum_sizes import MinimumScale
 from gsbench.train.losses import photometric
@@ -97,6 +97,18 @@ def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
     assert len(model) == 0
 
 
+def test_ten_different_views_are_drawn_anew() -> None:
+    """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
+    score = scores_of(four_gaussians(), moving_square().train)
+    real, looked_at = score._of_view, list[str]()
+    score._of_view = lambda view: looked_at.append(view.name) or real(view)
+    for seed in (0, 1, 0):
+        score(generator(seed))
+    rounds = [looked_at[:VIEWS], looked_at[VIEWS : 2 * VIEWS], looked_at[2 * VIEWS :]]
+    assert [len(set(names)) for names in rounds] == [10, 10, 10]
+    assert rounds[0] == rounds[2] != rounds[1]
+
+
 def of_eight(name: str, opacities: list[float], badness: list[float]) -> tuple[MultiviewDensification, torch.Tensor]:
     """The rule with scores that are given for eight Gaussians, of which 2 to 5 are important; and their means."""
     model = started(build(name, **OPTIONS[name]), 8)
@@ -140,6 +152,24 @@ def test_half_as_many_as_candidates_are_drawn_from_all(has_reset: bool, left: li
     density.unseen[7] = density.patience
     density.densify(generator(1), has_reset, most=100)  # two are drawn: 0 and 5
     assert copies(density.model, means) == left
+
+
+def test_children_are_drawn_as_their_parent() -> None:
+    """Catches scores of the rows before the split that are given to other rows after it."""
+    density, means = of_eight("3dgs", [0.0, 0.0, -8.0, 0.0, 0.0, 0.0, 0.0, -8.0], [0.0, 0.0, 1.0] + [0.0] * 5)
+    with torch.no_grad():
+        density.model.splats["scales"].fill_(math.log(0.1))  # large: split
+    density.gradient[2], density.times_visible[:] = 5.0, 1.0
+    density.densify(generator(1), has_reset=False, most=100)  # three are faint, so one is drawn: a child
+    assert copies(density.model, means) == [1, 1, 0, 1, 1, 1, 1, 1]
+    assert len(density.model) == 8
+
+
+def test_rows_are_drawn_once_in_proportion() -> None:
+    """Catches a row that is drawn twice, and weights that are not proportions."""
+    assert sorted(drawn_once(torch.tensor([1.0, 1e6, 1e-6]), 3, generator(0)).tolist()) == [0, 1, 2]
+    firsts = [int(drawn_once(torch.tensor([1.0, 3.0]), 1, generator(seed))) for seed in range(1000)]
+    assert 0.71 < sum(firsts) / 1000 < 0.79
 
 
 @pytest.mark.usefixtures("threads")
