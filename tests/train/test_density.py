@@ -185,6 +185,20 @@ def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[s
     assert printed.count(f"{fitted.density.limit} Gaussians are the most (default of train.densify.max_gaussians)") == 1
 
 
+def test_the_lightest_gaussians_go_and_moments_follow() -> None:
+    """Catches the heaviest that go, a weight of the wrong rows, and moments or counts of other Gaussians."""
+    fitted = trainer("3dgs", "train.densify.thin_to=0.5")
+    fitted.train_step()
+    model, optimizer = fitted.model, fitted.optimizer
+    weights = blend_weights(model, fitted.scene.train, fitted.renderer.antialias)
+    kept = weights.argsort(descending=True, stable=True)[: round(len(model) / 2)].sort().values
+    means, moments = model.splats["means"].detach()[kept], optimizer.moments[model.splats["means"]]["exp_avg"][kept]
+    fitted.density.thin()
+    assert torch.equal(model.splats["means"], means)
+    assert torch.equal(optimizer.moments[model.splats["means"]]["exp_avg"], moments)
+    assert len(fitted.density.rule.unseen) == len(kept)
+
+
 def test_blend_weights_add_up_to_alpha() -> None:
     """Catches weights of another channel count or view: the weights of a pixel add up to its alpha."""
     fitted = trainer("3dgs")

@@ -38,9 +38,9 @@ def moving(positions: torch.Tensor, velocities: torch.Tensor) -> FreeTimeModel:
     return model
 
 
-def prepared(model: GaussianModel) -> Strain:
-    penalty = Strain(model, 0, FRAMES)
-    penalty.prepare(0, VIEW)
+def prepared(model: GaussianModel, step: int = 0, seed: int = 0) -> Strain:
+    penalty = Strain(model, seed, FRAMES)
+    penalty.prepare(step, VIEW)
     return penalty
 
 
@@ -136,6 +136,15 @@ def test_what_is_culled_later_does_not_count() -> None:
     value.backward()
     assert value == 0
     assert all(x.grad is None or not x.grad.any() for x in model.splats.values())
+
+
+def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
+    """Catches draws from a generator that threads share, and the same draw for all views."""
+    model = lively("freetime", True)
+    values = [float(prepared(model, step, seed)(QUERY, index).detach())
+              for seed, step, index in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, 0))]  # fmt: skip
+    assert values[0] == values[4]
+    assert len(set(values)) == 4
 
 
 def test_neighbours_are_searched_again() -> None:
