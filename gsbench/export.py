@@ -14,8 +14,8 @@ from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.process.memory import is_out_of_memory, require
 from gsbench.reading import as_json
-from gsbench.run.checks import check_device, evaluated_views
 from gsbench.run.load import LoadedRun, load_run, scene_of
+from gsbench.run.setup import check_device, evaluated_views
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view import video
 from gsbench.view.slice_ply import SlicePly, write_clip, write_ply

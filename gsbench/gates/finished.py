@@ -13,10 +13,10 @@ from gsbench.gates.picture import draw
 from gsbench.measure import record as records
 from gsbench.measure.images import write_png
 from gsbench.measure.record import Record
-from gsbench.run.checks import check_folder, evaluated_views
 from gsbench.run.execution import Execution, write
 from gsbench.run.identity import RunSpec
 from gsbench.run.load import load_run, scene_of, trusted_root, typed_config
+from gsbench.run.setup import check_folder, evaluated_views
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 

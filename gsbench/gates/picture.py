@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsbench.gates.gate import cost_of, most_cost
 from gsbench.gates.messages import EFFECT_SETS
-from gsbench.measure.images import Pixels, inferno, to_bytes
+from gsbench.measure.images import GAP, Pixels, in_a_row, inferno, to_bytes, write_text
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
 from gsbench.models.render import rasterize_slice
@@ -25,10 +25,7 @@ COLOURS = {
     "static": (0x5C, 0x60, 0x66),
 }
 LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels; smaller images are enlarged by an integer factor, larger ones reduced
-GAP = 4  # pixels
-GREY = 200
 LINE = 22  # pixels of a line of text
-COLUMNS = 3
 
 
 @torch.no_grad()
@@ -88,30 +85,13 @@ def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixel
     if width > MOST_WIDTH:
         size = (MOST_WIDTH, max(1, round(height * MOST_WIDTH / width)))
         panels = [np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8) for panel in panels]
-    panels = [panel.repeat(factor, 0).repeat(factor, 1) for panel in panels]
-    width = panels[0].shape[1]
-    gap = np.full((panels[0].shape[0], GAP, 3), GREY, np.uint8)
-    row = np.concatenate([panels[0], gap, panels[1], gap, panels[2]], 1)
-    step = width + GAP
-    titles = _paper(1, row.shape[1])
-    by_set, cost = (
-        f"{sum(counts.values()):,} Gaussians by effect set",
-        f"cost of what a pixel shows, 0 to {most:.0f} ns",
-    )
-    for i, title in enumerate(("image", by_set, cost)):
-        _write(titles, title, i * step + 6, 0)
-    present = {name: number for name, number in counts.items() if number}
-    legend = _paper(-(-len(present) // COLUMNS), row.shape[1])
-    for i, (name, number) in enumerate(present.items()):
-        line, left = i // COLUMNS, i % COLUMNS * step + 6
-        legend[line * LINE + 5 : line * LINE + 17, left : left + 12] = COLOURS[name]
-        _write(legend, f"{EFFECT_SETS[name]}: {number:,}", left + 18, line)
+    row, step = in_a_row(panels, factor), panels[0].shape[1] * factor + GAP
+    titles, legend = (np.full((LINE, row.shape[1], 3), 255, np.uint8) for _ in range(2))
+    by_set = f"{sum(counts.values()):,} Gaussians by effect set"
+    for i, title in enumerate(("image", by_set, f"cost of what a pixel shows, 0 to {most:.0f} ns")):
+        write_text(titles, title, i * step + 6, 16)
+    for i, (name, number) in enumerate((name, number) for name, number in counts.items() if number):
+        left = i * step + 6
+        legend[5:17, left : left + 12] = COLOURS[name]
+        write_text(legend, f"{EFFECT_SETS[name]}: {number:,}", left + 18, 16)
     return np.concatenate([titles, row, legend])
-
-
-def _paper(lines: int, width: int) -> Pixels:
-    return np.full((lines * LINE, width, 3), 255, np.uint8)
-
-
-def _write(image: Pixels, text: str, x: int, line: int) -> None:
-    cv2.putText(image, text, (x, line * LINE + 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)

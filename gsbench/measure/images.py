@@ -39,13 +39,10 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
         if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
             raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
     factor = -(-LEAST_WIDTH // shape[1])
-    lines = [
-        _beside([to_bytes(render), to_bytes(truth), error_image(render, truth)], factor) for render, truth in pairs
-    ]
-    gap = np.full((GAP, lines[0].shape[1], 3), GREY, np.uint8)
     picture = [_header(shape[1] * factor)]
-    for line in lines:
-        picture += [line, gap]
+    gap = np.full((GAP, picture[0].shape[1], 3), GREY, np.uint8)
+    for render, truth in pairs:
+        picture += [in_a_row([to_bytes(render), to_bytes(truth), error_image(render, truth)], factor), gap]
     return np.concatenate(picture[:-1])
 
 
@@ -100,11 +97,11 @@ def data_url(image: Pixels) -> str:  # [H, W, 3] RGB
     return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
 
 
-def _beside(images: list[Pixels], factor: int) -> Pixels:
-    """Enlarge three images by an integer factor, and put them side by side with gaps between them."""
+def in_a_row(images: list[Pixels], factor: int) -> Pixels:
+    """Enlarge images of one size by an integer factor, and put them side by side with gaps between them."""
     large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]
     gap = np.full((large[0].shape[0], GAP, 3), GREY, np.uint8)
-    return np.concatenate([large[0], gap, large[1], gap, large[2]], 1)
+    return np.concatenate([part for image in large for part in (gap, image)][1:], 1)
 
 
 def _header(width: int) -> Pixels:
@@ -112,13 +109,14 @@ def _header(width: int) -> Pixels:
     header = np.full((HEADER, 3 * width + 2 * GAP, 3), 255, np.uint8)
     titles = ("render", "ground truth", "absolute error, mean of RGB")
     for column, title in enumerate(titles):
-        _write(header, title, column * (width + GAP) + 6, 16)
+        write_text(header, title, column * (width + GAP) + 6, 16)
     left, right = 2 * (width + GAP) + 6, 3 * width + 2 * GAP - 64
     header[26:38, left + 16 : right] = inferno(np.linspace(0, 1, right - left - 16)[None].repeat(12, 0))
-    _write(header, "0", left, 37)
-    _write(header, f">= {ERROR_SCALE}", right + 6, 37)
+    write_text(header, "0", left, 37)
+    write_text(header, f">= {ERROR_SCALE}", right + 6, 37)
     return header
 
 
-def _write(image: Pixels, text: str, x: int, y: int) -> None:
+def write_text(image: Pixels, text: str, x: int, y: int) -> None:
+    """Write a line of text into an image; (x, y) is its lower left corner."""
     cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)

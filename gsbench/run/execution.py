@@ -29,7 +29,6 @@ from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.process.memory import is_out_of_memory
 from gsbench.run import fitting, measuring, progress
-from gsbench.run.checks import check_folder, check_machine, check_scene, evaluated_views
 from gsbench.run.identity import RunSpec
 from gsbench.run.log import RunLog, check_tracker
 from gsbench.run.progress import Progress
@@ -43,7 +42,16 @@ from gsbench.run.selection import (
     reporter,
 )
 from gsbench.run.settings import check_settings, is_auto, lpips_weights, with_candidate
-from gsbench.run.setup import build, check_start, load_scene, trained_start
+from gsbench.run.setup import (
+    build,
+    check_folder,
+    check_machine,
+    check_scene,
+    check_start,
+    evaluated_views,
+    load_scene,
+    trained_start,
+)
 from gsbench.run.stop import Stopped
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians

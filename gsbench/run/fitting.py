@@ -12,9 +12,9 @@ from gsbench.config_roles import training_hash
 from gsbench.errors import InputError
 from gsbench.models import GaussianModel
 from gsbench.run import progress, stop
-from gsbench.run.checks import evaluated_views
 from gsbench.run.identity import RunSpec
 from gsbench.run.load import plain_description
+from gsbench.run.setup import evaluated_views
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen

@@ -3,8 +3,9 @@
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta
 from omegaconf import OmegaConf
 
 from gsbench.config import Config
@@ -20,8 +21,9 @@ from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 
 EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"
-MOST_PIXELS = 1 << 16  # a side
 LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
+Side = Annotated[int, Meta(ge=1, le=1 << 16)]  # pixels
+THREE = Meta(min_length=3, max_length=3)
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,14 @@ class SceneDescription:
 
     name: str
     fingerprint: str  # Scene.fingerprint of the data that the model was trained on
-    extent: float  # world units
-    background: list[float]  # RGB in [0, 1]
+    extent: Annotated[float, Meta(gt=0, lt=LARGEST_EXTENT)]  # world units
+    background: Annotated[list[Annotated[float, Meta(ge=0, le=1)]], THREE]  # RGB
     has_time: bool
-    width: int  # of the first training view, pixels
-    height: int
-    up: list[float]  # Scene.up
-    center: list[float]  # of Scene.placement
-    unit: float  # of Scene.placement
+    width: Side  # of the first training view, pixels
+    height: Side
+    up: Annotated[list[float], THREE]  # Scene.up, a unit vector
+    center: Annotated[list[Annotated[float, Meta(ge=-LARGEST_EXTENT, le=LARGEST_EXTENT)]], THREE]  # of Scene.placement
+    unit: Annotated[float, Meta(ge=1 / LARGEST_EXTENT, le=LARGEST_EXTENT)]  # of Scene.placement
 
     @classmethod
     def of(cls, scene: Scene) -> "SceneDescription":
@@ -99,8 +101,9 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     saved = checkpoint.read(path, device)
     config = typed_config(saved.config, path)
     config.device, config.raster.backend = device, backend
-    scene = parse(SceneDescription, saved.scene, str(path))
-    _check_scene(scene, path)
+    scene = parse(SceneDescription, saved.scene, f"{path}: scene")
+    if abs(math.hypot(*scene.up) - 1) > 1e-6:
+        raise InputError(f"{path}: scene: expected a unit vector up, got {scene.up!r:.80}")
     model = build_with_placeholders(config, scene.extent).to(device)  # `load_state` replaces the placeholders
     try:
         model.load_state(saved.state["model"])
@@ -145,24 +148,6 @@ def trusted_root(root: str, where: Path) -> str:
         raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
                          f"which would be imported: if you trust it, name it by --data-root")  # fmt: skip
     return root
-
-
-def _check_scene(scene: SceneDescription, path: Path) -> None:
-    """Raise InputError if a scene description has an invalid image size, extent, background, up vector or placement."""
-    sizes = 0 < scene.width <= MOST_PIXELS and 0 < scene.height <= MOST_PIXELS
-    if not sizes or not 0 < scene.extent < LARGEST_EXTENT:
-        raise InputError(f"{path}: scene: expected 1 to {MOST_PIXELS} pixels a side and a positive extent, got "
-                         f"{scene.width}x{scene.height} and {scene.extent}")  # fmt: skip
-    if len(scene.background) != 3 or not all(0 <= value <= 1 for value in scene.background):
-        raise InputError(
-            f"{path}: scene: expected a background of three numbers in [0, 1], got {scene.background!r:.80}"
-        )
-    if len(scene.up) != 3 or abs(math.hypot(*scene.up) - 1) > 1e-6:
-        raise InputError(f"{path}: scene: expected a unit vector up, got {scene.up!r:.80}")
-    if len(scene.center) != 3 or not all(abs(x) <= LARGEST_EXTENT for x in scene.center):
-        raise InputError(f"{path}: scene: expected a center of three finite numbers, got {scene.center!r:.80}")
-    if not 1 / LARGEST_EXTENT <= scene.unit <= LARGEST_EXTENT:
-        raise InputError(f"{path}: scene: expected a positive unit, got {scene.unit!r:.80}")
 
 
 def plain_description(scene: Scene) -> dict[str, Any]:

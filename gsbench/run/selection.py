@@ -25,10 +25,9 @@ from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate, LengthChoice, ModelComparison, TimeScreen
 from gsbench.measure.speed import Effort
 from gsbench.run import fitting, progress
-from gsbench.run.checks import check_scene
 from gsbench.run.identity import RunSpec
 from gsbench.run.settings import HOW_TO, candidates, is_auto, with_candidate
-from gsbench.run.setup import build, build_with_placeholders
+from gsbench.run.setup import build, build_with_placeholders, check_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import Schedule

@@ -16,8 +16,8 @@ from gsbench.models import GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
-from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
+from gsbench.run.setup import evaluated_views
 from gsbench.scenes.gaussian_ply import MAX_DEGREE, read_trained
 from gsbench.schedule import ActiveComponents
 from gsbench.stability.float32_error import Shot, measure

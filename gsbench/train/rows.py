@@ -4,45 +4,32 @@ Row i of every parameter tensor belongs to Gaussian i. Pruning, cloning and spli
 moments, counts of views and minimum scales must change with them.
 """
 
-from typing import Protocol
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from gsbench.models import GaussianModel
+from gsbench.train.optim import Optimizer
 
 START_BINS = 16  # number of intervals of the time range, by which rows are sorted
-
-
-class PerGaussian(Protocol):
-    """An object with per-Gaussian state."""
-
-    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder the state after Gaussians were added or removed, see `gsbench.train.hooks.Hook.reindex`."""
-
-
-class Moments(PerGaussian, Protocol):
-    """An optimizer with moments for each Gaussian, which can be set to zero for a whole parameter."""
-
-    def forget(self, parameter: Tensor) -> None:
-        """Set the moments of a parameter to zero."""
 
 
 class Rows:
     """The Gaussians (rows) of a model. All code of a training changes them only through this class."""
 
-    def __init__(self, model: GaussianModel, moments: Moments) -> None:
-        """Start with a model and the moments of its optimizer; `add` adds more per-Gaussian state."""
+    def __init__(self, model: GaussianModel, optimizer: Optimizer) -> None:
+        """Start with a model and its optimizer, which has moments of each Gaussian; `add` adds more such state."""
         self.model = model
-        self._moments = moments
-        self._followers: list[PerGaussian] = [moments]
+        self._optimizer = optimizer
+        self._reindex: list[Callable[[Tensor, Tensor], None]] = [optimizer.reindex]
 
     def __len__(self) -> int:
         return len(self.model)
 
-    def add(self, follower: PerGaussian) -> None:
-        """Register an object with per-Gaussian state."""
-        self._followers.append(follower)
+    def add(self, reindex: Callable[[Tensor, Tensor], None]) -> None:
+        """Register a function that reorders per-Gaussian state, see `gsbench.train.hooks.Hook.reindex`."""
+        self._reindex.append(reindex)
 
     def select(self, rows: Tensor, fresh: Tensor | None = None) -> None:
         """Keep the Gaussians `rows` of the model in this order.
@@ -57,8 +44,8 @@ class Rows:
     def moved(self, rows: Tensor, fresh: Tensor | None = None) -> None:
         """Update all per-Gaussian state after the model itself was changed as `select` does it."""
         fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device) if fresh is None else fresh
-        for follower in self._followers:
-            follower.reindex(rows, fresh)
+        for reindex in self._reindex:
+            reindex(rows, fresh)
 
     def sort_by_time(self) -> None:
         """Sort the Gaussians by the time interval in which each can be visible, which makes the CPU kernels faster.
@@ -75,4 +62,4 @@ class Rows:
 
     def forget(self, name: str) -> None:
         """Set the optimizer's moments of the parameter `name` to zero, after its values were replaced."""
-        self._moments.forget(self.model.splats[name])
+        self._optimizer.forget(self.model.splats[name])

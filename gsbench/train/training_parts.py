@@ -63,7 +63,7 @@ class TrainingParts:
         self.exact: set[str] = set()  # names of views that a measurement found exact (gsbench.measure.exact_views)
         self.hooks: list[Hook] = [hook(self) for hook in hook_types()]
         for hook in self.hooks:
-            self.rows.add(hook)
+            self.rows.add(hook.reindex)
 
     def hook(self, kind: type[H]) -> H:
         """Return the hook of a class."""

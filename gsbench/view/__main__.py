@@ -44,8 +44,8 @@ def serve(options: argparse.Namespace) -> None:
     if not 0 < options.port < 65536:
         raise InputError(f"--port: expected 1 to 65535, got {options.port}")
     from gsbench.models.registry import import_models
-    from gsbench.run.checks import check_device
     from gsbench.run.load import load_run
+    from gsbench.run.setup import check_device
     from gsbench.view.comparison_page import write_page
     from gsbench.view.video import check_file
 

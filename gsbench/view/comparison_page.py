@@ -10,8 +10,8 @@ import numpy as np
 from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ERROR_SCALE, Pixels, data_url, error_image
-from gsbench.run.checks import evaluated_views
 from gsbench.run.load import LoadedRun, scene_of
+from gsbench.run.setup import evaluated_views
 from gsbench.view.frame import FrameRequest, renderers_of
 from gsbench.view.training_views import ViewComparison, compare
 

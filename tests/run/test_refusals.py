@@ -7,10 +7,9 @@ import pytest
 from tiny_training import compose, moving_square
 
 from gsbench.errors import InputError
-from gsbench.run.checks import check_scene
 from gsbench.run.selection import check_candidates
 from gsbench.run.settings import check_settings, is_auto, with_candidate
-from gsbench.run.setup import build
+from gsbench.run.setup import build, check_scene
 
 COMPARE = "effects.compare=true"
 PAIRS = "train.coarse: expected pairs (factor above 1"

@@ -10,8 +10,8 @@ import pytest
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.measure.exact_views import MOST_PSNR
-from gsbench.run.checks import evaluated_views
 from gsbench.run.load import load_run, scene_of
+from gsbench.run.setup import evaluated_views
 from gsbench.view import comparison_page
 from gsbench.view.__main__ import main
 from gsbench.view.comparison_page import write_page

@@ -45,7 +45,7 @@ class DensificationRule(ABC):
         self.min_opacity = min_opacity
         self.views = views
         self.score = score
-        rows.add(self)
+        rows.add(self.reindex)
 
     @abstractmethod
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
