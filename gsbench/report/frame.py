@@ -94,11 +94,8 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
     runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
     views = [view for i, (_, record) in enumerate(kept) for view in _views(i, record)]
-    curves = [
-        {"run": i} | {name: getattr(point, of) for name, of in CURVES.items()}
-        for i, (_, record) in enumerate(kept)
-        for point in record.curve
-    ]
+    points = [(i, point) for i, (_, record) in enumerate(kept) for point in record.curve]
+    curves = [{"run": i} | {name: getattr(point, of) for name, of in CURVES.items()} for i, point in points]
     return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
 
 

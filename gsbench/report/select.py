@@ -28,10 +28,8 @@ class Selection:
         _check("scene", self.scenes, set(runs.scene))
         kept = runs.model.isin(self.models or set(runs.model)) & runs.scene.isin(self.scenes or set(runs.scene))
         if len(runs) and not kept.any():
-            pairs = sorted({printable(pair) for pair in runs.model + " on " + runs.scene})
-            raise InputError(
-                f"--select: expected a model and a scene with runs, got none. There is: {', '.join(pairs)}."
-            )
+            pairs = ", ".join(sorted({printable(pair) for pair in runs.model + " on " + runs.scene}))
+            raise InputError(f"--select: expected a model and a scene with runs, got none. There is: {pairs}.")
         return results.of(kept)
 
 

@@ -159,25 +159,26 @@ def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, show: Callab
         higher: whether higher values are better.
         show: formats a number as the table does.
     """
-    whole = runs[quantity].notna().groupby(runs[by]).all()
-    wide = runs.set_index([by, "scene", "seed"])[quantity].unstack("seed")
-    scenes = wide.index.unique("scene")
-    arrays = {key: wide.loc[key].reindex(scenes).to_numpy(float) for key in whole.index}  # [scenes, seeds]
-    mean = {key: float(np.mean([row[~np.isnan(row)].mean() for row in arrays[key] if not np.isnan(row).all()]))
-            for key in whole.index[whole]}  # fmt: skip
-    places = dict.fromkeys(whole.index, 0)
+    is_whole = runs[quantity].notna().groupby(runs[by]).all()
+    wide = runs.pivot(index=["scene", "seed"], columns=by, values=quantity)
+    means = wide.groupby("scene").mean().mean()[is_whole[is_whole].index]
+    rest = means.sort_values(ascending=not higher, kind="stable")
+    places = dict.fromkeys(is_whole.index, 0)
     for place in (1, 2):
-        if mean:
-            best = (max if higher else min)(mean, key=lambda key: mean[key])
-            for key in list(mean):
-                pairs = [row[~np.isnan(row)][:, None] for row in arrays[best] - arrays[key]]
-                gap = estimate(pairs, generalise=False) if all(map(len, pairs)) else NOTHING
-                if show(mean[best]) == show(mean[key]) or abs(gap.mean) <= gap.half:
-                    places[key] = place
-                    if key != best:
-                        del mean[key]
-            del mean[best]
+        if len(rest):
+            best = rest.index[0]
+            looks_equal = rest.map(show) == show(rest[best])
+            ties = [key for key in rest.index if looks_equal[key] or _may_be_zero(wide[best] - wide[key])]
+            places |= dict.fromkeys(ties, place)
+            rest = rest.drop(ties)
     return places
+
+
+def _may_be_zero(difference: pd.Series) -> bool:
+    """Tell whether the 95 % interval over seeds of a paired difference, by scene and seed, contains zero."""
+    scenes = [of.dropna().to_numpy()[:, None] for _, of in difference.groupby("scene")]
+    gap = estimate(scenes, generalise=False) if all(map(len, scenes)) else NOTHING
+    return abs(gap.mean) <= gap.half
 
 
 def ranked_rows(table: pd.DataFrame) -> pd.DataFrame:

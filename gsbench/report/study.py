@@ -46,15 +46,11 @@ def write(records: Iterable[Record], folder: Path) -> None:
     for i, record in enumerate(records):
         plain = asdict(record)
         scores, points = plain.pop("per_view"), plain.pop("curve")
-        runs.append({"run": str(i)} | {name: cell(value) for name, value in _flat(plain)})
-        views += [
-            {"run": str(i), "view": cell(view["name"])} | {name: _number(view[of]) for name, of in VIEWS.items()}
-            for view in scores
-        ]
-        curves += [
-            {"run": str(i)} | {name: _number(value) for name, value in zip(CURVES, point, strict=True)}
-            for point in points
-        ]
+        key = {"run": str(i)}
+        runs.append(key | {name: cell(value) for name, value in _flat(plain)})
+        for view in scores:
+            views.append(key | {"view": cell(view["name"])} | {name: _number(view[of]) for name, of in VIEWS.items()})
+        curves += [key | dict(zip(CURVES, map(_number, point), strict=True)) for point in points]
     for old, new in zip(records, _records(runs, views, curves, str(folder / RUNS_FILE)), strict=True):
         if new != old:
             raise InputError(f"{folder}: {old.path}: expected a record that tables can hold, got {new}"[:500])
@@ -117,10 +113,7 @@ def _flat(plain: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
         elif column := _BY_PLACE.get(place):
             yield column.name, value if column.unit == 1 or value is None else value / column.unit
         else:
-            yield (
-                next((f"{name}{place.removeprefix(part)}" for part, name in PARTS if place.startswith(part)), place),
-                value,
-            )
+            yield _swapped(place, PARTS), value
 
 
 def _nested(cells: Row, where: str) -> dict[str, Any]:
@@ -131,7 +124,7 @@ def _nested(cells: Row, where: str) -> dict[str, Any]:
         column = _BY_NAME.get(name)
         if column and column.unit != 1 and isinstance(value, int | float):
             value = round(value * column.unit)
-        place = column.place if column else _place(name)
+        place = column.place if column else _swapped(name, ((column, part) for part, column in PARTS))
         *parents, key = place.split(".")
         at = plain
         for parent in parents:
@@ -144,9 +137,9 @@ def _nested(cells: Row, where: str) -> dict[str, Any]:
     return plain
 
 
-def _place(name: str) -> str:
-    """Return the place in a record of a column that RUNS does not have."""
-    return next((f"{part}{name.removeprefix(prefix)}" for part, prefix in PARTS if name.startswith(prefix)), name)
+def _swapped(name: str, prefixes: Iterable[tuple[str, str]]) -> str:
+    """Return a name whose first part is replaced, such as "protocol.resize" as "protocol_resize" by PARTS."""
+    return next((f"{new}{name.removeprefix(old)}" for old, new in prefixes if name.startswith(old)), name)
 
 
 def cell(value: Any) -> str:
@@ -154,9 +147,8 @@ def cell(value: Any) -> str:
 
     A text that a spreadsheet would compute, or a terminal obey, is in quotes, with its control characters escaped.
     """
-    is_clear = (
-        isinstance(value, str) and value.isprintable() and not value.startswith(FORMULA) and _value(value) == value
-    )
+    is_clear = isinstance(value, str) and value.isprintable() and not value.startswith(FORMULA)
+    is_clear = is_clear and _value(value) == value
     return value if is_clear else json.dumps(value, allow_nan=False)
 
 

@@ -231,12 +231,12 @@ def test_the_profile_by_hand():
 
 def test_events_have_the_steps_of_the_schedule():
     """Catches events of the schedule's default length, AGR's start for a model without it, and a crash at old keys."""
-    train = {"iterations": 1000, "recipe_iterations": 1000, "refine_from": 250, "lambda_from": 750}
+    train = {"iterations": 1000, "recipe_iterations": 1000, "refine_from": 250}
     train |= {"densify": {"start": 100, "stop": 500}}
-    config = {"train": train, "model": {"lr": {"lambda": {"start": 0.1}}}}
+    config = {"train": train}
     record = but(make(), provenance={"config": config})
     steps = {letter: step for step, letters in events(record) for letter in letters}
-    assert {"A", "D", "L"} <= steps.keys()
+    assert {"A", "D"} <= steps.keys()
     assert steps["A"] == 250
     assert "A" not in "".join(letters for _, letters in events(but(record, effects=make("3dgs").effects)))
     assert events(but(record, provenance={"config": {"train": {"no_such_key": 1}}})) == []

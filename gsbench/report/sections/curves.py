@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +21,7 @@ STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
 FEWEST_TARGETS = 3  # for one scene
 WIDEST = 100.0  # dB from the lowest result, above which there is no target: more is no difference between models
 CONFIGURATION = ["scene", "series", "model", "variant"]
-EVENTS = {"A": "AGR starts", "R": "opacities are reset", "D": "densification ends", "L": "λ starts to be learned"}
+EVENTS = {"A": "AGR starts", "R": "opacities are reset", "D": "densification ends"}
 MOST_RESETS = 4  # opacity resets that are marked
 
 
@@ -180,19 +179,4 @@ def _steps(record: Record) -> list[tuple[int, str]]:
     steps = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if record.effects.refinement:
         steps.append((schedule.scaled(train.refine_from), "A"))
-    if _rates(record).get("lambda", {}).get("start", 0) > 0:
-        steps.append((schedule.scaled(train.lambda_from), "L"))
     return [(step, letter) for step, letter in steps if step <= train.iterations]
-
-
-def _rates(record: Record) -> dict[str, Any]:
-    """Return the learning rates of a run's model, with model=auto those of the model that it chose."""
-    model = record.provenance.config["model"]
-    if model.get("candidates"):
-        comparison = record.on_demand.comparison if record.on_demand else None
-        choices = [*model.get("compared", {}).values(), *model["candidates"].values()]
-        by_screen = model["candidates"]["moving" if record.effects.time else "static"]
-        chosen = [choice for choice in choices if comparison and choice.get("name") == comparison.chosen]
-        model = next(reversed(chosen), by_screen)
-    rates: dict[str, Any] = model["lr"]
-    return rates

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -14,7 +15,7 @@ from gsbench.report.intervals import over_seeds
 from gsbench.report.section import COLUMNS, Column, Figure, Section, section
 from gsbench.report.sections.gallery import images
 
-PICTURES = ("effect_sets.png", "classes.png")  # older runs have the second name
+PICTURE = "effect_sets.png"
 REMOVED = "removed"
 # Older runs also have Gaussians that are independent of only time, or only direction.
 SETS = {x: EFFECT_SETS.get(x, f"{x} frozen") for x in ("refined", "conditioned", "time", "direction", "static")}
@@ -138,11 +139,10 @@ def _notes(runs: pd.DataFrame) -> list[str]:
         for note in run.record.on_demand.notes:
             seeds.setdefault(f"{run.scene}, {run.label}: {note}", []).append(str(run.seed))
     notes = [f"{note} (seed {', '.join(some[:5])})" for note, some in seeds.items()]
-    return notes[:MOST_NOTES] + [f"{len(notes) - MOST_NOTES} more notes are in the records."] * (
-        len(notes) > MOST_NOTES
-    )
+    more = [f"{len(notes) - MOST_NOTES} more notes are in the records."] if len(notes) > MOST_NOTES else []
+    return notes[:MOST_NOTES] + more
 
 
-def _picture(paths: pd.Series) -> Any:
+def _picture(paths: pd.Series) -> Path | None:
     """Return the first picture of the effect sets beside some records."""
-    return next((file for path in paths for name in PICTURES if (file := path.parent / name).is_file()), None)
+    return next((file for path in paths if (file := path.parent / PICTURE).is_file()), None)
