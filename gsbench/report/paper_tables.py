@@ -180,8 +180,9 @@ def _quoted(dataset: str) -> pd.DataFrame:
     rows = paper.read_table("paper_table2.csv")
     rows = rows[rows.dataset == dataset].rename(columns={"lpips": "lpips_alex"})
     if rows.empty:
-        averages = paper.table1().loc[(dataset, paper.AVERAGE)].loc[list(NAMES)].rename(columns={"lpips": "lpips_alex"})
-        rows = averages.assign(method=list(NAMES.values()), source="table 1", dataset=dataset)
+        rows = paper.table1().loc[(dataset, paper.AVERAGE)].loc[list(paper.MODELS)]
+        rows = rows.rename(columns={"lpips": "lpips_alex"}).assign(source="table 1", dataset=dataset)
+        rows["method"] = [NAMES[model] for model in rows.index]
     leaks = rows.psnr_db.where((rows.source == "table 1") | rows.method.isin(list(NAMES.values())))
     return rows.assign(source="paper, " + rows.source, recipe="", psnr_best_on_test_db=leaks)
 
@@ -283,7 +284,7 @@ def _sections1(runs: pd.DataFrame) -> Iterator[Section]:
         title = f"Table 1, {dataset}, at the paper's protocol" if is_paper else f"{kind.upper()}, {_heading(of)}"
         if len(table):
             yield Section(f"table1-{kind}-{dataset}", title, TEXT_1 if is_paper else TEXT_OTHER, table)
-        if is_paper:
+        if is_paper and len(of):
             yield Section(f"seeds-{dataset}", f"Seeds, {dataset}", TEXT_SEEDS, seeds(of, dataset))
 
 

@@ -242,7 +242,7 @@ def _judged(table: pd.DataFrame) -> pd.DataFrame:
     return table.drop(columns=["squares", "freedom", "equal", "widest", "relative", "unit"])
 
 
-def in_percent(table: pd.DataFrame) -> pd.Series:
+def in_shown_unit(table: pd.DataFrame) -> pd.Series:
     """Return the differences in the unit of TITLES: dB, or per cent of the reference."""
     return table.difference.where(
         table.quantity == "psnr_db", 100 * table.difference / table.reference.where(table.reference != 0)
@@ -254,9 +254,9 @@ def summary(of: Reproduction) -> pd.DataFrame:
     counts = pd.crosstab(of.table.quantity, of.table.verdict)
     counts = counts.reindex(index=list(TITLES), columns=[AGREES, DIFFERS, UNDECIDED], fill_value=0)
     table = counts.assign(**{"bit-equal": of.table.groupby("quantity").bit_equal.sum()}).fillna(0).astype(int)
-    rows = of.table.assign(percent=in_percent(of.table), on=names_of(of.table) + " on " + of.table.scene)
-    largest = rows.sort_values("percent", key=abs).dropna(subset="percent").drop_duplicates("quantity", keep="last")
-    return table.join(largest.set_index("quantity")[["percent", "on"]]).reset_index(names="quantity")
+    rows = of.table.assign(largest=in_shown_unit(of.table), on=names_of(of.table) + " on " + of.table.scene)
+    largest = rows.sort_values("largest", key=abs).dropna(subset="largest").drop_duplicates("quantity", keep="last")
+    return table.join(largest.set_index("quantity")[["largest", "on"]]).reset_index(names="quantity")
 
 
 def reasons(of: Reproduction) -> pd.DataFrame:
@@ -282,7 +282,7 @@ def sections(of: Reproduction, reference: str) -> list[Section]:
     table = psnr[[*SIDES, "difference", "verdict"]].assign(**{"difference ±": psnr.high - psnr.difference})
     for quantity in list(TITLES)[1:]:
         rows = of.of(quantity).set_index(ROW)
-        table[quantity] = in_percent(rows)
+        table[quantity] = in_shown_unit(rows)
     differing = of.table[of.table.verdict == DIFFERS]
     table["differs in"] = differing.quantity.map(TITLES).groupby([differing[name] for name in ROW]).agg(", ".join)
     bits = of.seeds.groupby(ROW).bit_equal
@@ -298,7 +298,7 @@ def sections(of: Reproduction, reference: str) -> list[Section]:
     }
     columns |= {name: Column(TITLES[name], 1, signed=True) for name in list(TITLES)[1:]}
     counts = summary(of).assign(quantity=list(TITLES.values()))
-    titles = {"percent": Column("largest difference", 2, signed=True)}
+    titles = {"largest": Column("largest difference", 2, signed=True)}
     parts = [Section("against", f"Against {printable(reference)}", RULE, table, columns)]
     if len(why := reasons(of)):
         parts.append(Section("undecided", "What is undecided or not compared", "", why))
