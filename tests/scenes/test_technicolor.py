@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scenes.capture import COLOR, Capture
 from scenes.tiny_scene import write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
-from gsbench.scenes import colmap, files
+from gsbench.scenes import files
 from gsbench.scenes.points import frustum_points
 from gsbench.scenes.technicolor import CAMERAS, TEST_CAMERA
 
@@ -96,10 +97,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (table(lambda text: text + row(16)), "16.png of every camera"),
     (lambda root: (root / IMAGE).unlink(), "undist_00101_03"),
     (lambda root: write_image(root / IMAGE, np.zeros((4, 4, 3), np.uint8)), "expected 8x6"),
-    (
-        lambda root: (root / IMAGE).rename(root / "Other_undist_00101_03.png"),
-        "images of one .*, got those of Other, Tiny",
-    ),
+    (lambda root: (root / IMAGE).rename(root / "Other_undist_00101_03.png"), "of one .*, got those of Other, Tiny"),
 ]
 
 
@@ -123,9 +121,7 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
     """Catches an image of another camera or frame, and a replacement that no message, scene or fingerprint tells."""
     whole = scenes.load(root)
     damage(root, "Tiny_undist_00101_09")
-    with pytest.raises(
-        InputError, match=r"00101_09.*copy it again, or replace .* data\.repair=\[Tiny_undist_00101_09\]$"
-    ):
+    with pytest.raises(InputError, match=r"copy it again, or replace .* data\.repair=\[Tiny_undist_00101_09\]$"):
         scenes.load(root)
     repaired = scenes.load(root, repair=["Tiny_undist_00101_09", "Other_undist_00101_03"])
     message = capsys.readouterr().err.splitlines()
@@ -173,26 +169,15 @@ def test_repair_is_of_this_layout(tmp_path: Path) -> None:
         scenes.load(tmp_path, repair="Tiny_undist_00101_09")
 
 
-def test_points_of_colmap(root: Path) -> None:
-    """Catches a track that is read as a point; text and binary give the same."""
-    folder = root / "sparse" / "0"
-    folder.mkdir(parents=True)
-    means = [(0.5, -0.25, 4.0), (1.5, 2.0, 5.0)]
-    rows = [colmap._POINT.pack(i, *xyz, 255, 51, 0, 0.3, i) + b"\0" * 8 * i for i, xyz in enumerate(means, 1)]
-    (folder / "points3D.bin").write_bytes(len(rows).to_bytes(8, "little") + b"".join(rows))
-    binary = scenes.load(root).points
-    assert binary is not None
-    torch.testing.assert_close(scenes.load(root).placement.to_user(binary.means).float(), torch.tensor(means))
-    torch.testing.assert_close(binary.colors, torch.tensor([[1.0, 0.2, 0.0]]).expand(2, 3))
-    (folder / "points3D.bin").write_bytes(len(rows).to_bytes(8, "little") + b"".join(rows)[:-3])
-    with pytest.raises(InputError, match="truncated"):
-        scenes.load(root)
-    (folder / "points3D.bin").unlink()
-    lines = [f"{i} {x} {y} {z} 255 51 0 0.3 1 2" for i, (x, y, z) in enumerate(means, 1)]
-    (folder / "points3D.txt").write_text("\n".join(["# a comment", *lines]))
-    text = scenes.load(root).points
-    assert text is not None
-    assert torch.equal(text.means, binary.means)
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_points_of_colmap(root: Path, kind: str) -> None:
+    """Catches points of a reconstruction that are left out, or not moved with the cameras."""
+    means = np.array([(0.5, -0.25, 4.0), (1.5, 2.0, 5.0)])
+    capture = Capture("PINHOLE", WIDTH, HEIGHT, (1, 1, 1, 1), [], np.empty((0, 4, 4)), means)
+    capture.write(root, kind)
+    scene = scenes.load(root)
+    torch.testing.assert_close(scene.placement.to_user(scene.points.means).numpy(), means, rtol=0, atol=1e-6)
+    torch.testing.assert_close(scene.points.colors, (torch.tensor([COLOR]) / 255).expand(2, 3))
 
 
 def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
@@ -215,7 +200,6 @@ def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
 def test_playrooms_points_project_onto_their_colours() -> None:
     """Catches a pose that is inverted or mirrored: points of the scene have the colours of the pixels they fall on."""
     scene = scenes.load(PLAYROOM)
-    assert scene.points is not None
     for view in scene.train[:15:7]:
         x = scene.points.means @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
         pixel = (x @ view.camera.K.T)[:, :2] / x[:, 2:]

@@ -41,7 +41,7 @@ def joined(viewer: Viewer, **more: Any) -> ClientConnection:
 
 
 def until(holds: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not holds():
         assert time.monotonic() < deadline
         time.sleep(0.02)
