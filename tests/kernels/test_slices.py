@@ -8,10 +8,15 @@ from conftest import Place
 from sliced_models import CASES, TIME, assert_same, gradients, slice_of, sliced_model
 
 from gsbench.errors import InputError
-from gsbench.kernels.slices import slice_rotated, slice_static, slice_triangular
+from gsbench.kernels.backends import AUTO, REFERENCE
+from gsbench.kernels.slices import slice_free_time, slice_rotated, slice_static, slice_triangular
 from gsbench.models.effect_sets import EffectSets
 
 SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of 45 rows 0, 1, 22, 44 and all
+WITHOUT_KERNEL: list[tuple[str, dict[str, Any]]] = [
+    ("7dgs", {"scheme": "schur"}), ("4dgs", {"scheme": "schur"}), ("ubs", {"modulation": "raw"}),
+    ("dgs", {"coupling": "none"}), ("dgs", {"coupling": "interpolated"}),
+]  # fmt: skip
 CONDITIONED = [(name, options) for name, options in CASES if name not in ("3dgs", "ubs", "ubs_static")]
 
 
@@ -81,6 +86,29 @@ def test_sizes_of_beta_profiles_keep_their_digits() -> None:
         results.append((factors.diagonal(dim1=1, dim2=2).double(), slopes[: len(sizes)].double()))
     for got, want in zip(results[1], results[0], strict=True):
         torch.testing.assert_close(got, want, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize(("name", "options"), WITHOUT_KERNEL)
+def test_an_option_without_a_kernel_is_sliced_in_torch(name: str, options: dict[str, Any]) -> None:
+    """Catches a kernel that slices by another formula than the option says."""
+    model, raw = sliced_model(name, options, torch.float64)
+    slices = []
+    for backend in (AUTO, REFERENCE):
+        model.backend = backend
+        slices.append(slice_of(model.float(), {key: x.float() for key, x in raw.items()}))
+    assert all(torch.equal(x, y) for x, y in zip(*slices, strict=True))
+
+
+def test_arguments_are_taken_by_name() -> None:
+    """Catches a default that is not all rows, an input in the place of another, and a name that is dropped."""
+    _, raw = sliced_model("freetime", {}, torch.float32)
+    by_name = {key: x for key, x in raw.items() if key in slice_free_time.inputs} | {"time": TIME}
+    in_order = slice_free_time(*(by_name[key] for key in slice_free_time.inputs), len(raw["means"]))
+    assert all(torch.equal(x, y) for x, y in zip(slice_free_time(**by_name), in_order, strict=True))
+    with pytest.raises(InputError, match=r"slice_free_time: expected means, times, .*, got colours too"):
+        slice_free_time(**by_name, colours=TIME)
+    with pytest.raises(InputError, match="slice_free_time: expected quats as a tensor, got NoneType"):
+        slice_free_time(**by_name | {"quats": None})
 
 
 def test_arguments_that_do_not_fit_are_refused() -> None:
