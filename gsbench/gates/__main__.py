@@ -1,8 +1,7 @@
-"""Test whether a scene needs time, or simplify the Gaussians of a trained model, or draw what its Gaussians depend on.
+"""Test whether a scene needs time, or simplify the Gaussians of a trained model.
 
 python -m gsbench.gates SCENE_FOLDER [--json]
 python -m gsbench.gates --checkpoint RUN_FOLDER [--budget-db 0.05] [--data-root PATH]
-python -m gsbench.gates --picture RUN_FOLDER --out FILE.png [--camera 0] [--time 0.5] [--data-root PATH]
 """
 
 import argparse
@@ -31,10 +30,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
     parser.add_argument("--budget-db", type=float, default=BUDGET.default, help=BUDGET.help)
-    parser.add_argument("--picture", type=Path, metavar="RUN_FOLDER", help="draw its Gaussians by effect set")
-    parser.add_argument("--camera", type=int, default=0, help="of --picture: the number of the evaluated view")
-    parser.add_argument("--time", type=float, help="of --picture: in [0, 1]; that of the view by default")
-    parser.add_argument("--out", type=Path, metavar="FILE.png", help="where --picture goes")
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
     parser.add_argument("--data-root", help="where the data set of the run is now")
     options = parser.parse_args(arguments)
@@ -57,13 +52,8 @@ def _whole(text: str) -> int:
 
 def _answer(options: argparse.Namespace) -> Answer:
     """Check the options and do the task that they name."""
-    tasks = (options.scene, options.checkpoint, options.picture)
-    if sum(task is not None for task in tasks) != 1:
-        raise InputError("expected one of SCENE_FOLDER, --checkpoint RUN_FOLDER and --picture RUN_FOLDER")
-    if (options.picture is None) != (options.out is None):
-        raise InputError("expected --picture RUN_FOLDER and --out FILE.png together")
-    if options.out is not None and (not options.out.name or "\0" in str(options.out)):
-        raise InputError(f"--out: expected a file such as effect_sets.png, got {str(options.out)!a:.200}")
+    if (options.scene is None) == (options.checkpoint is None):
+        raise InputError("expected one of SCENE_FOLDER and --checkpoint RUN_FOLDER")
     if not 0 <= options.seed < 2**63:
         raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(options.seed)[:30]}")
     BUDGET.check("--budget-db", options.budget_db)
@@ -74,11 +64,6 @@ def _answer(options: argparse.Namespace) -> Answer:
         record, new = gate_finished(options.checkpoint, options.budget_db, options.data_root)
         lines = messages.lines(record.on_demand) if record.on_demand else []
         return {"on_demand": record.on_demand, "written": new}, [*lines, f"Written: {new}"]
-    if options.picture is not None:
-        from gsbench.gates.finished import draw_finished
-
-        draw_finished(options.picture, options.out, options.camera, options.time, options.data_root)
-        return {"written": options.out}, [f"Written: {options.out}"]
     screen = screen_time(scenes.load(options.scene), options.seed)
     return {"time": screen}, [messages.of_screen(screen)]
 

@@ -1,22 +1,18 @@
-"""Simplify the Gaussians of a finished run into a new run, and draw what the Gaussians of a run depend on."""
+"""Simplify the Gaussians of a finished run into a new run."""
 
 import copy
 from pathlib import Path
-
-import torch
 
 from gsbench.config import EffectsConfig
 from gsbench.config_roles import Plain, training_hash
 from gsbench.errors import InputError
 from gsbench.gates.hook import Gating
-from gsbench.gates.picture import draw
 from gsbench.measure import record as records
-from gsbench.measure.images import write_png
 from gsbench.measure.record import Record
 from gsbench.run.execution import Execution, write
 from gsbench.run.identity import RunSpec
-from gsbench.run.load import load_run, scene_of, trusted_root, typed_config
-from gsbench.run.setup import check_folder, evaluated_views
+from gsbench.run.load import trusted_root, typed_config
+from gsbench.run.setup import check_folder
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 
@@ -67,23 +63,3 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     write(record, new)
     execution.draw()
     return record, new
-
-
-def draw_finished(
-    folder: Path, out: Path, camera: int = 0, time: float | None = None, data_root: str | None = None
-) -> None:
-    """Draw the Gaussians of a run by effect set, from the camera of an evaluated view, at a time or at that view's.
-
-    Raises:
-        InputError: the time is not in [0, 1], there is no such view, or the run cannot be loaded.
-    """
-    if time is not None and not 0 <= time <= 1:
-        raise InputError(f"--time: expected 0 to 1, got {time}")
-    run = load_run(folder)
-    scene = scene_of(run, data_root)
-    views = evaluated_views(scene, run.config.scene.eval_split)
-    if not 0 <= camera < len(views):
-        raise InputError(f"--camera: expected 0 to {len(views) - 1}, the evaluated views of {scene.name}, got {camera}")
-    view, background = views[camera], torch.tensor(scene.background)
-    when = view.time if time is None else time
-    write_png(draw(run.model, view.camera, when, background, run.config.raster.antialias), out)

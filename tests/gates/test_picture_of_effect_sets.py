@@ -9,7 +9,6 @@ import torch
 from tiny_run import gsbench, overrides, write_moving_square
 
 from gsbench.gates import picture
-from gsbench.gates.__main__ import main
 from gsbench.gates.gate import COLORING, COSTS, REFINING, SLICING, cost_of, most_cost
 from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure import record
@@ -20,6 +19,7 @@ from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.simplifications import STATIC
 from gsbench.report.render.palette import SETS, THEMES
 from gsbench.report.sections import on_demand
+from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, Points
 from gsbench.schedule import ActiveComponents
 
@@ -127,32 +127,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path.parent
 
 
-def test_the_command_draws_a_run(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a run that leaves no picture, or not where the report looks; a command that draws another view or moment
-    than it was asked for, or than the run itself drew."""
+def test_a_gated_run_leaves_a_picture(folder: Path) -> None:
+    """Catches a run that leaves no picture, or not where the report looks, and one of another view than the first."""
     assert record.read(folder / record.FILE_NAME).on_demand
-    assert cv2.imread(str(folder / "effect_sets.png")).shape[1] == 3 * 304 + 2 * picture.GAP
-    out = [tmp_path / f"{i}.png" for i in range(3)]
-    for path, more in zip(out, ([], ["--camera", "1"], ["--camera", "1", "--time", "0.2"]), strict=True):
-        assert main(["--picture", str(folder), "--out", str(path), *more]) == 0
-    assert out[0].read_bytes() == (folder / "effect_sets.png").read_bytes()
-    assert len({path.read_bytes() for path in out}) == 3
-    assert str(out[2]) in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("more", "line"),
-    [
-        (["--camera", "2"], "--camera: expected 0 to 1, the evaluated views of square, got 2"),
-        (["--camera", "-1"], "--camera: expected 0 to 1"),
-        (["--time", "nan"], "--time: expected 0 to 1, got nan"),
-        (["--data-root", "/nowhere"], "/nowhere"),
-    ],
-)
-def test_the_command_refuses(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], line: str
-) -> None:
-    """Catches a stack trace, and a view that is counted from the end."""
-    assert main(["--picture", str(folder), "--out", str(tmp_path / "x.png"), *more]) == 2
-    assert line in capsys.readouterr().err
-    assert not (tmp_path / "x.png").exists()
+    run = load_run(folder)
+    first, black = scene_of(run).test[0], torch.zeros(3)
+    drawn = picture.draw(run.model, first.camera, first.time, black, run.config.raster.antialias)
+    assert np.array_equal(cv2.cvtColor(cv2.imread(str(folder / "effect_sets.png")), cv2.COLOR_BGR2RGB), drawn)
