@@ -52,7 +52,7 @@ def files() -> list[tuple[Path, str]]:
     return [(ROOT / file, folder) for file, folder in rows]
 
 
-def test_it_touches_fewer_than_eight_files() -> None:
+def test_it_touches_fewer_than_eight_files():
     """Catches seams that cost more again: a kernel for a new slice once touched 22 files."""
     assert sorted(path for path, _ in files()) == sorted((ROOT / "examples/kernel").iterdir())
     assert len(files()) + len({path for path, _, _ in insertions()}) == 5
@@ -62,7 +62,7 @@ KEPT = ("bindings.cpp", "dispatch.cpp", "table.cpp", "roofline.cpp", "ball.cpp")
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja", "c++"))), reason="needs cmake, ninja and a compiler")
-def test_the_worked_example_builds_and_differentiates(tmp_path: Path) -> None:
+def test_the_worked_example_builds_and_differentiates(tmp_path):
     """Catches documentation that no longer builds, on the CPU and by the shim for CUDA, or a wrong gradient of it.
 
     The copy's other kernels are empty, for they take most of a minute to compile.

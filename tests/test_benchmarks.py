@@ -30,7 +30,7 @@ open(f"{folder}/{name}.json", "w").write(json.dumps(rows))
 """
 
 
-def test_no_two_rows_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_two_rows_have_one_name(monkeypatch):
     """Catches rows that --against would compare with each other's times."""
     monkeypatch.setattr(rows, "model", lambda name, _, **options: scene.model(name, 50, **options))
     monkeypatch.setattr(rows, "gaussians", lambda _: scene.gaussians(50))
@@ -40,7 +40,7 @@ def test_no_two_rows_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {name for name, count in names.items() if count > 1} == set()
 
 
-def test_every_stage_is_timed_once_and_has_a_floor() -> None:
+def test_every_stage_is_timed_once_and_has_a_floor():
     """Catches a stage that is left out or that cannot be called twice, and a floor that is zero."""
     stage_rows = list(stages(50, 32))
     for row in stage_rows:
@@ -54,7 +54,7 @@ def test_every_stage_is_timed_once_and_has_a_floor() -> None:
     assert sorted(row.name for row in stage_rows) == sorted(expected)
 
 
-def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
+def test_a_trained_model_shows_a_part_of_its_rows_in_order():
     """Catches stages that are timed with every Gaussian visible, or with visible ones far apart."""
     for name in ("4dgs", "7dgs", "dgs", "dbs", "freetime"):
         fitted, view = scene.trained(name, 1600), one_view(32, 32)
@@ -63,18 +63,17 @@ def test_a_trained_model_shows_a_part_of_its_rows_in_order() -> None:
         assert visible.unflatten(0, (-1, 16)).any(1).float().mean() < 0.6  # it is 1 in any order
 
 
-def test_gradients_of_a_stage_are_added_in_place() -> None:
+def test_gradients_of_a_stage_are_added_in_place():
     """Catches a backward row that allocates its gradients, which most views of a batch do not."""
     fitted = scene.model("7dgs", 50)
     call = recorded(fitted, one_view(32, 32))["slice_triangular"]
     gradient = fitted.splats["motion"].grad
-    assert gradient is not None
     before = gradient.clone()
     call.backward_again()
     torch.testing.assert_close(gradient, 1.5 * before)
 
 
-def test_blended_alphas_are_those_of_the_image() -> None:
+def test_blended_alphas_are_those_of_the_image():
     """Catches a floor that counts pixels beyond the Gaussian, or Gaussians behind the end of a pixel."""
     view = one_view(32, 24)
     fitted = scene.model("3dgs", 4, sigma=0.3)
@@ -115,9 +114,7 @@ def install(other: Built, _: Path) -> None:
     (other.folder / "site/gsbench/__init__.py").write_text("MILLISECONDS = 2.5")
 
 
-def test_a_commit_is_measured_by_its_own_benchmarks(
-    commit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_commit_is_measured_by_its_own_benchmarks(commit, tmp_path, monkeypatch):
     """Catches the benchmarks or the gsbench of this tree, which an editable install puts before others, and a folder of
     a hundred MiB, or an entry in git's list of worktrees, that Ctrl-C leaves behind."""
     monkeypatch.setattr(against, "_install", install)
@@ -130,9 +127,7 @@ def test_a_commit_is_measured_by_its_own_benchmarks(
     assert subprocess.check_output(["git", "worktree", "list"], cwd=against.ROOT).count(b"\n") == 1
 
 
-def test_a_commit_that_cannot_be_measured_is_one_line(
-    commit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_commit_that_cannot_be_measured_is_one_line(commit, tmp_path, monkeypatch, capsys):
     """Catches a stack trace for a name that git does not know, for a build that fails, and for missing benchmarks."""
 
     def error(name: str) -> str:
@@ -151,9 +146,7 @@ def test_a_commit_that_cannot_be_measured_is_one_line(
     assert "No module named 'no_such_module': choose" in error(commit)
 
 
-def test_the_table_shows_ratios_where_the_commit_has_the_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_shows_ratios_where_the_commit_has_the_row(tmp_path, monkeypatch, capsys):
     """Catches a ratio upside down or of another row, a column without cells, and sections that are not in turns."""
     calls: list[str] = []
 

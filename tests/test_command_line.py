@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +15,7 @@ from gsbench.train import step
 from gsbench.usage import DESCRIBED, first_sentence
 
 
-def test_help_describes_what_there_is_without_torch() -> None:
+def test_help_describes_what_there_is_without_torch():
     """Catches a help text that pays for importing torch or composing a config, does not say what a model or an
     experiment is, or lists trials."""
     code = (
@@ -38,14 +37,14 @@ def test_help_describes_what_there_is_without_torch() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(p for group in DESCRIBED for p in (CONF / group).glob("*.yaml")), ids=str)
-def test_every_choice_in_the_help_has_a_sentence(path: Path) -> None:
+def test_every_choice_in_the_help_has_a_sentence(path):
     """Catches a model or an experiment without a description, or one that is cut behind 'et al.'."""
     sentence = first_sentence(path)
     assert len(sentence.split()) > 2
     assert sentence.count("(") == sentence.count(")")
 
 
-def test_the_help_lists_models_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_lists_models_of_the_user(tmp_path, capsys):
     """Catches `--config-dir` that is not read, as Hydra's own help does."""
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "balls.yaml").write_text("# Balls of one size. Not much.\nname: balls\n")
@@ -54,7 +53,7 @@ def test_the_help_lists_models_of_the_user(tmp_path: Path, capsys: pytest.Captur
         assert "  balls         Balls of one size\n" in capsys.readouterr().out
 
 
-def test_the_help_explains_keys(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_explains_keys(capsys):
     """Catches a key without its range, one that another key's name begins, and a prefix of no key."""
     assert main_here("train.densify", "--help") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -96,9 +95,7 @@ def test_the_help_explains_keys(capsys: pytest.CaptureFixture[str]) -> None:
         (["+exp=mini", "scene=custom", "scene.name=../sample"], ["scene: expected a name", "../sample"]),
     ],
 )
-def test_what_is_typed_wrong_is_told_in_one_line(
-    arguments: list[str], expected: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_typed_wrong_is_told_in_one_line(arguments, expected, tmp_path, capsys):
     """Catches a stack trace, or a message that does not name the key, the nearest valid one, or what to do; or two."""
     assert main_here(*arguments, *([f"results={tmp_path}"] if "+exp" in arguments[0] else [])) != 0
     printed = capsys.readouterr()
@@ -116,9 +113,7 @@ def test_what_is_typed_wrong_is_told_in_one_line(
 @pytest.mark.parametrize(
     "words", [[], ["+exp=dnerf"], ["-m", "+exp=dnerf", "scene=trex,lego"], ["-m", "data.root=.,???", "+exp=dnerf"]]
 )
-def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(words, tmp_path, capsys):
     """Catches lines of Hydra and warnings around the reason, and runs that are planned and then lost for ever."""
     assert main_here(*words, *([f"results={tmp_path}"] if words else [])) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -135,9 +130,7 @@ def test_a_command_without_an_experiment_or_data_is_refused_in_one_line(
         (["model=auto", "model.candidates.static.min_opacity=1"], "model=auto, candidate static: model.min_opacity: "),
     ],
 )
-def test_a_wrong_value_is_refused_before_the_first_run(
-    words: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_value_is_refused_before_the_first_run(words, reason, tmp_path, capsys):
     """Catches a sweep whose wrong run fails after hours, and a folder of a run that never was."""
     assert main_here("+exp=mini", "scene=suzanne", *words, f"results={tmp_path}") == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -146,9 +139,7 @@ def test_a_wrong_value_is_refused_before_the_first_run(
 
 
 @pytest.mark.parametrize(("place", "root"), [("a/b/square", ""), ("a/square", ""), ("a/square", "a/square")])
-def test_a_data_root_too_high_or_too_low_names_the_right_one(
-    place: str, root: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_data_root_too_high_or_too_low_names_the_right_one(place, root, square, tmp_path, capsys):
     """Catches a message that lists where the scene is not, while it lies in a folder beside."""
     (tmp_path / place).parent.mkdir(parents=True)
     (tmp_path / place).symlink_to(square / "square")
@@ -157,7 +148,7 @@ def test_a_data_root_too_high_or_too_low_names_the_right_one(
     assert f'type "data.root={(tmp_path / place).parent}"' in capsys.readouterr().err
 
 
-def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, tmp_path: Path) -> None:
+def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square, tmp_path):
     """Catches runs that overwrite each other, AGR that cannot be switched, and finished runs that are done again."""
     sweep = ["-m", *overrides(square, tmp_path), "model=4dgs,3dgs", "agr=true,false"]
     first = gsbench(*sweep)
@@ -169,8 +160,7 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
         assert run.effects.refinement == label.endswith("_agr")
         assert run.effects.time == label.startswith("4dgs")
         assert len(run.curve) == 2
-        assert (run.metrics or {})["psnr"] is not None
-        assert run.cost is not None
+        assert run.metrics["psnr"] is not None
         assert set(run.cost.stage_s) >= {"slice", "raster", "loss", "backward", "optimizer"}
         (pictures,) = (tmp_path / "dnerf" / "square").glob(f"{label},*/seed0/pictures.png")
         assert pictures.is_file()
@@ -181,7 +171,7 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square: Path, 
     assert {p: p.stat().st_mtime_ns for p in record.find(tmp_path)} == written
 
 
-def test_a_finished_run_outlives_a_later_attempt_that_fails(tmp_path: Path) -> None:
+def test_a_finished_run_outlives_a_later_attempt_that_fails(tmp_path):
     """Catches a finished record that a refused attempt overwrites, a table that still shows it as the run's result, and
     a training that is repeated once its data is back."""
     data = write_moving_square(tmp_path / "data")
@@ -204,7 +194,7 @@ def test_a_finished_run_outlives_a_later_attempt_that_fails(tmp_path: Path) -> N
     assert not path.with_name("record.stale.json").exists()
 
 
-def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> None:
+def test_what_is_measured_trains_nothing_again(square, tmp_path):
     """Catches a training repeated for the sake of its pictures; the protocol is that of the last command."""
     arguments = overrides(square, tmp_path, "model=3dgs")
     assert gsbench(*arguments).returncode == 0
@@ -217,13 +207,12 @@ def test_what_is_measured_trains_nothing_again(square: Path, tmp_path: Path) -> 
     assert "continues from step 30" in done.stderr
     assert record.find(tmp_path) == [path]
     after = record.read(path)
-    assert after.cost is not None
-    assert (after.cost.train_s, after.curve) == (getattr(before.cost, "train_s", None), before.curve)
+    assert (after.cost.train_s, after.curve) == (before.cost.train_s, before.curve)
     assert after.protocol["quantise"]
     assert after.metrics != before.metrics
 
 
-def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
+def test_one_bad_scene_does_not_stop_the_others(tmp_path):
     """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0, and a 4DGS fitted to
     a made-up time, where 6DGS takes the same scene."""
     names = ("broken", "square", "static")
@@ -251,7 +240,7 @@ def test_one_bad_scene_does_not_stop_the_others(tmp_path: Path) -> None:
     assert "use 3dgs or 6dgs" in str(runs["static", "4dgs"].reason)
 
 
-def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path: Path) -> None:
+def test_divergence_ends_as_a_record_and_the_rest_goes_on(square, tmp_path):
     """Catches a diverged run that is lost, hidden, or takes the sweep with it: one line, a record, exit code 1."""
     sweep = ["-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1"]
     done = gsbench(*sweep, "model.lr.means.start=1e38")
@@ -263,9 +252,7 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square: Path, tmp_path
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError, TooLargeError])
-def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(
-    error: type[Exception], square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_path, monkeypatch):
     """Catches a run out of a GPU's memory, or refused by the CPU's, that ends the process, counts as diverged, or has
     a record that does not say what to lower."""
     rasterize = step.rasterize_slice

@@ -44,7 +44,7 @@ def wrong(facts: Key) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("dotted", [name for name in KEYS if [*wrong(KEYS[name])] and "NAME" not in name])
-def test_values_out_of_a_range_or_no_choice_are_refused(dotted: str, config: Config) -> None:
+def test_values_out_of_a_range_or_no_choice_are_refused(dotted, config):
     """Catches a key that is not looked at: its run would fail in the middle, or train as if nothing were said."""
     for value in wrong(KEYS[dotted]):
         broken = copy.deepcopy(config)
@@ -58,7 +58,7 @@ def test_values_out_of_a_range_or_no_choice_are_refused(dotted: str, config: Con
     check_settings(config)
 
 
-def test_rates_of_any_name_have_a_range(config: Config) -> None:
+def test_rates_of_any_name_have_a_range(config):
     """Catches a negative learning rate."""
     broken = copy.deepcopy(config)
     broken.model.lr["means"].start = -1
@@ -67,7 +67,7 @@ def test_rates_of_any_name_have_a_range(config: Config) -> None:
 
 
 @pytest.mark.parametrize("key", ["train.cooldown_from", "train.average_from"])
-def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
+def test_steps_end_with_the_recipe(key, config):
     """Catches an end of a training that begins after its last step, of the recipe's 30,000."""
     broken = copy.deepcopy(config)
     setattr(broken.train, key.removeprefix("train."), 30_000)
@@ -75,7 +75,7 @@ def test_steps_end_with_the_recipe(key: str, config: Config) -> None:
         check_settings(broken)
 
 
-def test_facts_are_those_of_the_code() -> None:
+def test_facts_are_those_of_the_code():
     """Catches a choice that the code does not have, and one that is refused though it has it."""
     choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "train.densify.kind": RULES}
     for name, known in choices.items():
@@ -120,20 +120,20 @@ def changed(dotted: str, value: Any) -> dict[str, Any]:
         ("train.patience", None, False, False),
     ],
 )
-def test_what_depends_on_a_key(dotted: str, value: Any, trains: bool, measures: bool) -> None:
+def test_what_depends_on_a_key(dotted, value, trains, measures):
     """Catches a finished run that is trained again for nothing, and one that is kept though its numbers are others."""
     other = changed(dotted, value)
     assert (training_hash(other) != training_hash(PLAIN)) == trains == bool(training_differences(PLAIN, other))
     assert bool(measuring_differences(PLAIN, other)) == measures
 
 
-def test_differences_are_named() -> None:
+def test_differences_are_named():
     """Catches a difference with the two values exchanged."""
     assert training_differences(PLAIN, changed("train.iterations", 8)) == ["train.iterations 8 instead of 9"]
     assert measuring_differences(changed("experiment", None), PLAIN) == ["experiment a instead of not set"]
 
 
-def test_files_of_conf_have_known_keys_and_allowed_values() -> None:
+def test_files_of_conf_have_known_keys_and_allowed_values():
     """Catches a key of a YAML that is refused only when someone chooses it."""
     for path in CONF.rglob("*.yaml"):
         text, group = path.read_text(), path.relative_to(CONF).parts[0]
@@ -145,7 +145,7 @@ def test_files_of_conf_have_known_keys_and_allowed_values() -> None:
                 facts(dotted).check(f"{path}: {dotted}", value)
 
 
-def test_a_dataclass_of_another_module_joins_a_group() -> None:
+def test_a_dataclass_of_another_module_joins_a_group():
     """Catches a hook whose keys are not in the schema, or in front of those that names of runs begin with."""
 
     @joins("test")
@@ -164,7 +164,7 @@ def test_a_dataclass_of_another_module_joins_a_group() -> None:
     assert Group.__module__ == __name__
 
 
-def test_the_schema_needs_no_library() -> None:
+def test_the_schema_needs_no_library():
     """Catches a hook that imports torch, which takes seconds, or gsbench.config, which then lacks its keys."""
     program = ("import sys, {}; from gsbench import config, config_key; print(*config_key.declared(config.Config));"
                "assert not {{'torch', 'hydra', 'omegaconf'}} & sys.modules.keys()")  # fmt: skip

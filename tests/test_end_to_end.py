@@ -30,7 +30,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
+def test_every_model_learns_and_time_is_worth_something(results):
     """Catches a model that does not learn, or a time dimension that does nothing where things move."""
     runs = {(run.scene, run.model): metrics_of(run) for run in map(record.read, record.find(results))}
     assert len(runs) == 4
@@ -41,7 +41,7 @@ def test_every_model_learns_and_time_is_worth_something(results: Path) -> None:
         assert runs[scene, "7dgs"]["psnr"] > runs[scene, "3dgs"]["psnr"] + 1
 
 
-def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
+def test_the_table_has_every_run_and_the_papers_row(results):
     """Catches a table that drops runs, the average, or the paper's row beside the stand-in scene."""
     folder = results / "mini"
     runs = load(folder)
@@ -56,7 +56,7 @@ def test_the_table_has_every_run_and_the_papers_row(results: Path) -> None:
     assert len((folder / "table.csv").read_text().splitlines()) == 1 + 4
 
 
-def test_changed_data_runs_again_and_training_views_keep_their_score(tmp_path: Path) -> None:
+def test_changed_data_runs_again_and_training_views_keep_their_score(tmp_path):
     """Catches a result of other data that is passed off as this one's, and a psnr_train measured on another split: the
     images of the test split alone change, and the training stays the same to the bit."""
     data, runs = write_moving_square(tmp_path / "data"), []

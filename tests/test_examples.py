@@ -41,7 +41,7 @@ def figures(outputs: list[Any]) -> int:
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_it_is_committed_with_small_outputs(name: str) -> None:
+def test_it_is_committed_with_small_outputs(name):
     """Catches a notebook that shows nothing where it is read, a part of a run, a warning, a path of a machine."""
     text = NOTEBOOKS[name].read_text()
     cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
@@ -54,7 +54,7 @@ def test_it_is_committed_with_small_outputs(name: str) -> None:
     assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users)\b", printed(kept(name)))
 
 
-def test_git_ignores_what_they_write() -> None:
+def test_git_ignores_what_they_write():
     """Catches a notebook that leaves scenes and results as untracked files in a checkout."""
     ignored = (ROOT / ".gitignore").read_text().splitlines()
     for name, written in {"first_look": "first_look", "own_capture": "captures", "own_model": "own_model"}.items():
@@ -62,7 +62,7 @@ def test_git_ignores_what_they_write() -> None:
         assert f"examples/{written}/" in ignored
 
 
-def test_their_model_is_the_one_of_the_page() -> None:
+def test_their_model_is_the_one_of_the_page():
     """Catches a notebook and a page that explain two different models by one name."""
     page = {Path(path).name: text.strip() for path, text in blocks().items()}
     assert page["balls.py"].partition("\n\n")[2].strip() in sources("first_look", "code")
@@ -111,9 +111,7 @@ def psnr(text: str, name: str) -> float:
         ("own_model", "7dgs", "balls", ""),
     ],
 )
-def test_it_runs(
-    name: str, better: str | None, worse: str, also: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_runs(name, better, worse, also, tmp_path, monkeypatch):
     """Catches a cell that fails, a picture that is not drawn, a training that does not learn, a capture that its own
     cells write wrong, times that are lost, and a model outside of gsbench that is not found."""
     text, drawn = run(name, tmp_path, monkeypatch)

@@ -36,10 +36,7 @@ class Refused(Recorded):
 @pytest.mark.parametrize(
     ("backend", "replay", "frames"), [(CPU, Recorded, None), (CUDA, Recorded, "replayed"), (CUDA, Refused, "launched")]
 )
-def test_the_record_says_which_frames_are_timed(
-    backend: Backend, replay: type[Recorded], frames: str | None, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_the_record_says_which_frames_are_timed(backend, replay, frames, monkeypatch, capsys):
     """Catches a protocol that speaks of replays on a CPU, a finished training lost to a model that waits for the
     device, and an FPS that hides how it was made."""
     monkeypatch.setattr(measuring, "GraphedFrames", replay)

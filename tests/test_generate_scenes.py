@@ -1,7 +1,6 @@
 """The views of the embedded scenes: enough of them, good poses, and held-out views between training views."""
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from tools.generate_scenes import DISTANCE, RECIPES, _pack
 
 
 @pytest.mark.parametrize("name", sorted(RECIPES))
-def test_views_are_enough_upright_and_held_out_ones_lie_between_training_views(name: str) -> None:
+def test_views_are_enough_upright_and_held_out_ones_lie_between_training_views(name):
     """Catches a scene whose views are learnt by heart because they are few, a mirrored or tilted camera, which Blender
     would accept, and a test view that training saw, or that is outside of what it saw."""
     shots = RECIPES[name].shots()
@@ -34,7 +33,7 @@ def test_views_are_enough_upright_and_held_out_ones_lie_between_training_views(n
         assert 0.1 < min(angles) < 30
 
 
-def test_a_rig_repeats_its_places_and_an_orbit_does_not() -> None:
+def test_a_rig_repeats_its_places_and_an_orbit_does_not():
     """Catches a rig whose cameras move, and a monocular scene that sees a moment twice."""
     for name, places, times in (("pendulum", 12, 11), ("suzanne", 120, 120)):
         train = [shot for shot in RECIPES[name].shots() if shot.split == "train"]
@@ -42,7 +41,7 @@ def test_a_rig_repeats_its_places_and_an_orbit_does_not() -> None:
         assert len({shot.time for shot in train}) == times
 
 
-def test_a_picture_is_packed_without_a_change_that_shows(tmp_path: Path) -> None:
+def test_a_picture_is_packed_without_a_change_that_shows(tmp_path):
     """Catches a packed picture that lost colours or alpha, and hidden colours that would only take room."""
     before = np.random.default_rng(0).integers(1, 256, (8, 9, 4), dtype=np.uint8)
     before[:, :4, 3] = 0

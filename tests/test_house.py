@@ -151,7 +151,7 @@ def vague_names() -> list[str]:
 GSBENCH = modules(ROOT / "gsbench")
 
 
-def test_imports_run_down() -> None:
+def test_imports_run_down():
     """Catches a kernel that needs a model, a report that needs a training, imports in a circle, and a new folder that
     no one has placed, whose modules would count as loose files."""
     assert {path.parent.name for path in (ROOT / "gsbench").glob("*/__init__.py")} == FLOOR.keys()
@@ -161,25 +161,25 @@ def test_imports_run_down() -> None:
     assert not upward(graph)
 
 
-def test_libraries_are_changed_in_known_places() -> None:
+def test_libraries_are_changed_in_known_places():
     """Catches a module that changes another library, which no file of this list names."""
     changed = {name: names for name, tree in GSBENCH.items() if (names := patched(tree))}
     assert changed == {"gsbench.view.request_guard": {"websockets_server"}}
 
 
 @pytest.mark.parametrize("name", GSBENCH)
-def test_a_module_says_what_it_does(name: str) -> None:
+def test_a_module_says_what_it_does(name):
     """Catches a module whose first line is a heading or is missing."""
     first = (ast.get_docstring(GSBENCH[name]) or "").partition("\n")[0]
     assert is_sentence(first), f"{name}: expected a sentence as the first line, got '{first}'"
 
 
-def test_no_name_is_vague() -> None:
+def test_no_name_is_vague():
     """Catches a variable, an argument, an attribute or a function whose name says nothing of what it is."""
     assert vague_names() == []
 
 
-def test_the_checks_find_what_they_look_for() -> None:
+def test_the_checks_find_what_they_look_for():
     """Catches checks that pass whatever they are given."""
     parsed = {
         "g.raster": ast.parse("def f():\n    from g.models import a"),

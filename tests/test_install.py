@@ -36,7 +36,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built("build_sdist", ROOT, tmp_path_factory.mktemp("sdist"))[0]
 
 
-def test_the_sdist_has_what_builds_and_tests_it(sdist: Path) -> None:
+def test_the_sdist_has_what_builds_and_tests_it(sdist):
     """Catches an sdist without sources or scenes, or one that records, builds and trials have bloated."""
     assert sdist.name == f"gsbench_splatting-{__version__}.tar.gz"  # as .github/workflows/wheels.yml expects it
     with tarfile.open(sdist) as archive:
@@ -49,7 +49,7 @@ def test_the_sdist_has_what_builds_and_tests_it(sdist: Path) -> None:
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja"))), reason="needs cmake and ninja")
-def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist: Path, tmp_path: Path) -> None:
+def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist, tmp_path):
     """Catches an install that fails for want of a compiler, a wheel without configs or scenes, and silence."""
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "source", filter="data")

@@ -14,14 +14,14 @@ ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in LINES[
 LICENCES = {name: row[0] for row in ROWS for cell in row[1:] for name in cell.split(", ") if name}
 
 
-def test_every_dependency_is_listed() -> None:
+def test_every_dependency_is_listed():
     """Catches a dependency whose licence nobody has looked at."""
     assert LICENCES.keys() == licences.direct().keys() | licences.along().keys()
     assert len(licences.along()) > 20
 
 
 @pytest.mark.parametrize("name", LICENCES.keys() - licences.NOT_INSTALLED.keys())
-def test_the_table_says_what_the_metadata_say(name: str) -> None:
+def test_the_table_says_what_the_metadata_say(name):
     """Catches a table that was written by hand, or before a dependency took another licence."""
     try:
         licence = licence_of(metadata.distribution(name))
@@ -31,14 +31,14 @@ def test_the_table_says_what_the_metadata_say(name: str) -> None:
     assert LICENCES[name] == (f"**{licence}**" if GPL.search(licence) else licence)
 
 
-def test_only_developers_install_the_gpl() -> None:
+def test_only_developers_install_the_gpl():
     """Catches a table that lists a package of users under developers, or the other way round."""
     users, developers = ({name for row in ROWS for name in row[column].split(", ")} for column in (1, 2))
     assert {"torch", "viser", "urllib3"} <= users - developers
     assert {"plyfile", "pytest", "sphinx"} <= developers - users
 
 
-def test_no_user_installs_the_gpl() -> None:
+def test_no_user_installs_the_gpl():
     """Catches a library whose licence would bind every program that imports gsbench, and a search that finds none:
     plyfile, which only tests use, is under the GPL."""
     texts = {name: licence_of(package) for name, package in licences.of_users().items()}
@@ -47,7 +47,7 @@ def test_no_user_installs_the_gpl() -> None:
     assert GPL.search(licence_of(metadata.distribution("plyfile")))
 
 
-def test_the_sbom_lists_what_users_install(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_sbom_lists_what_users_install(capsys):
     """Catches a bill of materials that leaves out what comes along, or has what only developers install."""
     licences.main(["--sbom"])
     listed = json.loads(capsys.readouterr().out)

@@ -68,12 +68,12 @@ def missing(pointer: str) -> bool:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     """Catches a file that was moved, and a heading that was reworded, under a link to it."""
     assert broken(page) == []
 
 
-def test_pointers_of_errors_and_comments_lead_to_a_heading() -> None:
+def test_pointers_of_errors_and_comments_lead_to_a_heading():
     """Catches a page that was moved, and a heading that was reworded, under an error that names it."""
     texts = {path: path.read_text() for path in SOURCES}
     constants = {name: value for text in texts.values() for name, value in constants_of(text).items()}
@@ -82,7 +82,7 @@ def test_pointers_of_errors_and_comments_lead_to_a_heading() -> None:
     assert [(path, pointer) for path, names in pointers.items() for pointer in names if missing(pointer)] == []
 
 
-def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
+def test_what_leads_nowhere_is_found(tmp_path):
     """Catches checks that pass whatever a page links to or an error names."""
     (tmp_path / "docs").mkdir()
     (tmp_path / "other.md").write_text("# One `two`, three!\n\n# Twice\n\n# Twice\n")
@@ -97,7 +97,7 @@ def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
     assert [missing(pointer) for pointer in ("data.md#fetching", "data.md#fetched", "datum.md")] == [False, True, True]
 
 
-def test_the_printed_line_ends_with_the_pointer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_printed_line_ends_with_the_pointer(tmp_path, capsys):
     """Catches a pointer that is kept and not printed, and one on a second line."""
     assert main_here("+exp=dnerf", "model=3dgs", f"results={tmp_path}") == 2
     *_, line = capsys.readouterr().err.splitlines()
@@ -106,7 +106,7 @@ def test_the_printed_line_ends_with_the_pointer(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("kind", [InputError, TooLargeError])
-def test_a_worker_sends_the_pointer(kind: type[InputError]) -> None:
+def test_a_worker_sends_the_pointer(kind):
     """Catches an error that cannot be unpickled in the process that started the worker, or that has two pointers."""
     sent = pickle.loads(pickle.dumps(kind("no images", docs="data.md")))
     assert type(sent) is kind

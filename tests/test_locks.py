@@ -45,7 +45,7 @@ def holds(asked: Requirement) -> bool:
 
 
 @pytest.mark.parametrize("path", LOCKS, ids=lambda path: path.stem)
-def test_every_line_has_one_version_and_its_hashes(path: Path) -> None:
+def test_every_line_has_one_version_and_its_hashes(path):
     """Catches a line that pip would take from anybody."""
     lines = [line for line in path.read_text().replace("\\\n", " ").splitlines() if not line.startswith("#")]
     assert lines
@@ -53,7 +53,7 @@ def test_every_line_has_one_version_and_its_hashes(path: Path) -> None:
         assert re.fullmatch(r"[a-z0-9._-]+==[^ ,*]+( ; [^#]+?)?( +--hash=sha256:[0-9a-f]{64})+", line), line
 
 
-def test_what_gsbench_asks_for_is_locked() -> None:
+def test_what_gsbench_asks_for_is_locked():
     """Catches a dependency that is added to pyproject.toml or changed in constraints.txt without `make locks`."""
     extras = [extra for name, extra in OURS["optional-dependencies"].items() if name not in TRACKERS]
     asked = [*OURS["dependencies"], *PYPROJECT["build-system"]["requires"], *itertools.chain(*extras)]
@@ -64,7 +64,7 @@ def test_what_gsbench_asks_for_is_locked() -> None:
     assert str(cpu.specifier) == f"{ALL['torch'][0].specifier}+cpu"
 
 
-def test_what_comes_along_is_locked() -> None:
+def test_what_comes_along_is_locked():
     """Catches a package that is missing in a new .venv, as pip is told not to look for what a package needs."""
     missing = []
     for name in {name for path in LOCKS if path.stem in INSTALLED for name in locked(path)}:
@@ -78,7 +78,7 @@ def test_what_comes_along_is_locked() -> None:
     assert missing == []
 
 
-def test_make_installs_locks_and_nothing_else() -> None:
+def test_make_installs_locks_and_nothing_else():
     """Catches a package that is installed by name, a lock that nobody installs, and tools fetched to build with."""
     installs = re.findall(r"^.*pip install .*$", MAKEFILE, re.MULTILINE)
     assert all("--no-deps" in line and ("--require-hashes" in line or line.startswith("PIP := ")) for line in installs)
@@ -88,7 +88,7 @@ def test_make_installs_locks_and_nothing_else() -> None:
     assert set(re.findall(r"(?:\$\(LOCKED\)|locks)/(\w+)\.txt", MAKEFILE)) == {path.stem for path in LOCKS}
 
 
-def test_a_file_with_another_hash_is_refused(tmp_path: Path) -> None:
+def test_a_file_with_another_hash_is_refused(tmp_path):
     """Catches options of pip under which hashes are not looked at: the Makefile's own are tried on a small wheel."""
     wheel, lock = tmp_path / "trial-1-py3-none-any.whl", tmp_path / "lock.txt"
     texts = {"METADATA": "Metadata-Version: 2.1\nName: trial\nVersion: 1\n", "RECORD": "",
@@ -108,7 +108,7 @@ def test_a_file_with_another_hash_is_refused(tmp_path: Path) -> None:
         assert (tmp_path / "out").exists() != bool(message)
 
 
-def test_actions_are_named_by_commit() -> None:
+def test_actions_are_named_by_commit():
     """Catches an action whose tag its owner, or a thief, can move."""
     for path in (ROOT / ".github/workflows").glob("*.yml"):
         used = re.findall(r"uses: *(.*)", path.read_text())

@@ -1,7 +1,5 @@
 """The recipes in conf/: rates that mean the same for a run of any length, and the published ones as published."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -44,9 +42,7 @@ AUTHORS = {"log_diagonal": 5e-3, "shape": 1e-3, "motion": 1e-3, "lambda": 0}
         ("authors", 30_000, AUTHORS, False, {"lambda_t": 0.01, "lambda_d": 0.01, "off_diagonal": "row_scaled"}),
     ],
 )
-def test_rates_are_those_published(
-    recipe: str, iterations: int, expected: dict[str, float], agr: bool, options: dict[str, object]
-) -> None:
+def test_rates_are_those_published(recipe, iterations, expected, agr, options):
     """Catches a published rate that falls, or that depends on the run's length or the scene's size; with the authors'
     code AGR, which it does not have, a lambda that learns, and entries that are not row-scaled."""
     config = composed("model=7dgs", f"+recipe={recipe}", f"train.iterations={iterations}")
@@ -58,7 +54,7 @@ def test_rates_are_those_published(
     assert Schedule(config.train, 3, config.agr).densify_every == 100
 
 
-def test_7dgs_without_direction_learns_as_7dgs_does() -> None:
+def test_7dgs_without_direction_learns_as_7dgs_does():
     """Catches a price of direction that is one of rates or of options: what both have is the same."""
     whole, less = composed("model=7dgs"), composed("model=7dgs_nodir")
     assert whole.model.lr.keys() - less.model.lr.keys() == {"directions", "coupling"}
@@ -68,7 +64,7 @@ def test_7dgs_without_direction_learns_as_7dgs_does() -> None:
     assert whole.model.min_opacity == less.model.min_opacity
 
 
-def test_every_model_goes_as_far_in_a_short_run() -> None:
+def test_every_model_goes_as_far_in_a_short_run():
     """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not.
 
     The harmonics of 3DGS and 6DGS are, which was chosen on static scenes.
@@ -85,7 +81,7 @@ TRIALS = sorted((CONF / "trial").rglob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", TRIALS, ids=lambda path: str(path.relative_to(CONF / "trial")))
-def test_trials_change_what_they_say(path: Path) -> None:
+def test_trials_change_what_they_say(path):
     """Catches a trial that names a parameter its model lacks, or that changes nothing."""
     trial = str(path.relative_to(CONF / "trial").with_suffix(""))
     model = trial.split("/")[0] if "/" in trial else "7dgs"
@@ -96,7 +92,7 @@ def test_trials_change_what_they_say(path: Path) -> None:
     assert changed == (trial != "recipe")
 
 
-def test_every_model_has_the_same_number_of_trials() -> None:
+def test_every_model_has_the_same_number_of_trials():
     """Catches a model that was tuned more than another."""
     folders = [folder for folder in (CONF / "trial").iterdir() if folder.is_dir()]
     settings = {folder.name: sorted(path.name for path in folder.glob("*.yaml")) for folder in folders}
@@ -104,7 +100,7 @@ def test_every_model_has_the_same_number_of_trials() -> None:
     assert {len(names) for names in settings.values()} == {5}
 
 
-def test_the_suite_names_every_scene_once() -> None:
+def test_the_suite_names_every_scene_once():
     """Catches a scene that `scene=all` leaves out, one of no kind, and one that overrides the experiment."""
     register_schema()
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -118,7 +114,7 @@ def test_the_suite_names_every_scene_once() -> None:
 
 
 @pytest.mark.parametrize("folder", ["../other", "/etc", "a/../../b"])
-def test_a_published_name_stays_below_the_data_root(folder: str) -> None:
+def test_a_published_name_stays_below_the_data_root(folder):
     """Catches a config that reads files outside of data.root."""
     with pytest.raises(InputError, match="scene: expected a name"):
         scene_folder(composed(f"scene.released_as={folder}"))

@@ -32,7 +32,7 @@ def commands(jobs: dict[str, Any]) -> str:
     return "\n".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
 
 
-def test_the_version_and_its_day_are_one() -> None:
+def test_the_version_and_its_day_are_one():
     """Catches a release without notes, or whose citation, metadata or pages name another version or another day."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     changes = (ROOT / "CHANGELOG.md").read_text()
@@ -52,7 +52,7 @@ STRANGERS = re.compile(r"gsbench\[[a-zA-Z]|pip3? install(?: +-\S+(?: +\S+\.txt)?
 """What installs another project's package, which has the name gsbench in PyPI."""
 
 
-def test_nobody_is_told_to_install_a_strangers_package() -> None:
+def test_nobody_is_told_to_install_a_strangers_package():
     """Catches a page, a message, a workflow or an image that installs gsbench by that name, and that name itself."""
     bad = ("pip install 'gsbench[view]'", "`pip install gsbench`", "pip install -c c.txt gsbench==0.3", "gsbench[dev]")
     good = (f"'{how_to_install('view')}'", "pip install gsbench_splatting-0.3.0-cp311.whl", "pip install -c c.txt .")
@@ -70,7 +70,7 @@ def test_nobody_is_told_to_install_a_strangers_package() -> None:
     assert PYPROJECT["project"]["scripts"] == {"gsbench": doctor.COMMAND}
 
 
-def test_every_python_is_tested() -> None:
+def test_every_python_is_tested():
     """Catches a Python that is allowed and not tested, or tested and refused by make."""
     jobs = workflow("tests.yml")["jobs"]
     assert jobs["test"]["strategy"]["matrix"]["python"] == PYTHONS
@@ -82,7 +82,7 @@ def test_every_python_is_tested() -> None:
         assert f"Python {PYTHONS[0]} to {PYTHONS[-1]}" in (ROOT / page).read_text()
 
 
-def test_a_wheel_is_made_for_every_python_and_tried() -> None:
+def test_a_wheel_is_made_for_every_python_and_tried():
     """Catches wheels that leave out a Python, or that no one has installed."""
     settings = PYPROJECT["tool"]["cibuildwheel"]
     assert settings["build"] == "cp3*-manylinux_*"  # of which cibuildwheel takes those that requires-python allows
@@ -91,7 +91,7 @@ def test_a_wheel_is_made_for_every_python_and_tried() -> None:
     assert (ROOT / settings["test-command"].partition("{project}/")[2]).is_file()
 
 
-def test_the_image_is_of_a_wheel_of_this_project() -> None:
+def test_the_image_is_of_a_wheel_of_this_project():
     """Catches an image of another Python or without pins, one that runs as root, and one that Apptainer cannot find."""
     folder = ROOT / "containers"
     text = re.sub(r"\\\n\s*", "", (folder / "Dockerfile").read_text())
@@ -120,7 +120,7 @@ def test_the_image_is_of_a_wheel_of_this_project() -> None:
 
 
 @pytest.mark.parametrize("name", ["tests.yml", "wheels.yml"])
-def test_workflows_run_what_there_is(name: str) -> None:
+def test_workflows_run_what_there_is(name):
     """Catches a target of make, a script or a file of a trigger that has been renamed."""
     parsed = workflow(name)
     lines = commands(parsed["jobs"])

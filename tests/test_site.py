@@ -24,7 +24,7 @@ DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/models.md", "docs/config.md", "docs/results.md"])
-def test_a_page_is_what_code_and_records_say(page: str) -> None:
+def test_a_page_is_what_code_and_records_say(page):
     """Catches a model, a key, a default or a published record that was changed without its page."""
     assert (ROOT / page).read_text() == tables.filled(page), "write it anew by docs/site/tables.py"
 
@@ -49,7 +49,7 @@ def row_of(block: str, name: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_the_tables_follow_from_the_records(tmp_path: Path) -> None:
+def test_the_tables_follow_from_the_records(tmp_path):
     """Catches a best model, a price or a loss of choosing another one that stays when the records change."""
     for name in ("frontier", "suite"):
         copied(tmp_path, name)
@@ -63,7 +63,7 @@ def test_the_tables_follow_from_the_records(tmp_path: Path) -> None:
     assert lost[0] - lost[1] == pytest.approx((20 + 20.85 - 24.72) / 9, abs=0.02)  # without playroom and lego100
 
 
-def test_the_tables_name_every_model_and_key() -> None:
+def test_the_tables_name_every_model_and_key():
     """Catches a table that leaves rows out, or facts of a key."""
     models = [row.split("`")[1] for row in tables.models().splitlines()[2:]]
     assert models == sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
@@ -88,7 +88,7 @@ def broken(site: Path) -> list[str]:
     return bad
 
 
-def test_code_that_a_page_shows_is_where_the_page_looks() -> None:
+def test_code_that_a_page_shows_is_where_the_page_looks():
     """Catches a class that moved to another file, without building the site."""
     block = r"\{literalinclude\} \.\./(\S+)\n(?::\S+:.*\n)*?:pyobject: (\S+)"
     shown = [match for page in (ROOT / "docs").glob("*.md") for match in re.findall(block, page.read_text())]
@@ -98,7 +98,7 @@ def test_code_that_a_page_shows_is_where_the_page_looks() -> None:
 
 
 @pytest.mark.slow
-def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
+def test_the_site_builds_offline_without_a_broken_link(tmp_path):
     """Catches a warning of Sphinx, a link to a page, a heading or a file that is gone, and what needs a network."""
     site = tmp_path / "site"
     done = subprocess.run(
@@ -117,7 +117,7 @@ def test_the_site_builds_offline_without_a_broken_link(tmp_path: Path) -> None:
     assert "site.css" in (site / "results.html").read_text(), "without it, a table of ten columns is cut"
 
 
-def test_broken_links_of_a_site_are_found(tmp_path: Path) -> None:
+def test_broken_links_of_a_site_are_found(tmp_path):
     """Catches a check that passes whatever the pages link to."""
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "c.html").write_text('<h1 id="d">d</h1>')

@@ -34,7 +34,7 @@ def failures(tests: list[doctest.DocTest]) -> int:
 
 
 @pytest.mark.parametrize("name", gsbench.__all__)
-def test_the_examples_run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_run(name, folder, monkeypatch):
     """Catches a public name without an example, and an example that no longer does what it shows."""
     monkeypatch.chdir(folder)
     monkeypatch.setenv("TORCH_HOME", str(folder))  # a machine without the weights of LPIPS
@@ -47,7 +47,7 @@ def test_the_examples_run(name: str, folder: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", gsbench.__all__)
-def test_a_public_name_says_what_it_takes(name: str) -> None:
+def test_a_public_name_says_what_it_takes(name):
     """Catches a public function whose arguments, units or errors have to be guessed."""
     public = getattr(gsbench, name)
     text = inspect.getdoc(public) or ""
@@ -58,7 +58,7 @@ def test_a_public_name_says_what_it_takes(name: str) -> None:
     assert "Raises:" in raises
 
 
-def test_import_gsbench_is_quick() -> None:
+def test_import_gsbench_is_quick():
     """Catches an import that brings torch, or anything else that takes a second, before a name is asked for."""
     program = (
         "import sys, gsbench\n"
@@ -72,7 +72,7 @@ def test_import_gsbench_is_quick() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_only_public_names_are_there() -> None:
+def test_only_public_names_are_there():
     """Catches a name in `__all__` that nothing defines, and a `__getattr__` that answers to anything."""
     names: dict[str, object] = {}
     exec("from gsbench import *", names)
@@ -80,7 +80,7 @@ def test_only_public_names_are_there() -> None:
     assert not hasattr(gsbench, "rasterise")
 
 
-def test_type_checkers_see_what_runs() -> None:
+def test_type_checkers_see_what_runs():
     """Catches a name that mypy takes from one module and Python from another, or that only one of them knows."""
     tree = ast.parse(Path(gsbench.__file__).read_text())
     guard = next(node for node in tree.body if isinstance(node, ast.If))
@@ -96,7 +96,7 @@ def test_type_checkers_see_what_runs() -> None:
 
 
 @pytest.mark.slow
-def test_mypy_reads_the_types(tmp_path: Path) -> None:
+def test_mypy_reads_the_types(tmp_path):
     """Catches public names that are `Any` to the code of others, and a misspelt one that no checker refuses."""
     user = tmp_path / "user.py"
     user.write_text("import gsbench\n\nreveal_type(gsbench.ssim)\ngsbench.rasterise\n")

@@ -49,16 +49,14 @@ def limited(limit: int, current: int, stat: str = "", folder: str = "") -> dict[
     ],
     ids=["nested", "above", "container", "outside", "elsewhere", "version 1"],
 )  # fmt: skip
-def test_the_group_that_leaves_least_decides(
-    groups: str, mounts: str, files: dict[str, str], left: int, tmp_path: Path
-) -> None:
+def test_the_group_that_leaves_least_decides(groups, mounts, files, left, tmp_path):
     """Catches a limit of a batch job or a container that is not read, and memory of files counted as used."""
     assert memory.left_by_control_groups(tree(tmp_path, groups, mounts, files)) == left
 
 
 @pytest.mark.parametrize("text", ["", "\n", "0", "0::", ":::::\n", "x\0y", "4:memory\n", "9" * 5000, "- - - - - -\n",
                                   "1 2 3 - cgroup2\n", "a - cgroup\n", " - \n"])  # fmt: skip
-def test_files_that_are_something_else_limit_nothing(text: str, tmp_path: Path) -> None:
+def test_files_that_are_something_else_limit_nothing(text, tmp_path):
     """Catches a run that ends because a system writes these files in another way."""
     assert memory.left_by_control_groups(tree(tmp_path, text, V2.format("/") + V1.format("/"), {})) is None
     files = dict.fromkeys(("/max", "/current", "/stat"), text)
@@ -70,7 +68,7 @@ def test_files_that_are_something_else_limit_nothing(text: str, tmp_path: Path) 
     assert memory.left_by_control_groups(tmp_path / "nothing") is None
 
 
-def test_the_group_counts_in_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_group_counts_in_what_is_available(monkeypatch):
     """Catches a limit that is read and not used."""
     monkeypatch.setattr(memory, "left_by_control_groups", lambda: 12345)
     assert memory.available() == 12345

@@ -18,7 +18,7 @@ def ended(code: list[str], **options: object) -> subprocess.CompletedProcess[str
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("unbuffered", [[], ["-u"]])
-def test_a_full_disk_that_takes_no_output_is_told_in_one_line(unbuffered: list[str]) -> None:
+def test_a_full_disk_that_takes_no_output_is_told_in_one_line(unbuffered):
     """Catches a stack trace, or Python's own status 120 after two lines, where stdout goes to a full disk."""
     with FULL.open("w") as full:
         done = ended([*unbuffered, "-c", PRINTS.format(status=0)], stdout=full)
@@ -26,7 +26,7 @@ def test_a_full_disk_that_takes_no_output_is_told_in_one_line(unbuffered: list[s
     assert done.returncode == 2
 
 
-def test_a_reader_that_has_gone_is_not_told() -> None:
+def test_a_reader_that_has_gone_is_not_told():
     """Catches a stack trace of `python -m gsbench.report ... | head`."""
     code = [sys.executable, "-c", f"input(); {PRINTS.format(status=0)}"]
     with subprocess.Popen(
@@ -42,7 +42,7 @@ def test_a_reader_that_has_gone_is_not_told() -> None:
     assert child.returncode == 0
 
 
-def test_the_status_is_that_of_the_command() -> None:
+def test_the_status_is_that_of_the_command():
     """Catches a failed command that ends as a success."""
     assert ended(["-c", PRINTS.format(status=3)], stdout=subprocess.DEVNULL).returncode == 3
     assert ended(["-c", PRINTS.format(status="exit(1)")], stdout=subprocess.DEVNULL).returncode == 1
@@ -51,7 +51,7 @@ def test_the_status_is_that_of_the_command() -> None:
     assert "FileNotFoundError" in done.stderr
 
 
-def test_all_commands_end_so() -> None:
+def test_all_commands_end_so():
     """Catches a new command that ends in a stack trace if its output cannot be written."""
     begin = 'if __name__ == "__main__":\n'
     ends = {path.relative_to(ROOT): path.read_text().partition(begin)[2] for path in (ROOT / "gsbench").rglob("*.py")}

@@ -14,7 +14,7 @@ def slowly(item: int) -> tuple[int, int, bool]:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("workers", [1, 2, 5])
-def test_results_come_in_the_order_of_the_items(workers: int) -> None:
+def test_results_come_in_the_order_of_the_items(workers):
     """Catches results out of order, and workers that compute gradients for a caller without them."""
     torch.set_num_threads(4)
     with torch.no_grad():
@@ -26,7 +26,7 @@ def test_results_come_in_the_order_of_the_items(workers: int) -> None:
     assert all(result[2] for result in side_by_side(slowly, range(2), workers))
 
 
-def test_an_error_in_a_worker_is_the_caller_s() -> None:
+def test_an_error_in_a_worker_is_the_caller_s():
     """Catches a piece of work that fails in silence."""
 
     def fail(item: int) -> int:

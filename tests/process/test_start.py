@@ -6,7 +6,6 @@ Each program runs in a process of its own, and prints a number or what torch and
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -65,21 +64,21 @@ def printed(imports: str, program: str, **variables: str) -> str:
 
 
 @GLIBC
-def test_workers_get_the_memory_they_freed() -> None:
+def test_workers_get_the_memory_they_freed():
     """Catches gradients that are mapped anew in every step: a third of a training at 517,000 Gaussians."""
     faults = float(printed("torch, gsbench", FAULTS.format(before=20, rounds=5)))  # gsbench second, which is harder
     assert faults < 0.01 * ALL_ANEW
 
 
 @GLIBC
-def test_the_environment_has_the_last_word() -> None:
+def test_the_environment_has_the_last_word():
     """Catches settings of malloc that a user has chosen and that an import overrules."""
     faults = printed("gsbench, torch", FAULTS.format(before=1, rounds=2), **dict.fromkeys(start.OPTIONS, "4"))
     assert float(faults) > 0.9 * ALL_ANEW
 
 
 @pytest.mark.skipif(not kernels.available(), reason="the native kernels are not built here")
-def test_idle_threads_sleep() -> None:
+def test_idle_threads_sleep():
     """Catches threads that spin for milliseconds after every kernel, as libgomp's do by default: twice the CPU time."""
     assert float(printed("torch, gsbench", ALTERNATE, OMP_NUM_THREADS="2")) < 1.3
 
@@ -93,9 +92,7 @@ def test_idle_threads_sleep() -> None:
         ("gsbench, torch", "AVX512", "CNR:COMPATIBLE", {"ATEN_CPU_CAPABILITY": "avx512"}),
     ],
 )
-def test_vectors_are_chosen_as_gsbench_is_imported(
-    imports: str, capability: str, code: str, variables: dict[str, str]
-) -> None:
+def test_vectors_are_chosen_as_gsbench_is_imported(imports, capability, code, variables):
     """Catches a setting that comes after torch or MKL has read it, a variable that they do not know, and one that is
     set over the user's."""
     text = printed(imports, VECTORS, MKL_VERBOSE="1", **variables)
@@ -107,9 +104,7 @@ def test_vectors_are_chosen_as_gsbench_is_imported(
     ("flags", "wanted"),
     [("fpu avx2 avx512f avx512bw", "avx2"), ("fpu avx2 fma", None), ("", None)],
 )
-def test_nothing_is_set_without_avx512(
-    flags: str, wanted: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_nothing_is_set_without_avx512(flags, wanted, monkeypatch, tmp_path):
     """Catches AVX2 asked of a processor that may not have it, where torch would end by a signal."""
     info = tmp_path / "cpuinfo"
     if flags:

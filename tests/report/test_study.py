@@ -34,7 +34,7 @@ def hard() -> list[Record]:
     return [make(), odd, lost(make(seed=1), "=out"), *frontier(("3dgs",), ("suzanne",), 2, views=3)]
 
 
-def test_a_study_gives_back_its_records(tmp_path: Path):
+def test_a_study_gives_back_its_records(tmp_path):
     """Catches a number that loses bits, a text that becomes a number, a null, and bytes that differ from day to day."""
     records = hard()
     study.write(records, tmp_path / "a")
@@ -47,7 +47,7 @@ def test_a_study_gives_back_its_records(tmp_path: Path):
     assert not [line for line in (tmp_path / "a/runs.csv").read_text().splitlines() if "\x1b" in line or ",=" in line]
 
 
-def test_a_record_that_no_table_can_hold_is_refused(tmp_path: Path):
+def test_a_record_that_no_table_can_hold_is_refused(tmp_path):
     """Catches a key with a dot, which comes back as two keys, in a study that is already published."""
     with pytest.raises(InputError, match="expected a record that tables can hold"):
         study.write([but(make(), provenance={"config": {"a.b": 1, "a": {"c": 2}}})], tmp_path)
@@ -85,7 +85,7 @@ def packed(name: str, text: bytes) -> Callable[[Path], object]:
         (edited("protocol_background", "protocol"), "run 0"),
     ],
 )
-def test_damaged_tables_are_left_out(harm: Callable[[Path], object], fault: str, tmp_path: Path):
+def test_damaged_tables_are_left_out(harm, fault, tmp_path):
     """Catches a study that was edited by hand, cut off or blown up, and whose numbers are counted or end in a trace."""
     study.write(hard(), tmp_path)
     harm(tmp_path)
@@ -94,7 +94,7 @@ def test_damaged_tables_are_left_out(harm: Callable[[Path], object], fault: str,
     assert "\n" not in first
 
 
-def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_path: Path):
+def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_path):
     """Catches a failed or dirty run among published ones, one that is there twice, and one that is lost."""
     to, folder = tmp_path / "published/mini", tmp_path / "mini"
 
