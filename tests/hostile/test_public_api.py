@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.adam import adam
+from gsbench.models import CameraTime
 from gsbench.raster import RasterOutput, rasterize
 
 NUMBERS = (0, 1, -1, 2, 17, 2**31, 2**63, 10**30, 0.0, 0.5, 1e-30, 1e30, float("nan"), float("inf"), True, False, None,
@@ -40,6 +41,11 @@ def test_any_call_works_or_is_an_input_error(count: int) -> None:
         [sys.executable, __file__, str(count)], capture_output=True, text=True, env=environment, check=False
     )
     assert done.returncode == 0, f"{done.stdout[-600:]}\nexit status {done.returncode}: {done.stderr[-3000:]}"
+
+
+def test_a_time_beyond_64_bits_is_a_number() -> None:
+    """Catches torch's OverflowError for an integer that a float holds."""
+    assert float(CameraTime.at(torch.zeros(3), 10**30).time) == pytest.approx(1e30)
 
 
 def try_cases(count: int) -> None:
