@@ -71,6 +71,20 @@ def test_a_read_only_disk_is_named_by_the_user_s_file(
     assert caught.value.filename == str(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_file_is_created_once(has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches two runs that claim one folder, on a disk with hard links or without, and a temporary file that stays."""
+
+    def refused(*_: object) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", refused)
+    assert [atomic.create_atomically(tmp_path / "a", data) for data in (b"x", b"y")] == [True, False]
+    assert (tmp_path / "a").read_bytes() == b"x"
+    assert os.listdir(tmp_path) == ["a"]
+
+
 def test_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
     """Catches --json /dev/full, which put a file in the place of the machine's device."""
     os.mkfifo(tmp_path / "pipe")
