@@ -74,7 +74,6 @@ def test_a_gated_model_is_gated_again(name: str) -> None:
     whose errors the probe does not look at."""
     _, after = gated(name, 3.0)
     rows, effect_sets = after.count_by_effects(), after.effect_sets
-    assert effect_sets is not None
     assert sum(rows.values()) == len(after) < N
     assert 0 <= effect_sets.refined <= effect_sets.conditioned <= len(after)
     plain, again = copy.deepcopy(after), copy.deepcopy(after)
@@ -117,7 +116,6 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
         return sum(psnr(render(shown, view.camera, view.time, BLACK), view.image) for view in views[:5]) / 5
 
     copied = gate_within(model, sensitivity, 0.3, measure)
-    assert copied is not None
     assert copied.gate.measured_db <= 0.3
     assert copied.gate.measured_db == pytest.approx(measure(model) - measure(copied.model), abs=1e-9)
     assert sum(copied.gate.rows.values()) == N
@@ -126,7 +124,6 @@ def test_the_loss_is_measured_and_not_only_predicted() -> None:
     predicted = choose(sensitivity, model, copied.gate.share).predicted
     assert copied.gate.predicted_db == pytest.approx(10 * math.log10(1 + predicted))
     harmless = gate_within(model, sensitivity, 0.3, lambda _: 30.0)
-    assert harmless is not None
     assert harmless.gate.share == 0.1, "a share of 0.2 is predicted to cost more than twice the allowed 0.3 dB"
     worse = iter([30.0] + [20.0] * 20)
     assert gate_within(model, sensitivity, 0.3, lambda _: next(worse)) is None

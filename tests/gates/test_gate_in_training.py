@@ -95,7 +95,6 @@ def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     training = trainer("effects.gate=both")
     training.run(lambda _: None, "test", lambda: training.step < 61)
     effect_sets = training.model.effect_sets
-    assert effect_sets is not None
     assert effect_sets.conditioned < len(training.model)
     before = {name: value.detach().clone() for name, value in training.model.splats.items()}
     training.run(lambda _: None, "test", lambda: training.step < 70)
@@ -205,9 +204,7 @@ def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     training.hook(Gating).compare(ungated, training.views)
     assert training.hook(Gating).gates[0].eval_loss_db == pytest.approx(before - after, abs=1e-6)
     frozen = without_direction(training.model, training.scene.train)
-    assert frozen is not None
     direction = training.hook(Gating).direction
-    assert direction is not None
     assert direction.loss_db == pytest.approx(after - training.renderer.psnr(frozen, training.views), abs=1e-9)
     assert direction.loss_db != 0
 
@@ -224,10 +221,7 @@ def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: py
     auto = record.read(folder / record.FILE_NAME)
     assert auto.model == "auto"
     assert auto.effects.time
-    assert auto.on_demand is not None
-    assert auto.on_demand.screen is not None
     assert auto.on_demand.screen.decision == "undecided"
-    assert auto.cost is not None
     assert auto.cost.stage_s["screen"] > 0
     loaded = load_run(folder)
     assert loaded.config.model.name == "7dgs"

@@ -37,7 +37,7 @@ def five(name: str = "7dgs", *, agr: bool = True, effect_sets: EffectSets | None
     model.set_active(ActiveComponents(3, agr, True))
     model.effect_sets = effect_sets
     batch = Gaussians3D(means, 0.35 * torch.eye(3).expand(5, 3, 3), torch.full((5,), 0.999), torch.full((5, 3), 0.5))
-    model.slice = lambda _: batch  # type: ignore[method-assign]
+    model.slice = lambda _: batch
     return model
 
 

@@ -71,20 +71,16 @@ def test_agr_rests_unseen() -> None:
     rows, _ = apply(gated, sensitivity, choice)
     again, _ = apply(resting, sensitivity, choice, intervals)
     assert sorted(rows.tolist()) == sorted(again.tolist())
-    assert resting.effect_sets is not None
-    assert resting.effect_sets.intervals is not None
     assert torch.equal(resting.effect_sets.intervals, intervals[again[: resting.effect_sets.refined]])
     assert not (again < 5).any(), "Gaussians that are never seen cost nothing to remove"
     for view in views:
         a, b = (render(shown, view.camera, view.time, BLACK) for shown in (gated, resting))
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
     asleep = share_asleep(resting, views)
-    assert asleep is not None
     assert 0.2 < asleep < 1
     assert share_asleep(gated, views) is None
     other = trained_a_little("7dgs", 1)
     other.load_state(resting.pack())
-    assert other.effect_sets is not None
     assert torch.equal(other.effect_sets.intervals, resting.effect_sets.intervals)
     assert resting.stored_bytes() == gated.stored_bytes() + 8 * resting.effect_sets.refined
     assert len(effect_sets_of(resting).intervals) == resting.effect_sets.refined

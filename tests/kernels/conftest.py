@@ -82,8 +82,6 @@ def shim() -> ModuleType:
             done = subprocess.run(command, capture_output=True, text=True, env=plain)
             assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -86,7 +86,7 @@ def test_what_cannot_be_repeated_says_so(work: object) -> None:
     """Catches a number that Python code read, a shape that depends on values, and a draw without its generator."""
     x = torch.ones(())
     with Recording() as recording:
-        work(x)  # type: ignore[operator]
+        work(x)
     assert not recording.is_repeatable
 
 

@@ -34,7 +34,6 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
     elif variant not in ("dgs", "dbs"):
         model.splats["times"].data[:4, 0] = torch.tensor([-9.0, -9.0, 10.0, 10.0])  # visible never
     intervals = model.visible_intervals()
-    assert intervals is not None
     assert variant in ("dgs", "dbs", "ndgs") or "," in variant or intervals[:4].isinf().all()
     first, last = intervals.unbind(1)
     hidden, times = 0, torch.linspace(0, 1, 41, dtype=torch.float64)
@@ -61,7 +60,7 @@ def test_lifetimes_are_held(name: str) -> None:
     raw = {key: value.data for key, value in model.splats.items()}
     bounded = getattr(model, "bounded_times", False) or name == "dgs"
     raw["times"].fill_(0.0 if bounded else 0.5)  # the sigmoid of 0 is 0.5
-    parameter, column, tiny = IN_TIME.get(name) or ("log_diagonal", model.rows["t"][0], -20.0)  # type: ignore[index]
+    parameter, column, tiny = IN_TIME.get(name) or ("log_diagonal", model.rows["t"][0], -20.0)
     raw[parameter][::2, column] = tiny
     before = {key: value.clone() for key, value in raw.items()}
 
@@ -103,14 +102,13 @@ def test_rows_are_sorted_by_when_they_can_be_visible() -> None:
         model.splats["log_diagonal"][:50, 3] = 3.0  # visible always
         model.splats["opacities"][-20:] = -9.0  # visible never
     before = model.splats["means"].detach().clone()
-    model.effect_sets = object()  # type: ignore[assignment]
+    model.effect_sets = object()
     Rows(model, moments).sort_by_time()
     assert not len(moments.rows)
     model.effect_sets = None
     Rows(model, moments).sort_by_time()
     assert torch.equal(model.splats["means"], before[moments.rows])
     intervals = model.visible_intervals()
-    assert intervals is not None
     bins = (intervals[:, 0] * START_BINS).floor()
     assert torch.equal(bins, bins.sort().values)
     for start in bins.unique():

@@ -65,7 +65,7 @@ class Hidden:
     """Mixed into a model: its slices show nothing."""
 
     def condition(self, raw: Any, query: Any) -> Any:
-        sliced = super().condition(raw, query)  # type: ignore[misc]
+        sliced = super().condition(raw, query)
         return sliced._replace(opacity_factor=0 * sliced.opacity_factor)
 
 

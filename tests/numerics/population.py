@@ -214,7 +214,6 @@ def all_seen(order: str, scheme: str, backend: str) -> CholeskyModel:
     """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
     model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
                   backend=BACKENDS[backend])  # fmt: skip
-    assert isinstance(model, CholeskyModel)
     for name in ("direction", "time"):
         model.log_lambda[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))

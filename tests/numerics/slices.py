@@ -632,7 +632,7 @@ def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
     scheme = str(getattr(model, "scheme", "square_root"))
     if scheme == "square_root":
         return torch.zeros(len(raw["means"]), dtype=torch.bool)
-    cov = subtract(model.factors(raw), scheme)[1].double()  # type: ignore[operator]
+    cov = subtract(model.factors(raw), scheme)[1].double()
     finite = cov.isfinite().all((1, 2))
     least = torch.linalg.eigvalsh(torch.where(finite[:, None, None], cov, 0.0))[:, 0]
     return ~finite | (least < 0)

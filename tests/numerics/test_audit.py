@@ -152,7 +152,7 @@ def test_a_shaken_start_is_64_roundings_away() -> None:
     """Catches start values that stay, that move by more than what ten steps round, or that two seeds move alike."""
     models = [torch.nn.ParameterList([torch.linspace(-3, 3, 50).double()]) for _ in range(3)]
     for model, seed in zip(models[1:], (1, 2), strict=True):
-        trainings.shake(model, seed)  # type: ignore[arg-type]
+        trainings.shake(model, seed)
     start, first, second = (next(iter(model)).detach() for model in models)
     assert 2.0**-19 < ((first - start) / start).abs().max() <= 2.0**-18
     assert not torch.equal(first, second)

@@ -81,7 +81,6 @@ def all_images_equal(g: Generator, severity: float, model: str) -> Training:
 def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:
     """Put half of the Gaussians outside all views: their gradients are 0, and Adam divides them by sqrt(0) + eps."""
     scene = moving_square()
-    assert scene.points is not None
     means = scene.points.means.clone()
     means[::2, 1] += 100 * severity
     return Training(model, compose(model, STEPS), replace(scene, points=Points(means, scene.points.colors)))
@@ -209,7 +208,6 @@ def fit(training: Training, backend: str, shaken_by: int | None = None) -> Train
     config, scene = training.config, training.scene
     config.raster.backend, config.train.curve_points, config.device = backend, 1, device_of(backend)
     model = build(config)
-    assert scene.points is not None
     model.initialise(scene.points, scene.extent, generator(config.seed))
     model.to(config.device, scene.train[0].image.dtype)
     if shaken_by is not None:

@@ -62,7 +62,6 @@ def test_picture_in_single_precision(name: str) -> None:
     output.info.means2d.retain_grad()
     (output.image.square().sum() + output.alpha.sum()).backward()
     for tensor in (*(arguments[k] for k in DIFFERENTIABLE if k in arguments), output.info.means2d):
-        assert tensor.grad is not None
         assert tensor.grad.isfinite().all()
     hidden = output.info.radii.amax(0) == 0
     assert not arguments["means"].grad[hidden].any()

@@ -157,16 +157,20 @@ def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name: str, mo
     assert any(negative[10:])
 
 
-def model_of(name: str, log_diagonal: Sequence[float] | None = None, motion: float = 0.0) -> GaussianModel:
-    model, points = setup.build(compose(name, 100)), moving_square().points
-    assert points is not None
-    model.initialise(points, 4.4, generator(0))
-    if log_diagonal:
-        model.splats["log_diagonal"].data[:] = torch.tensor(log_diagonal)
-        for kind in KINDS:
-            model.splats[kind].data.zero_()
-        for kind, size in (("motion", motion), ("coupling", motion / 1e3)):
-            model.splats[kind].data.normal_(0, size, generator=generator(0))
+def small_model(name: str = "7dgs", backend: str = "cpu") -> GaussianModel:
+    """A model at its start in the scene of the moving square."""
+    model, square = setup.build(compose(name, 100, f"raster.backend={backend}")), moving_square()
+    model.initialise(square.points, square.extent, generator(0))
+    return model
+
+
+def with_factors(log_diagonal: Sequence[float], motion: float = 0.0) -> GaussianModel:
+    """A model in float64 whose factors have this diagonal, and correlations of about this size."""
+    model = small_model()
+    model.splats["log_diagonal"].data[:] = torch.tensor(log_diagonal)
+    sizes = {"motion": motion, "coupling": motion / 1e3}
+    for kind in KINDS:
+        model.splats[kind].data.normal_(0, sizes.get(kind, 0.0), generator=generator(0))
     return model.double()
 
 
@@ -175,17 +179,15 @@ def test_condition_numbers() -> None:
 
     Also a share of indefinite covariances by the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3.
     """
-    plain = float32_error.conditioning(model_of("7dgs", [0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0]))
-    assert plain is not None
+    plain = float32_error.conditioning(with_factors([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0]))
     for numbers, decades in zip(plain.condition_numbers.values(), (6, 2), strict=True):
         assert numbers == pytest.approx([math.exp(decades)] * len(float32_error.PERCENTILES))
     assert set(plain.indefinite.values()) == {0.0}
     assert max(plain.error.values()) < 1e-5
-    hard = float32_error.conditioning(model_of("7dgs", [0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5], motion=1e3))
-    assert hard is not None
+    hard = float32_error.conditioning(with_factors([0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5], motion=1e3))
     assert min(hard.indefinite.values()) > 0.5
     assert min(hard.error.values()) > 1
-    assert float32_error.conditioning(model_of("3dgs")) is None
+    assert float32_error.conditioning(small_model("3dgs").double()) is None
 
 
 # ---- the metric of a record
@@ -195,36 +197,27 @@ def psnr_float32(model: GaussianModel, views: Sequence[View]) -> tuple[float | N
     return float32_error.psnr_float32(model, views, torch.zeros(3), False)
 
 
-def small_model(backend: str) -> tuple[GaussianModel, list[View]]:
-    config, square = compose("7dgs", 100, f"raster.backend={backend}"), moving_square()
-    model = setup.build(config)
-    assert square.points is not None
-    model.initialise(square.points, square.extent, generator(config.seed))
-    return model, square.train[:8]
+VIEWS = moving_square().train[:8]
 
 
 def test_it_is_the_largest_change_of_three_spaced_views() -> None:
     """Catches a mean or a sum instead of the largest change, other views, and a bound instead of a change."""
-    model, views = small_model("cpu")
-    change, why = psnr_float32(model, views)
+    model = small_model()
+    change, why = psnr_float32(model, VIEWS)
     assert not why
-    shots = [float32_error.Shot.of(views[i]) for i in (0, 2, 5)]
+    shots = [float32_error.Shot.of(VIEWS[i]) for i in (0, 2, 5)]
     assert len(shots) == float32_error.VIEWS
     known = float32_error.measure(model, shots, BLACK, "").views
     assert change == max(abs(view.psnr_change or 0.0) for view in known) > 0
 
 
-def test_a_run_without_the_cpu_kernels_has_a_reason() -> None:
-    """Catches a backend whose images are compared with those of another one."""
-    change, why = psnr_float32(*small_model("reference"))
-    assert change is None
-    assert "needs raster.backend=cpu" in why
-
-
 @pytest.mark.parametrize("kind", [RuntimeError, TypeError])
 def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an error of a user's model in float64 that ends a trained run."""
-    model, views = small_model("cpu")
+    """Catches an error of a user's model in float64 that ends a trained run, and a backend whose images are compared
+    with those of another one."""
+    assert psnr_float32(small_model(backend="reference"), VIEWS)[0] is None
+    assert "needs raster.backend=cpu" in psnr_float32(small_model(backend="reference"), VIEWS)[1]
+    model = small_model()
     right = type(model).slice
 
     def single(self: Any, query: CameraTime) -> Any:
@@ -233,16 +226,15 @@ def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatc
         return right(self, query)
 
     monkeypatch.setattr(type(model), "slice", single)
-    change, why = psnr_float32(model, views)
-    assert change is None
-    assert why == "the model has no image in float64: expected scalar type Float but found Double"
+    reason = "the model has no image in float64: expected scalar type Float but found Double"
+    assert psnr_float32(model, VIEWS) == (None, reason)
 
 
 def test_equal_images_have_no_change() -> None:
     """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped."""
-    model, views = small_model("cpu")
+    model = small_model()
     double = float32_error.float64_model(model)
     rendered = [float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).image
-                for view in views]  # fmt: skip
-    equal = [replace(view, pixels=image) for view, image in zip(views, rendered, strict=True)]
+                for view in VIEWS]  # fmt: skip
+    equal = [replace(view, pixels=image) for view, image in zip(VIEWS, rendered, strict=True)]
     assert psnr_float32(model, equal) == (0.0, "")
