@@ -194,6 +194,11 @@ def names_of(runs: pd.DataFrame) -> pd.Series:
     return (runs.model + " " + runs.variant).str.rstrip()
 
 
+def title_of(runs: pd.DataFrame) -> str:
+    """Return what the runs of one experiment on one data set are called."""
+    return f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])[:60]}"
+
+
 def covered(runs: pd.DataFrame, by: str = "label") -> list[str]:
     """Return the scenes that every model of finished `runs` has finished: averages are over these."""
     ok = runs[runs.status == "ok"]

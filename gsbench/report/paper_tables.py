@@ -153,11 +153,11 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
     return table.join(of_paper.add_suffix(" paper")).join(difference.add_suffix(" difference"))
 
 
-def _once(runs: pd.DataFrame) -> pd.DataFrame:
+def _once(runs: pd.DataFrame, by: Sequence[str] = RECIPE) -> pd.DataFrame:
     """Return one finished run for each seed of a row: the one that also has the best PSNR on test, if there is one."""
     ok = runs[runs.status == "ok"]
     ok = ok.loc[ok.psnr_best_on_test_db.notna().sort_values(kind="stable").index]
-    return ok.drop_duplicates(["scene", *RECIPE, "seed"], keep="last")
+    return ok.drop_duplicates(["scene", *by, "seed"], keep="last")
 
 
 def table2(runs: pd.DataFrame) -> pd.DataFrame:
@@ -206,8 +206,7 @@ def successors(results: Results) -> pd.DataFrame:
         recipe=[without(variant, *IN_THE_PROTOCOL) for variant in runs.variant],
     )  # fmt: skip
     by = ["order", "model", "recipe", "experiment", "protocol"]
-    runs = runs.loc[runs.psnr_best_on_test_db.notna().sort_values(kind="stable").index]
-    runs = of_one_machine(runs.drop_duplicates(["scene", *by, "seed"], keep="last")) if len(runs) else runs
+    runs = of_one_machine(_once(runs, by)) if len(runs) else runs
     rows: list[dict[str, Any]] = []
     for dataset, scenes in SUCCESSOR_SCENES.items():
         means = [[scene for scene in scenes if scene != "lego"]] if "lego" in scenes else []

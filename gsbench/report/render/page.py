@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from gsbench.errors import printable
 from gsbench.measure.atomic import write_atomically
-from gsbench.report.frame import Results
+from gsbench.report.frame import Results, title_of
 from gsbench.report.render import charts, text
 from gsbench.report.render.palette import MARKERS, THEMES, styles
 from gsbench.report.section import Figure, Section
@@ -98,11 +98,10 @@ def _article(key: str, chapter: Results) -> Article:
     runs = chapter.runs
     counts = {"run": len(runs)} | {name: runs[name].nunique() for name in ("model", "scene", "seed")}
     words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
-    title = f"experiment {runs.experiment.iloc[0]}, data {printable(runs.dataset.iloc[0])[:60]}"
     summary = " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]])
     mean = runs.groupby("model").psnr_db.mean()
     best = "" if mean.isna().all() else str(mean.idxmax())
-    return Article(key, title, summary, built(chapter), sorted(runs.series.unique()), best)
+    return Article(key, title_of(runs), summary, built(chapter), sorted(runs.series.unique()), best)
 
 
 def table(of: Section) -> dict[str, Any]:

@@ -6,8 +6,8 @@ import pandas as pd
 
 from gsbench.errors import printable
 from gsbench.report import paper, stats
-from gsbench.report.frame import Results, covered
-from gsbench.report.section import COLUMNS, Column, Section, number, section, text
+from gsbench.report.frame import Results, covered, title_of
+from gsbench.report.section import COLUMNS, Column, Section, number, section
 
 SHOWN = ("psnr_db", "psnr_moving_db", "psnr_object_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians",
          "lpips_vgg", "psnr_best_on_test_db")  # fmt: skip
@@ -46,8 +46,7 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
     shown = [c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows]
     order = ["scene", "label", *shown, "seeds"]
     rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
-    title = f"experiment {runs.experiment.iloc[0]}, data {text(runs.dataset.iloc[0])[:60]}"
-    return Section("experiment", f"Results: {title}", TEXT, rows, notes=tuple(_notes(chapter)))
+    return Section("experiment", f"Results: {title_of(runs)}", TEXT, rows, notes=tuple(_notes(chapter)))
 
 
 def _means(runs: pd.DataFrame, names: list[str]) -> pd.DataFrame:
