@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from gsbench.report import paper, stats
+from gsbench.report import paper, paper_tables, stats
 from gsbench.report.frame import Results, load, names_of
 from gsbench.report.intervals import Values, estimate
 from gsbench.report.render.text import bold
@@ -31,7 +31,7 @@ CHANGES = {"time, given direction": ("7dgs_noagr", "6dgs"), "direction": ("6dgs"
 CHOICES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS", "auto": "`model=auto`",
            "auto compare=true": "`model=auto effects.compare=true`"}  # fmt: skip
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
-ON_GPU = f"device=cuda,{AT_PAPER}"
+LAMBDA_T = "lambda_t=0.05"  # trained before lambda_t started at 0.5 on D-NeRF
 PARTS = (0.3, 0.5, 0.7, 1.0)  # of the training after which the best model on val is chosen
 ABLATIONS = {
     "none": "nothing", "no_agr": "no AGR", "time_only": "no direction: 4DGS with AGR",
@@ -257,14 +257,20 @@ def lengths(published: Path) -> str:
 # ---- D-NeRF and recipes
 
 
-def trex(published: Path) -> str:
-    """Return README's table of trex at the paper's resolution, batch size and iterations."""
-    of = means(only(published, "dnerf"), "psnr_db", "psnr_best_on_test_db")
-    of = of.loc[[("7dgs", ON_GPU), ("7dgs_noagr", ON_GPU), ("4dgs", AT_PAPER)]].droplevel("variant")
-    table = of[["seeds", "psnr_db", "psnr_db ±", "psnr_best_on_test_db", "psnr_best_on_test_db ±"]]
-    table = table.assign(paper=[paper.average("D-NeRF", ["trex"], model).psnr_db for model in of.index])
-    return block(table, psnr_db=Column("last iteration, dB"), psnr_best_on_test_db=Column("best on test, dB"),
-                 paper=Column("paper (best on test), dB"))  # fmt: skip
+# By the end of their titles. Of the paper there is only the best on test.
+LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
+
+
+def dnerf(published: Path, quantities: dict[str, str]) -> str:
+    """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
+    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
+    rows = rows[(rows.table == "paper") & (rows.recipe == "")].set_index("scene")
+    parts = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
+             for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
+    table = pd.DataFrame(parts).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
+    mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
+    table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
+    return block(table, **{name: Column(name) for name in table})
 
 
 def _minutes(of: pd.Series, device: str) -> pd.Series:
@@ -274,19 +280,24 @@ def _minutes(of: pd.Series, device: str) -> pd.Series:
 
 
 def trex400(published: Path) -> str:
-    """Return trex as the paper trains it, beside the paper's rows, and with other recipes."""
-    of = means(load(published / "dnerf").finished, *QUANTITIES)  # a chapter has times of one machine
+    """Return trex as the paper trains it, with both initial lambda_t, beside the paper's rows; and other recipes."""
+    results = load(published / "dnerf").finished  # a chapter has times of one machine
+    of = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
     rows: dict[str, pd.Series] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
-        for variant, place, device in ((ON_GPU, "H200", "GPU"), (AT_PAPER, "CPU", "CPU")):
-            if (model, variant) in of.index:
-                rows[f"{model}, {place}"] = _minutes(of.loc[(model, variant)], device)
+        for words, device in {"device=cuda,": "GPU", "": "CPU"}.items():
+            for start in ("", f"{LAMBDA_T},"):
+                if (model, variant := f"{words}{start}{AT_PAPER}") in of.index:
+                    title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
+                    rows[title] = _minutes(of.loc[(model, variant)], device)
         names = {"psnr_db": "psnr_best_on_test_db", "train_min": "GPU min"}
         rows[f"{model}, paper"] = paper.average("D-NeRF", ["trex"], model).rename(names)
     others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
-              *((model, "quick", "") for model in ("7dgs", "4dgs", "7dgs_noagr"))]  # fmt: skip
+              ("7dgs", "quick", f",{LAMBDA_T}"), ("4dgs", "quick", ""),
+              ("7dgs_noagr", "quick", f",{LAMBDA_T}")]  # fmt: skip
     for model, name, more in others:
-        rows[f"{model}, `+recipe={name}`, CPU"] = _minutes(of.loc[(model, f"recipe={name}{more}")], "CPU")
+        start = "λ_t from 0.05, " if LAMBDA_T in more else ""
+        rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(of.loc[(model, f"recipe={name}{more}")], "CPU")
     table = pd.DataFrame(rows).T.rename_axis("trex, 400 x 400").astype(float)
     intervals = ["psnr_db ±", "psnr_best_on_test_db ±"]
     return block(table[["seeds", *OF_TREX, *intervals]], **OF_TREX)
@@ -323,8 +334,11 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 README: dict[str, Callable[[Path], str]] = {
     "cost": lambda published: cost(published, models=[model for model in MODELS if model != "6dgs"]),
     "worth": lambda published: suite_kinds(published, list(CHANGES)[:4]),
-    "trex": trex,
+    "dnerf": lambda published: dnerf(published, BEST | OF_PAPER),
 }
 _OF_RESULTS = (table1, frontier, effects, suite_scenes, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
                trex400, on_demand)  # fmt: skip
-RESULTS: dict[str, Callable[[Path], str]] = {write.__name__: write for write in _OF_RESULTS}
+RESULTS: dict[str, Callable[[Path], str]] = {
+    "dnerf": lambda published: dnerf(published, LAST | BEST | OF_PAPER),
+    **{write.__name__: write for write in _OF_RESULTS},
+}

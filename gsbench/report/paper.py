@@ -4,13 +4,16 @@ Source: Gao et al., "7DGS: Unified Spatial-Temporal-Angular Gaussian Splatting",
 are NaN. The paper's averages over a data set have the scene name "avg".
 """
 
+import re
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 from importlib import resources
 from typing import Any
 
 import pandas as pd
 
+from gsbench.errors import printable
 from gsbench.measure.record import Record
 from gsbench.report.frame import iterations, value_at
 
@@ -115,6 +118,16 @@ def has_images_of_paper(record: Record) -> bool:
     if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
         return False
     return all(of_run == of_paper for of_run, of_paper in _settings_of_images(record, protocol).values())
+
+
+def relative_size(record: Record) -> str:
+    """Return the width of a run's images divided by the paper's, such as "1/2"; if there is none, their size."""
+    protocol = PROTOCOLS.get(str(record.protocol.get("paper_dataset")))
+    size = str(record.protocol.get("resolution", "a size not recorded"))
+    width = re.fullmatch(r"([0-9]{1,6})x[0-9]{1,6}", size)
+    if protocol is None or width is None:
+        return printable(size)
+    return str(Fraction(int(width[1]), int(protocol.size(record.scene).partition("x")[0])))
 
 
 def _settings_of_images(record: Record, protocol: Protocol) -> dict[str, tuple[Any, Any]]:

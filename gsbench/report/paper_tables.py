@@ -28,7 +28,7 @@ TABLE_2 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex"]
 TABLE_SUCCESSORS = ["psnr_db", "psnr_best_on_test_db", "gaussians"]
 RECIPE = ["order", "model", "experiment", "recipe"]  # what the runs of a row of Table 1 and 2 have in common
 # Settings of a variant that belong to no recipe: they change what is measured, or a heading or a protocol names them.
-MEASURING = ("iterations", "downscale", "eval_split", "best_on_test", "curve_points")
+MEASURING = ("iterations", "downscale", "eval_split", "best_on_test", "curve_points", "device")
 IN_THE_PROTOCOL = (*MEASURING, "protocol", "resize", "batch_size")
 NAMES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS"}  # in the paper's tables
 FILES = [f"{name}.{end}" for name in ("table1", "table2", "table_successors") for end in ("md", "csv")]
@@ -59,8 +59,9 @@ SOURCES_2 = {
     "table 1": "the average of the 7DGS paper's Table 1 (its Table 2 lacks this data set), best on test",
 }
 TEXT_SUCCESSORS = (
-    "Published rows beside measured rows, which may follow any protocol and name it: name, downscale, iterations x "
-    "batch. Measured rows have lego on val. ± is half the width of the 95 % interval over seeds."
+    "Published rows beside measured rows, which may follow any protocol and name it: name, width of the images beside "
+    "that of 7DGS' paper, iterations x batch. Measured rows have lego on val. ± is half the width of the 95 % interval "
+    "over seeds."
 )
 SOURCES = {
     "dgs": "the authors of dGS (under review, 2026): black background, half resolution (D-NeRF: 400x400), lego on val. "
@@ -75,13 +76,13 @@ def of_the_paper(results: Results) -> pd.DataFrame:
     """Return the runs on data of the 7DGS paper or on stand-ins for them, with their recipe and how they depart.
 
     `departs` names the settings in which a run differs from the paper's protocol; "" if there are none. `pool` names
-    runs with one protocol, which may share a table: (data of the paper, data, experiment, downscaling, filter,
-    iterations).
+    runs with one protocol, which may share a table: (data of the paper, data, experiment, size of the images beside the
+    paper's, filter, iterations).
     """
     runs = results.runs[results.runs.model.isin(MODELS)]
     named = [str(record.protocol.get("paper_dataset")) for record in runs.record]
     runs = runs[pd.Series(named, runs.index, dtype=object).isin(list(paper.PROTOCOLS))]
-    pools = [(str(r.protocol["paper_dataset"]), r.dataset, r.experiment, str(r.protocol.get("downscale")),
+    pools = [(str(r.protocol["paper_dataset"]), r.dataset, r.experiment, paper.relative_size(r),
               str(r.protocol.get("resize")), int(iterations(r)) if iterations(r) > 0 else 0)
              for r in runs.record]  # fmt: skip
     recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
@@ -251,7 +252,7 @@ def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict
 
 
 def _protocol(record: Record) -> str:
-    """Return the protocol of a run as a text such as "gsbench, 2, 30,000 x 4".
+    """Return the protocol of a run as a text such as "gsbench, 1/2, 30,000 x 4".
 
     Parts that the name of a protocol does not imply are added: another filter, rounding or background.
     """
@@ -261,7 +262,8 @@ def _protocol(record: Record) -> str:
     name = of.get("name", "protocol not recorded")
     implied = {"resize": "pillow" if name == "dgs2026" else None, "quantise": name == "dgs2026", "background": "black"}
     more = [f"{key} {of.get(key)}" for key, value in implied.items() if of.get(key) != value]
-    return printable(", ".join([f"{name}, {of.get('downscale')}, {steps if steps > 0 else 0:,.0f} x {batch}", *more]))
+    length = f"{steps if steps > 0 else 0:,.0f} x {batch}"
+    return printable(", ".join([name, paper.relative_size(record), length, *more]))
 
 
 def sections(results: Results) -> dict[str, list[Section]]:
