@@ -200,24 +200,27 @@ def test_the_mean_without_lego_is_beside_the_rows_that_lack_lego():
 
 
 def test_a_row_of_a_successor_has_one_protocol_and_names_it():
-    """Would catch runs of two protocols averaged as seeds, one without its protocol, and a trial on val as a result."""
+    """Would catch runs of two protocols averaged as seeds, one without its protocol, and a trial on val as a result; and images of one
+    size kept apart, because one data set has them at twice that size.
+    """
     rows = successors(results(
         at_paper("dgs", seed=0, psnr=30.0),
+        at_paper("dgs", seed=6, psnr=30.0, downscale=1, variant="device=cuda,downscale=1"),
         at_paper("dgs", seed=1, psnr=31.0, **BY_DGS),
         at_paper("dgs", seed=2, psnr=32.0, quantise=True),
         at_paper("dgs", seed=3, psnr=33.0, batch_size=1, variant="recipe=mcmc,batch_size=1"),
-        at_paper("dgs", seed=4, psnr=34.0, downscale=8, iterations=500),
+        at_paper("dgs", seed=4, psnr=34.0, downscale=8, resolution="100x100", iterations=500),
         at_paper("dgs", seed=5, psnr=35.0, eval_split="val"),
         at_paper("3dgs", psnr=20.0),
         at_paper("dgs", psnr=21.0, dataset="mini"),
     ))  # fmt: skip
     measured = rows[rows.row == "measured"].sort_values("psnr_db")
     assert measured[["recipe", "protocol", "seeds", "psnr_db"]].values.tolist() == [
-        ["", "gsbench, 2, 30,000 x 4", 1, 30.0],
-        ["", "dgs2026, 2, 30,000 x 4", 1, 31.0],
-        ["", "gsbench, 2, 30,000 x 4, quantise True", 1, 32.0],
-        ["recipe=mcmc", "gsbench, 2, 30,000 x 1", 1, 33.0],
-        ["", "gsbench, 8, 500 x 4", 1, 34.0],
+        ["", "gsbench, 1, 30,000 x 4", 2, 30.0],
+        ["", "dgs2026, 1, 30,000 x 4", 1, 31.0],
+        ["", "gsbench, 1, 30,000 x 4, quantise True", 1, 32.0],
+        ["recipe=mcmc", "gsbench, 1, 30,000 x 1", 1, 33.0],
+        ["", "gsbench, 1/4, 500 x 4", 1, 34.0],
     ]
 
 
