@@ -200,8 +200,9 @@ def test_the_mean_without_lego_is_beside_the_rows_that_lack_lego():
 
 
 def test_a_row_of_a_successor_has_one_protocol_and_names_it():
-    """Would catch runs of two protocols averaged as seeds, one without its protocol, and a trial on val as a result; and images of one
-    size kept apart, because one data set has them at twice that size.
+    """Would catch runs of two protocols averaged as seeds, one without its protocol, and a trial on val as a result.
+
+    Also images of one size kept apart, because one folder has them at twice that size.
     """
     rows = successors(results(
         at_paper("dgs", seed=0, psnr=30.0),
