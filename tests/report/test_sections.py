@@ -26,7 +26,7 @@ from gsbench.measure.record import LengthChoice
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import sections as of_report
 from gsbench.report import stats
-from gsbench.report.sections.budgets import contests, is_beside_others, points
+from gsbench.report.sections.budgets import basis, contests, is_beside_others, points
 from gsbench.report.sections.curves import events, mean_curves, profiles, round_numbers, targets
 from gsbench.report.sections.experiment import table
 from gsbench.report.sections.lengths import by_length
@@ -129,6 +129,14 @@ def test_an_effect_is_priced_from_published_models():
 
 
 # ---- budgets and the frontier
+
+
+def test_a_point_is_the_mean_of_its_scenes():
+    """Catches a configuration that has not finished a scene and is averaged over fewer."""
+    of = chapter(*runs_of("a", "", 20.0, 10.0), *runs_of("a", "", 30.0, 30.0, scene="x"), *runs_of("b", "", 20.0, 10.0))
+    (point,) = points(of, ["suzanne", "x"]).to_dict("records")
+    assert (point["series"], point["psnr_db"], point["train_s"]) == ("a", 25.0, 20.0)
+    assert basis(of) == ["suzanne"]
 
 
 def test_of_two_equals_neither_is_dominated_and_one_is_on_the_frontier():
