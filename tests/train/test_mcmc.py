@@ -11,7 +11,7 @@ from models.small import CAMERA, moved, started
 from gsbench.config import DensifyConfig
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.train.batches import generator
-from gsbench.train.density.mcmc import MCMCDensification, relocated
+from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
 
 OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
@@ -52,6 +52,13 @@ def test_many_copies_do_not_cancel(o: float) -> None:
     total = sum(Fraction(math.comb(i - 1, k)) * (-1) ** k * exact ** (k + 1) / Fraction(math.sqrt(k + 1))
                 for i in range(1, 52) for k in range(i))  # fmt: skip
     assert c == pytest.approx(o / float(total), rel=1e-9)
+
+
+def test_rows_are_drawn_in_proportion() -> None:
+    """Catches rows of weight zero that are drawn, and weights that are not proportions."""
+    counts = drawn(torch.tensor([0.0, 1.0, 0.0, 3.0, 0.0]), 4000, generator(0)).bincount(minlength=5)
+    assert counts[[0, 2, 4]].sum() == 0
+    assert 0.72 < counts[3] / 4000 < 0.78
 
 
 @pytest.mark.parametrize("name", OPTIONS)
