@@ -27,7 +27,7 @@ def rows(text: str) -> dict[str, list[str]]:
 
 def shown(colours: str, name: str, *counts: int) -> ShownImage:
     """An image of a model with so many Gaussians of each effect set."""
-    renderer: Any = SimpleNamespace(name=name, counts=dict(zip(NAMES, counts or (1, 0, 0, 0, 0), strict=True)))
+    renderer: Any = SimpleNamespace(name=name, counts=dict(zip(NAMES, counts or (1, 0, 0), strict=True)))
     return ShownImage(renderer, colours)
 
 
@@ -53,7 +53,7 @@ def test_the_table_splits_a_frame_by_stage() -> None:
 def test_the_legend_explains_the_colours_that_there_are() -> None:
     """Catches a count beside the name of another effect set or colour, effect sets that nothing shown has, a scale that
     is not the one the image was drawn on, and a legend of colours that need none."""
-    text = legend([shown(CLASS, "7dgs", 1200, 5, 0, 0, 30), shown(CLASS, "4dgs", 0, 700, 0, 0, 0)], 250.0, {})
+    text = legend([shown(CLASS, "7dgs", 1200, 5, 30), shown(CLASS, "4dgs", 0, 700, 0)], 250.0, {})
     table = rows(text)
     assert list(table) == ["Gaussians", EFFECT_SETS["refined"], EFFECT_SETS["conditioned"], EFFECT_SETS["static"]]
     assert list(table.values()) == [["7dgs", "4dgs"], ["1,200", "0"], ["5", "700"], ["30", "0"]]
