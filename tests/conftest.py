@@ -15,6 +15,7 @@ LONGEST = (
     "test_adding_a_model.py",
     "test_command_line.py",
     "test_checkpoint.py",
+    "test_selection.py",
     "test_install.py",
     "test_start.py",
     "test_end_to_end.py",

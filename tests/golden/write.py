@@ -38,7 +38,8 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "4dgs": ("+exp=mini", "scene=suzanne", "scene.downscale=5", "model=4dgs", *SHORT,
              "train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1",
              "train.coarse=[[2,20]]", "train.cooldown_from=50",
-             "raster.antialias=true", "optim=sparse_adam", "train.patience=0.5", "seed=3"),
+             "raster.antialias=true", "optim=sparse_adam", "seed=3"),
+    "patience": ("model=4dgs", *SHORT, "train.patience=0.5"),  # ends with its best iteration
     "7dgs": ("model=7dgs", "data.initial_lambda_t=0.05", "train.iterations=800", "train.densify.stop=17000",
              "train.densify.every=50", "train.densify.max_gaussians=2000", "data.initial_points=100",
              "train.average_from=25000", "effects.gate=both", "train.checkpoint_minutes=0.003"),
