@@ -19,6 +19,10 @@ class CameraTime(NamedTuple):
 
     `CameraTime.of` takes a camera, and `CameraTime.at` a position; both check their arguments.
 
+    Args:
+        center: position of the camera, world units, a tensor [3].
+        time: in [0, 1], a tensor []; None if the scene has no time.
+
     Example:
         >>> import torch
         >>> from gsbench import CameraTime
@@ -30,8 +34,8 @@ class CameraTime(NamedTuple):
         gsbench.errors.InputError: query: center: expected shape [3], got [2]
     """
 
-    center: Tensor  # [3] position of the camera, world units
-    time: Tensor | None = None  # [] in [0, 1]; None: the scene has no time
+    center: Tensor  # [3]
+    time: Tensor | None = None  # []
 
     @classmethod
     def of(cls, camera: Camera, time: float | Tensor | None) -> CameraTime:
