@@ -21,8 +21,8 @@ def unpack(archive: Path, folder: Path) -> None:
     """Unpack a zip archive into a new folder, which appears only after everything is unpacked.
 
     Raises:
-        InputError: the file is not a zip archive or is damaged, a member leads out of the folder, or the disk has too
-            little space.
+        InputError: the file is not a zip archive or is damaged, a member leads out of the folder, it has more than
+            MOST_FILES files, or the disk has too little space.
     """
     part = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
     try:

@@ -50,8 +50,8 @@ def follow_time(
 
     def share(rows: NDArray[np.int64]) -> float:
         """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera."""
-        turned = np.concatenate([slow, known], 1)[rows]
-        energies = np.einsum("vk,vk->k", turned, gram @ turned)
+        permuted = np.concatenate([slow, known], 1)[rows]
+        energies = np.einsum("vk,vk->k", permuted, gram @ permuted)
         left = total - energies[slow.shape[1] :].sum()
         return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0
 

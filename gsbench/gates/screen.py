@@ -20,7 +20,7 @@ from gsbench.errors import InputError
 from gsbench.gates.fixed_camera_test import compare_images
 from gsbench.gates.permutation_test import Array, follow_time
 from gsbench.gates.shared_viewpoints import Viewpoints, group_by_viewpoint
-from gsbench.gates.static_fit_residuals import camera_basis, residual_products, smaller
+from gsbench.gates.static_fit_residuals import camera_basis, gradient_products, smaller
 from gsbench.measure.record import TimeScreen
 from gsbench.scenes import Scene
 
@@ -99,13 +99,13 @@ def _screen_fixed(scene: Scene, viewpoints: Viewpoints, seed: int) -> TimeScreen
 
 def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str) -> TimeScreen:
     """Test for change with time by the residuals of a static 3DGS, fitted to views without a common camera position."""
-    numbers = [v for group in viewpoints.held for v in group] or viewpoints.other
-    views = [smaller(scene.train[v]) for v in numbers]
+    indices = [v for group in viewpoints.held for v in group] or viewpoints.other
+    views = [smaller(scene.train[v]) for v in indices]
     times = np.array([view.time for view in views], dtype=np.float64)
     ends = np.cumsum([len(group) for group in viewpoints.held])
     held = [list(range(end - len(group), end)) for end, group in zip(ends, viewpoints.held, strict=True)]
     camera = _indicators(held) if held else camera_basis(views)
-    test = follow_time(residual_products(views, scene, seed, backend), times, camera, seed, held)
+    test = follow_time(gradient_products(views, scene, seed, backend), times, camera, seed, held)
     if test.free < LEAST_FREE:
         reason = (f"the camera moves along with time, so that only {test.free:.0%} of a slow change can be told from "
                   f"its motion; {LEAST_FREE:.0%} are needed")  # fmt: skip

@@ -33,10 +33,12 @@ RADIUS = 0.4  # half width of the cube of initial points, as a part of the dista
 Array = NDArray[np.float64]
 
 
-def residual_products(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
+def gradient_products(views: Sequence[View], scene: Scene, seed: int, backend: str) -> Array:
     """Fit a static 3DGS to V views for STEPS steps, and return the scalar products of the views' gradients, [V, V].
 
-    The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit.
+    The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit. If
+    the scene moves, it says where each Gaussian should be at the view's time, so that gradients of views at close times
+    are alike; `gsbench.gates.permutation_test` tests this, and needs no more of the gradients than their products.
     """
     random = torch.Generator().manual_seed(seed)
     points = scene_points(views, scene, random)
@@ -48,33 +50,33 @@ def residual_products(views: Sequence[View], scene: Scene, seed: int, backend: s
     groups = [{"params": [model.splats[name]], "lr": rate * (scene.extent if name == "means" else 1.0)}
               for name, rate in RATES.items()]  # fmt: skip
     adam = torch.optim.Adam(groups, eps=1e-15)
-    fitted = [model.splats[name] for name in RATES]
+    fitted = [model.splats[name] for name in RATES]  # means first
     workers = model.backend.workers(fitted[0])
-    of_view = partial(_gradients, model, fitted, background)
+    gradients_of = partial(_gradients, model, fitted, background)
     for _ in range(STEPS):
         chosen = torch.randint(len(views), (BATCH,), generator=random).tolist()
-        by_view = list(side_by_side(of_view, [views[i] for i in chosen], workers))
+        by_view = list(side_by_side(gradients_of, [views[i] for i in chosen], workers))
         for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):
             parameter.grad = torch.stack(gradients).mean(0)
         adam.step()
-    rows = [gradients[0].flatten() for gradients in side_by_side(of_view, views, workers)]
-    matrix = torch.stack(rows).double().cpu().numpy()
+    of_means = [by_parameter[0].flatten() for by_parameter in side_by_side(gradients_of, views, workers)]
+    matrix = torch.stack(of_means).double().cpu().numpy()
     return np.asarray(matrix @ matrix.T)
 
 
-def _gradients(model: Gaussians3DModel, by: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
-    """Compute the gradients of a view's mean squared error with respect to the parameters `by` of a 3DGS model."""
+def _gradients(model: Gaussians3DModel, parameters: list[nn.Parameter], background: Tensor, view: View) -> list[Tensor]:
+    """Compute the gradients of a view's mean squared error with respect to some parameters of a 3DGS model."""
     with Tape() as tape:
         gaussians = model.slice(CameraTime.of(view.camera, None))
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
     gradients: dict[int, Tensor] = {}
     residual = image.detach() - view.image
-    tape.backward(image, 2 / residual.numel() * residual, by, gradients)
-    return [gradients.get(id(parameter), torch.zeros_like(parameter)) for parameter in by]
+    tape.backward(image, 2 / residual.numel() * residual, parameters, gradients)
+    return [gradients.get(id(parameter), torch.zeros_like(parameter)) for parameter in parameters]
 
 
 def smaller(view: View) -> View:
-    """Reduce the image of a view by an integer factor, so that its longer side has LONG_SIDE pixels or a few more."""
+    """Shrink a view by an integer factor to a longer side of LONG_SIDE pixels or a few more, so that a fit is fast."""
     camera = view.camera
     factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
     height, width = camera.height // factor, camera.width // factor

@@ -32,13 +32,13 @@ POLL = 0.2  # seconds between two looks for a signal, and of a run's process for
 Running = dict[BaseProcess, str]  # the processes of runs, and the overrides of each
 
 
-def do_planned(config: RunConfig, folder: Path, number: int, at_once: int = 1) -> Ended:
-    """Do run `number` of the sweep whose plan is in `folder`; write its outcome, and print the time left.
+def do_planned(config: RunConfig, folder: Path, run_number: int, at_once: int = 1) -> Ended:
+    """Do run `run_number` of the sweep whose plan is in `folder`; write its outcome, and print the time left.
 
     `at_once` is the number of runs at a time, 0 if nobody knows, as on Slurm.
     """
     ended = do(config)
-    plan.write_ended(folder, number, ended)
+    plan.write_ended(folder, run_number, ended)
     if at_once and (line := plan.time_left(folder, at_once)):
         print(line, file=sys.stderr)
     return ended
@@ -98,10 +98,10 @@ def launch_parallel(configs: Sequence[RunConfig], folder: Path) -> None:
     running: Running = {}
     try:
         with stop.requested() as request:
-            for number, config in enumerate(configs):
+            for run_number, config in enumerate(configs):
                 _wait(running, most - 1, request)
                 if request.signal is None:
-                    arguments = (config, folder, number, request, os.getpid(), most)
+                    arguments = (config, folder, run_number, request, os.getpid(), most)
                     process = get_context("fork").Process(target=_work, args=arguments)
                     process.start()
                     running[process] = " ".join(config.overrides)
@@ -124,20 +124,21 @@ def _wait(running: Running, most: int, request: Request) -> None:
 
 def _report_end(code: int, overrides: str, request: Request) -> None:
     """Print how a process ended if it was killed; if a signal asked it to end, ask this process to end too."""
-    number = -code if code < 0 else code - 128
-    if number in stop.SIGNALS:
-        request.signal = request.signal or number
+    signal_number = -code if code < 0 else code - 128
+    if signal_number in stop.SIGNALS:
+        request.signal = request.signal or signal_number
     elif code < 0:
-        why = " (memory may have run out)" if number == signal.SIGKILL else ""
-        print(f"\ngsbench: error: {printable(overrides)}: its process was ended by {signal.Signals(number).name}{why}: "
+        why = " (memory may have run out)" if signal_number == signal.SIGKILL else ""
+        name = signal.Signals(signal_number).name
+        print(f"\ngsbench: error: {printable(overrides)}: its process was ended by {name}{why}: "
               "the same command continues from its last checkpoint", file=sys.stderr)  # fmt: skip
 
 
-def _end(running: Running, number: int) -> None:
+def _end(running: Running, signal_number: int) -> None:
     """Send a signal to all processes and wait for their end; a second signal to this process is sent to them too."""
     for process in running:
         if process.is_alive() and process.pid is not None:
-            os.kill(process.pid, number)
+            os.kill(process.pid, signal_number)
     try:
         for process in list(running):
             process.join()
@@ -157,8 +158,11 @@ def _import_torch() -> None:
             raise
 
 
-def _work(config: RunConfig, folder: Path, number: int, request: Request, parent: int, at_once: int) -> None:
-    """Do a run in its process; `request` tells of a signal that came before the process listens."""
+def _work(config: RunConfig, folder: Path, run_number: int, request: Request, parent: int, at_once: int) -> None:
+    """Do run `run_number` of the plan in `folder`, in a process of its own, which ends when process `parent` does.
+
+    `request` tells of a signal that came before this process listens. `at_once` runs at a time give the time left.
+    """
     with contextlib.suppress(OSError):  # the kernel kills a run if memory runs out, not the parent, which reports it
         Path("/proc/self/oom_score_adj").write_text("500")
     threading.Thread(target=_end_with, args=(parent,), name="gsbench-parent", daemon=True).start()
@@ -166,14 +170,14 @@ def _work(config: RunConfig, folder: Path, number: int, request: Request, parent
         stop.listen()
         if request.signal is not None:
             raise Stopped(request.signal)
-        do_planned(config, folder, number, at_once)
+        do_planned(config, folder, run_number, at_once)
     except Stopped as stopped:
         print(f"gsbench: {stopped}", file=sys.stderr)
         sys.exit(stopped.code)
 
 
 def _end_with(parent: int) -> None:
-    """Ask this process to end when its parent is gone."""
+    """Ask this process to end when its parent is gone, so that a killed sweep leaves no runs behind."""
     while os.getppid() == parent:
         time.sleep(POLL)
     os.kill(os.getpid(), signal.SIGTERM)

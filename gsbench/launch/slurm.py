@@ -117,7 +117,7 @@ def in_container(configs: Sequence["RunConfig"], folder: Path) -> str:
 
 
 def _paths(config: "DictConfig") -> Iterator[str]:
-    """Yield the files and folders that a config names."""
+    """Yield the files and folders that a config names, without those in a package (pkg://), which the image has."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 

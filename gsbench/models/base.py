@@ -257,15 +257,19 @@ class GaussianModel(nn.Module, ABC):
         return Gaussians3D(means, factors, opacities, self.shade(raw, means, opacities, query), beta_exponents)
 
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
-        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time."""
+        """Compute means, covariance factors and opacities of the 3D Gaussians for a camera and a time.
+
+        The model's kernel does this in one call where it can; elsewhere `condition` does the same in torch.
+        """
         if not self.uses_kernel(raw):
             means, factors, opacity_factor, beta_exponents = self.condition(raw, query)
             return Geometry(means, factors, torch.sigmoid(raw["opacities"]) * opacity_factor, beta_exponents)
         assert self.kernel is not None
-        known, names = self.kernel_arguments(raw, query), (*self.kernel.inputs, *self.kernel.numbers)
-        outputs = self.kernel(**{name: known[name] for name in names if name in known})
-        part = dict(zip(self.kernel.outputs, outputs, strict=True))
-        return Geometry(part.get("means", raw["means"]), part["factors"], part["opacities"], part.get("shapes"))
+        arguments, names = self.kernel_arguments(raw, query), (*self.kernel.inputs, *self.kernel.numbers)
+        outputs = self.kernel(**{name: arguments[name] for name in names if name in arguments})
+        sliced = dict(zip(self.kernel.outputs, outputs, strict=True))
+        means = sliced.get("means", raw["means"])  # a static kernel returns none, because they do not move
+        return Geometry(means, sliced["factors"], sliced["opacities"], beta_exponents=sliced.get("shapes"))
 
     def uses_kernel(self, raw: Raw) -> bool:
         """Return whether `kernel` computes the slice of these parameters, on their device and in their type."""

@@ -190,9 +190,9 @@ class CholeskyModel(JointModel):
         order = sorted(range(len(sorted_rows)), key=sorted_rows.__getitem__)  # back to that of the model's factor
         return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, order]
 
-    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+    def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         """Return masks of the parameter entries that are used: a static Gaussian uses none of time and direction."""
-        masks = super().kept(effect_sets)
+        masks = super().used_entries(effect_sets)
         if effect_sets.orders is None:
             return masks
         static = ~effect_sets.is_conditioned

@@ -59,10 +59,11 @@ class GatedModel(GaussianModel):
         """List the lower SH degrees to which colours can be reduced, as degree + 4 (frequencies in time - 1)."""
         return [ColorOrder(degree, 1).packed for degree in range(self.active.sh_degree)]
 
-    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used: a static Gaussian uses no parameters of motion.
+    def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        """Return masks of the parameter entries that affect an image: a static Gaussian uses no parameters of motion.
 
-        Masks can be broadcast to the parameters; without a mask, all entries are used. `fill` sets the others.
+        Masks can be broadcast to the parameters; without a mask, all entries are used. `fill` sets the others to
+        constants, so that they need not be stored.
         """
         if effect_sets.orders is None:
             return {}
@@ -75,7 +76,7 @@ class GatedModel(GaussianModel):
     @torch.no_grad()
     def fill(self, effect_sets: EffectSets) -> None:
         """Set parameter entries that change no image, such as the motion of static Gaussians, to constants."""
-        for name, mask in self.kept(effect_sets).items():
+        for name, mask in self.used_entries(effect_sets).items():
             self.splats[name].data.masked_fill_(~mask, self.constant(name))
 
     # ---- what every such model does
@@ -105,7 +106,7 @@ class GatedModel(GaussianModel):
         if effect_sets is None:
             return state
         assert effect_sets.orders is not None
-        for name, mask in self.kept(effect_sets).items():
+        for name, mask in self.used_entries(effect_sets).items():
             value = state[f"splats.{name}"]
             state[f"splats.{name}"] = value[mask.expand_as(value)]
         counts = torch.tensor([effect_sets.refined, effect_sets.conditioned])
@@ -122,7 +123,7 @@ class GatedModel(GaussianModel):
         """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""
         assert effect_sets.orders is not None
         whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
-        for name, mask in self.kept(effect_sets).items():
+        for name, mask in self.used_entries(effect_sets).items():
             key, shape = f"splats.{name}", (len(effect_sets.orders), *self.splats[name].shape[1:])
             packed, used = state.get(key), mask.expand(shape)
             if not isinstance(packed, Tensor) or tuple(packed.shape) != (int(used.sum()),):

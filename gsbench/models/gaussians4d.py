@@ -134,21 +134,25 @@ class Gaussians4DModel(JointModel, gates=True):
         orders = {ColorOrder(degree, waves).packed for waves in (1, self.time_degree + 1) for degree in degrees}
         return sorted(orders - {self.full_order()})
 
-    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used, given which Gaussians are static.
+    def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        """Return masks of the parameter entries that affect an image, so that the others need not be stored.
 
-        A static Gaussian does not use its right quaternion and its scale in time. It uses its mean time only if its
-        colour changes with time.
+        The result is empty if colours have no orders, because all entries are used then. A static Gaussian does not use
+        its right quaternion and its scale in time. It uses its mean time only if its colour changes with time.
         """
         orders = effect_sets.orders
         if orders is None:
             return {}
-        stored = coefficients_within(orders, self.sh_degree, self.time_degree + 1)
-        changes = effect_sets.is_conditioned[:, None]
-        space = torch.tensor([[True, True, True, False]], device=orders.device)
-        timed = changes | (order_of(orders).waves > 1)[:, None]
-        others = stored.flatten(1)[:, 1:, None]  # the constant coefficient is stored in sh0
-        return {"shN": others, "times": timed, "right_quats": changes.expand(-1, 4), "scales": changes | space}
+        coefficients = coefficients_within(orders, self.sh_degree, self.time_degree + 1)
+        moves = effect_sets.is_conditioned[:, None]
+        is_of_space = torch.tensor([[True, True, True, False]], device=orders.device)
+        uses_mean_time = moves | (order_of(orders).waves > 1)[:, None]  # one wave: a colour that is constant in time
+        return {
+            "shN": coefficients.flatten(1)[:, 1:, None],  # the constant coefficient is stored in sh0
+            "times": uses_mean_time,
+            "right_quats": moves.expand(-1, 4),
+            "scales": moves | is_of_space,
+        }
 
     def constant(self, name: str) -> float:
         return LOG_SIZE_MAX if name == "scales" else 0.0

@@ -64,8 +64,8 @@ class MovingGaussians3D(Gaussians3DModel):
                "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))}  # fmt: skip
         return {"static": {name: value.to(raw[name].dtype) for name, value in new.items()}}
 
-    def kept(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        masks = super().kept(effect_sets)
+    def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
+        masks = super().used_entries(effect_sets)
         if effect_sets.orders is not None:
             masks |= dict.fromkeys(self.moving, effect_sets.is_conditioned[:, None])
         return masks

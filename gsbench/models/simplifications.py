@@ -47,7 +47,7 @@ def simplifications_of(
     simplified = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
-    fewer = {order: raw | {"shN": raw["shN"] * model.kept(EffectSets(0, 0, _all(model, order)))["shN"]}
+    fewer = {order: raw | {"shN": raw["shN"] * model.used_entries(EffectSets(0, 0, _all(model, order)))["shN"]}
              for order in model.lower_orders()}  # fmt: skip
     rows = model.count_by_effects()
     conditioned = len(model) - rows["static"]

@@ -27,6 +27,7 @@ TABLE_1 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex", "train_min",
 TABLE_2 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex"]
 TABLE_SUCCESSORS = ["psnr_db", "psnr_best_on_test_db", "gaussians"]
 RECIPE = ["order", "model", "experiment", "recipe"]  # what the runs of a row of Table 1 and 2 have in common
+SUCCESSOR_RECIPE = ["order", "model", "recipe", "experiment", "protocol"]  # the same, for the table of successors
 # Settings of a variant that belong to no recipe: they change what is measured, or a heading or a protocol names them.
 MEASURING = ("iterations", "downscale", "eval_split", "best_on_test", "curve_points", "device")
 IN_THE_PROTOCOL = (*MEASURING, "protocol", "resize", "batch_size")
@@ -194,33 +195,44 @@ def successors(results: Results) -> pd.DataFrame:
     A measured row has finished all scenes of its mean. Trials, which are measured on val where the data set has a test
     split, are left out.
     """
-    runs = results.finished.runs
+    runs = _successor_runs(results.finished.runs)
+    rows: list[dict[str, Any]] = []
+    for dataset in SUCCESSOR_SCENES:
+        for scenes in _scene_sets(dataset):
+            name = scenes[0] if len(scenes) == 1 else paper.AVERAGE
+            place = {"dataset": dataset, "scene": name}
+            rows += [row | place for row in _published(dataset, name, scenes)]
+            of_scenes = runs[(runs.dataset == dataset) & runs.scene.isin(scenes)]
+            if of_scenes.empty:
+                continue
+            measured = stats.means(of_scenes, SUCCESSOR_RECIPE, TABLE_SUCCESSORS)
+            for row in measured[measured.scenes == len(scenes)].to_dict("records"):
+                rows.append(row | place | {"row": "measured", "method": row["model"]})
+    named = ["dataset", "scene", "scenes", "row", "method", "recipe", "experiment", "protocol", "seeds"]
+    return pd.DataFrame(rows, columns=[*named, *(name + end for name in TABLE_SUCCESSORS for end in ("", " ±"))])
+
+
+def _successor_runs(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs of 7DGS and its successors on the split that the paper evaluates, one for each seed of a row."""
     runs = runs[runs.model.isin(SUCCESSORS) & runs.dataset.isin(list(SUCCESSOR_SCENES))]
-    kept = [
+    is_comparable = [
         r.scene in SUCCESSOR_SCENES[r.dataset]
         and r.protocol.get("eval_split") == paper.PROTOCOLS[r.dataset].split(r.scene)
         for r in runs.record
     ]
-    runs = runs[pd.Series(kept, runs.index, dtype=bool)]
+    runs = runs[pd.Series(is_comparable, runs.index, dtype=bool)]
     runs = runs.assign(
         order=runs.model.map(SUCCESSORS.index), protocol=runs.record.map(_protocol),
         recipe=[without(variant, *IN_THE_PROTOCOL) for variant in runs.variant],
     )  # fmt: skip
-    by = ["order", "model", "recipe", "experiment", "protocol"]
-    runs = of_one_machine(_once(runs, by)) if len(runs) else runs
-    rows: list[dict[str, Any]] = []
-    for dataset, scenes in SUCCESSOR_SCENES.items():
-        means = [[scene for scene in scenes if scene != "lego"]] if "lego" in scenes else []
-        for of_scenes in (*([scene] for scene in scenes), scenes, *means):
-            name = of_scenes[0] if len(of_scenes) == 1 else paper.AVERAGE
-            place = {"dataset": dataset, "scene": name}
-            rows += [row | place for row in _published(dataset, name, of_scenes)]
-            of = runs[(runs.dataset == dataset) & runs.scene.isin(of_scenes)]
-            measured = stats.means(of, by, TABLE_SUCCESSORS) if len(of) else pd.DataFrame({"scenes": []})
-            for row in measured[measured.scenes == len(of_scenes)].to_dict("records"):
-                rows.append(row | place | {"row": "measured", "method": row["model"]})
-    named = ["dataset", "scene", "scenes", "row", "method", "recipe", "experiment", "protocol", "seeds"]
-    return pd.DataFrame(rows, columns=[*named, *(name + end for name in TABLE_SUCCESSORS for end in ("", " ±"))])
+    return of_one_machine(_once(runs, SUCCESSOR_RECIPE)) if len(runs) else runs
+
+
+def _scene_sets(dataset: str) -> list[list[str]]:
+    """Return the scenes of each row: one scene, all scenes, and all but lego, which some published means leave out."""
+    scenes = SUCCESSOR_SCENES[dataset]
+    without_lego = [[scene for scene in scenes if scene != "lego"]] if "lego" in scenes else []
+    return [*([scene] for scene in scenes), scenes, *without_lego]
 
 
 def published(dataset: str) -> pd.DataFrame:

@@ -142,16 +142,17 @@ class Execution:
     def measure(self, trainer: Trainer) -> Record:
         """Measure image quality, speed and size of the trained model, and return the record."""
         results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
-        measured = measuring.measure(trainer, self.chosen.config, "on_demand" in results)
+        measured = measuring.measure(trainer, self.chosen.config, with_effect_sets="on_demand" in results)
         self._images = measured.images
         record = self.describe("ok", None)
-        known = {name: value for name, value in results.items() if hasattr(record, name)}
-        parts = {name: value for name, value in results.items() if name not in known}
+        fields = {name: value for name, value in results.items() if hasattr(record, name)}
+        of_other_hooks = {name: value for name, value in results.items() if name not in fields}
+        exact_views = trainer.exact.union(*(view.exact for view in measured.per_view))  # the render equals the image
         return replace(
             record, protocol=record.protocol | measured.frames, metrics=measured.metrics,
             missing=measured.missing, per_view=measured.per_view, regions=measured.regions,
-            cost=measured.cost, curve=trainer.curve.points, **known, parts=parts,
-            exact=sorted(trainer.exact.union(*(view.exact for view in measured.per_view))),
+            cost=measured.cost, curve=trainer.curve.points, **fields, parts=of_other_hooks,
+            exact=sorted(exact_views),
         )  # fmt: skip
 
     def draw(self) -> None:
@@ -167,7 +168,7 @@ class Execution:
                 print(f"{self.spec.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
 
     def describe(self, status: Status, reason: str | None) -> Record:
-        """Return a record of the run without measurements; `reason` says why it failed or diverged."""
+        """Return a record without measurements, to check it before step 0, and for a run that failed for a `reason`."""
         config, scene, spec = self.chosen.config, self.scene, self.spec
         observes = models.find(config.model.name, config.model.module).observes
         camera = scene.train[0].camera if scene else None

@@ -38,7 +38,7 @@ class Measured:
     images: dict[str, Pixels]  # images by file name
 
 
-def measure(trainer: Trainer, config: Config, with_effect_sets: bool) -> Measured:
+def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Measured:
     """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
     views = trainer.views
     shown: Pairs = []

@@ -179,7 +179,10 @@ def best(results: Sequence[Result]) -> Result:
 
 
 def check_candidates(config: Config, scene: Scene) -> None:
-    """Raise InputError if a scene with times has no val views, or a candidate bad settings or no way to train on it."""
+    """Raise InputError, before step 0, if the scene has no val views or a candidate cannot be trained on it.
+
+    A scene without times is not checked, because model=auto compares nothing on it.
+    """
     if not scene.val:
         raise InputError(f"effects.compare=true: expected views of val to compare models on, {scene.name} has none: "
                          f"scene.val_every=8 takes every eighth training view", docs=HOW_TO)  # fmt: skip

@@ -295,7 +295,7 @@ def _are_keypoints(words: list[str]) -> bool:
 
 
 def _binary_points(file: ModelFile) -> list[tuple[float, ...]]:
-    """Return (x, y, z, r, g, b) of each point of points3D.bin, whose lengths differ because each has a track."""
+    """Return (x, y, z, r, g, b) of each point of points3D.bin; records differ in length, because each has a track."""
     reader = _Reader(file)
     rows: list[tuple[float, ...]] = []
     for _ in range(reader.unpack(_COUNT)[0]):

@@ -283,18 +283,24 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
     listed = []
     for name, moment in zip(plain, moments, strict=True):
         numbers, at = [], 0
-        inside = moment.span() if moment else (-1, -1)
-        spans = [match.span() for match in pattern.finditer(name)]
-        spans = [(a, b) for a, b in spans if b <= inside[0] or a >= inside[1]] if moment else spans
-        for start, end in sorted([*spans, *([inside] if moment else [])]):
+        for start, end in _spans(name, moment, pattern):
             label = name[at:start].rpartition("/")[2]
-            is_moment = moment is not None and (start, end) == inside
+            is_moment = moment is not None and (start, end) == moment.span()
             value = (_seconds(moment, source) if is_moment and moment else
                      _exact(name[start:end], f"{source}: image {name[start:end][:40]}"))  # fmt: skip
             numbers.append(_Number(value, label, is_moment))
             at = end
         listed.append(numbers)
     return listed
+
+
+def _spans(name: str, moment: re.Match[str] | None, pattern: re.Pattern[str]) -> list[tuple[int, int]]:
+    """Return where the numbers of a name begin and end; those inside its date and time of day are one number."""
+    spans = [match.span() for match in pattern.finditer(name)]
+    if moment is None:
+        return spans
+    begin, end = moment.span()
+    return sorted([*((a, b) for a, b in spans if b <= begin or a >= end), (begin, end)])
 
 
 def _have_decimals(names: Sequence[str]) -> bool:

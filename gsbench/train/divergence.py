@@ -86,7 +86,7 @@ def _all_finite(gradients: list[Tensor], like: Tensor) -> Tensor:
 
 
 def explain(model: GaussianModel) -> str:
-    """Name the first Gaussian with a NaN or infinite gradient."""
+    """Name the first Gaussian with a NaN or infinite gradient; if there is none, name what else may have caused it."""
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue

@@ -38,10 +38,10 @@ class Optimizer:
     def __init__(
         self, model: GaussianModel, config: ModelConfig, train: TrainConfig, extent: float, kind: str = "adam"
     ) -> None:
-        """Make an Adam parameter group for each group of an initialised model; `extent` is the radius of the scene.
+        """Check that each parameter group of an initialised model has a learning rate; `extent` is the scene's radius.
 
         Raises:
-            InputError: a parameter has no learning rate, or a learning rate has no parameter.
+            InputError: a group has no learning rate, or a learning rate has no group.
         """
         self.groups = groups = model.groups()
         check_rates(groups, config)
@@ -50,9 +50,11 @@ class Optimizer:
         self.train = train
         self.extent = extent
         self.is_sparse = kind == "sparse_adam"
-        # Of each parameter, named as torch.optim.Adam names them.
+        # The step count and both moments of each parameter, in the form of torch.optim.Adam.state.
         self.moments: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
-        self.skip: Tensor | None = None  # a GPU's finite check, [] 1 if a step is to change nothing
+        self.skip: Tensor | None = (
+            None  # [] on a GPU: 1 after a gradient was not finite, so that no step changes anything
+        )
 
     @cached_property
     def torch_adam(self) -> torch.optim.Adam:
@@ -128,7 +130,10 @@ class Optimizer:
         parameter.grad = None
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
-        """Reorder Adam's moments, see `gsbench.train.hooks.Hook.reindex`; those of new Gaussians become zero."""
+        """Reorder Adam's moments after Gaussians were added, removed or sorted; those of new Gaussians become zero.
+
+        `rows` [M] has for each Gaussian its index before, or that of its parent; `fresh` [M] bool, whether it is new.
+        """
         for parameter in self.model.splats.values():
             state = self.moments.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):

@@ -75,7 +75,7 @@ class Row(NamedTuple):
 
 
 def cost_table(costs: Sequence[FrameCost], width: int, height: int) -> str:
-    """Write a table of a frame's milliseconds: a column for each model, a row for each stage, and the FPS."""
+    """Return a table in HTML of a frame's milliseconds: a column for each model, the stages by part, and the FPS."""
     rows = [Row("ms", [cost.name for cost in costs], is_bold=True)]
     for part, stages in STAGES.items():
         rows.append(Row(part, [f"{cost.of(part):.1f}" for cost in costs], is_bold=True))
@@ -93,7 +93,7 @@ def legend(
     most_cost: float,  # ns that the most expensive Gaussian adds to a frame; it has the brightest colour
     notes: Mapping[str, Float32Error | str],  # by model: the bound on the error of float32, or why it is not shown
 ) -> str:
-    """Write the legend of the colours; "" if Gaussians have their usual colours."""
+    """Return the legend of the colours in HTML; "" if Gaussians have their usual colours."""
     renderers = {meaning: {image.renderer.name: image.renderer for image in shown if image.colours == meaning}
                  for meaning in (CLASS, COST, FLOAT32)}  # fmt: skip
     classes = [Row("Gaussians", list(renderers[CLASS]), is_bold=True)] if renderers[CLASS] else []
@@ -114,6 +114,6 @@ def legend(
 
 
 def comparison(nearest: Nearest, compared: Sequence[ViewComparison]) -> str:
-    """Write the HTML that shows a training view, the models' renders of this view, and their errors."""
+    """Return the HTML that shows a training view, the models' renders of this view, and their errors."""
     away = f"{nearest.distance:.2f} world units and {nearest.degrees:.0f}° from here"
     return _COMPARISON_PAGE.render(view=nearest.view, compared=compared, away=away, scale=f"{ERROR_SCALE} or more")

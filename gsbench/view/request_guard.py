@@ -119,7 +119,11 @@ class Connection(ServerConnection):
 
 
 class RequestGuard:
-    """The port on which the viewer listens, and the host names by which a browser may reach it."""
+    """The port on which the viewer listens, and the host names by which a browser may reach it.
+
+    Requests by other names are refused: a web site can let its own name resolve to this machine ("DNS rebinding"), and
+    a browser would then let this site read what the viewer sends.
+    """
 
     def __init__(self, host: str, port: int) -> None:
         """Find the first free port from `port` on.
@@ -133,7 +137,7 @@ class RequestGuard:
         self._is_open = any(ipaddress.ip_address(address).is_unspecified for address in addresses)
         if self._is_open:  # every machine on the network can connect, by any address of this machine
             self._hosts.add(socket.gethostname().lower())
-        self._guards = False
+        self._is_active = False
 
     @contextmanager
     def active(self) -> Iterator[None]:
@@ -150,7 +154,7 @@ class RequestGuard:
 
         def serve(*arguments: Any, process_request: Callable[..., Answer], **options: Any) -> Any:
             asyncio.get_running_loop().set_exception_handler(_print_error)
-            self._guards = True
+            self._is_active = True
             options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent_logger()}
 
             def check(connection: ServerConnection, request: Request) -> Answer:
@@ -163,14 +167,14 @@ class RequestGuard:
             yield
         finally:
             websockets_server.serve = original  # type: ignore[misc]
-        if not self._guards:
+        if not self._is_active:
             raise InputError("expected a viser that the viewer can guard, such as 1.1.1, got another one: install that")
 
     def admits(self, headers: Headers) -> bool:
         """Tell whether a request is for this server and comes from its own page.
 
-        The page of another site has another `Origin` header. In an attack by "DNS rebinding", the attacker's host name
-        resolves to this machine's address; such a request has that name in its `Host` header.
+        The page of another site has another `Origin` header. After "DNS rebinding", the attacker's host name is in the
+        `Host` header.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_this_server(hosts[0]):

@@ -98,7 +98,7 @@ def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     assert effect_sets.conditioned < len(training.model)
     before = {name: value.detach().clone() for name, value in training.model.splats.items()}
     training.run(lambda _: None, "test", lambda: training.step < 70)
-    masks = training.model.kept(effect_sets)
+    masks = training.model.used_entries(effect_sets)
     for name, value in training.model.splats.items():
         mask = masks[name].expand_as(value) if name in masks else torch.ones_like(value, dtype=torch.bool)
         assert torch.equal(value[~mask], before[name][~mask]), name

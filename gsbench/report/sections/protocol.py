@@ -30,17 +30,19 @@ DIFFER = " WARNING: runs that are compared differ in this."
 
 @section(in_terminal=True)
 def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
-    """Make the table of settings; a setting that differs between the runs of a scene, and is no variant, is a warning.
+    """Make the table of settings, so that a reader sees whether the runs can be compared.
+
+    It warns of a setting in which runs of a scene differ, unless their variant names it: then the table compares it.
 
     It describes the finished runs whose settings most runs share. If no run finished, it describes the failed ones
     without a warning, because they may have stopped before their data was known.
     """
     ok = chapter.finished.runs
     runs = ok[ok.main] if len(ok) else chapter.runs
-    named = {name.removeprefix("protocol_"): name for name in sorted(runs) if name.startswith("protocol_")}
-    named.pop("paper_dataset", None)
-    named |= {"iterations": "iterations", "data": "data_hash"} | OF_ALL
-    rows = [row for setting, column in named.items() for row in _setting(runs, setting, column, warn=len(ok) > 0)]
+    columns = {name.removeprefix("protocol_"): name for name in sorted(runs) if name.startswith("protocol_")}
+    columns.pop("paper_dataset", None)  # it names the paper's numbers to compare with, and changes no measurement
+    columns |= {"iterations": "iterations", "data": "data_hash"} | OF_ALL
+    rows = [row for setting, column in columns.items() for row in _setting(runs, setting, column, warn=len(ok) > 0)]
     rows += [["", *fact] for fact in _facts(runs)]
     table = pd.DataFrame(rows, columns=["note", "setting", "value", "scenes", "runs"])
     table = table.sort_values("note", ascending=False, kind="stable").reset_index(drop=True)
@@ -49,14 +51,15 @@ def protocol(chapter: Results, tests: pd.DataFrame) -> Section:
 
 
 def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> Iterator[list[object]]:
-    """Yield a row for each value of a setting, with its scenes and its number of runs."""
+    """Yield a row for each value of a setting, with its scenes and its number of runs, and whether it is a warning."""
     silent = SILENT.get(setting, "none" if runs[column].isna().all() else "not recorded")
     values = runs[column].map(lambda value: silent if value is None or value != value else _short(setting, value))
     compared = runs.variant.map(lambda variant: without(variant, setting) == variant)
     by_scene = values[compared].groupby(runs.scene[compared]).nunique()
     is_mixed = (by_scene > 1).any() or (setting in OF_ALL and values.nunique() > 1)
-    for value, of in runs.groupby(values):
-        yield [WARNING if is_mixed and warn else "", printable(setting), value, _scenes(of, runs), len(of)]
+    for value, runs_with in runs.groupby(values):
+        note = WARNING if is_mixed and warn else ""
+        yield [note, printable(setting), value, _scenes(runs_with, runs), len(runs_with)]
 
 
 def _short(setting: str, value: object) -> str:
