@@ -61,8 +61,8 @@ def compare_images(views: Sequence[View], groups: Sequence[Sequence[int]], seed:
     """
     most = max(4, MOST_VIEWS // len(groups))
     blocks, changed, means, times = 0, 0, [], []
-    for number, group in enumerate(groups):
-        chosen = _spread(sorted(group, key=lambda v: views[v].time or 0.0), most, number / len(groups))
+    for position, group in enumerate(groups):
+        chosen = _spread(sorted(group, key=lambda v: views[v].time or 0.0), most, position / len(groups))
         halves = _halves(changes_of(np.stack([_pixels(views[v]) for v in chosen])))
         is_changed = _is_changed(halves)
         blocks, changed = blocks + len(is_changed), changed + int(is_changed.sum())
@@ -187,10 +187,10 @@ def _fit(
 
     A black pixel (x = y = 0) with a small weight is added, so that an image of one shade determines only a gain.
     """
-    number = use.sum(-1, keepdims=True)
-    enough = number >= LEAST_PIXELS
+    pixel_count = use.sum(-1, keepdims=True)
+    enough = pixel_count >= LEAST_PIXELS
     y, x = np.pad(y, ((0, 0), (0, 0), (0, 1))), np.pad(x, ((0, 0), (0, 1)))
-    weights = np.concatenate([use, BLACK * number], -1).astype(np.float32)
+    weights = np.concatenate([use, BLACK * pixel_count], -1).astype(np.float32)
     weight = weights
     for _ in range(REWEIGHTINGS):
         weight = weight / np.maximum(weight.sum(-1, keepdims=True), 1e-9)
@@ -209,9 +209,9 @@ def _shared(
     otherwise: float,
 ) -> Pixels:
     """Replace a gain or offset that was fitted to too few pixels by the mean over the image's other channels."""
-    number = enough.sum(1, keepdims=True)
-    mean = (values * enough).sum(1, keepdims=True) / np.maximum(number, 1)
-    return np.where(enough, values, np.where(number > 0, mean, otherwise)).astype(np.float32)
+    channel_count = enough.sum(1, keepdims=True)
+    mean = (values * enough).sum(1, keepdims=True) / np.maximum(channel_count, 1)
+    return np.where(enough, values, np.where(channel_count > 0, mean, otherwise)).astype(np.float32)
 
 
 def _static_image(
@@ -225,6 +225,6 @@ def _static_image(
     black.
     """
     ordered = np.sort(np.where(saturated, np.float32(np.inf), values), 0)
-    number = (~saturated).sum(0)
-    middle = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]
-    return np.where(number > 0, middle, np.where(full, values.max(0), values.min(0)))
+    unsaturated_count = (~saturated).sum(0)
+    middle = np.take_along_axis(ordered, np.maximum(unsaturated_count - 1, 0)[None] // 2, 0)[0]
+    return np.where(unsaturated_count > 0, middle, np.where(full, values.max(0), values.min(0)))

@@ -47,11 +47,12 @@ def lines(on_demand: OnDemand) -> list[str]:
 
 
 def _of_gate(gate: Gate) -> str:
-    left = sum(number for name, number in gate.rows.items() if name != "removed")
+    """Return one line on a gate: how many Gaussians are left, and what it changed in PSNR, speed and size."""
+    left = sum(count for name, count in gate.rows.items() if name != "removed")
     when = "after training" if gate.step is None else f"after step {gate.step}"
-    kept = ", ".join(f"{gate.rows[name]} {words}" for name, words in EFFECT_SETS.items() if gate.rows.get(name))
+    by_effects = ", ".join(f"{gate.rows[name]} {words}" for name, words in EFFECT_SETS.items() if gate.rows.get(name))
     text = f"gate {when}: {left} of {left + gate.rows.get('removed', 0)} Gaussians are left"
-    text += f" ({kept})" if kept else ""
+    text += f" ({by_effects})" if by_effects else ""
     text += f"; PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB"
     if gate.eval_loss_db is not None:
         text += f", on the evaluated views {-gate.eval_loss_db:+.3f} dB"

@@ -39,18 +39,18 @@ def follow_time(
         groups: views within which times are permuted; by default all views are one group.
     """
     waves = slow_waves(times)
-    known = _range(camera)
-    unexplained = waves - known @ (known.T @ waves)
+    of_camera = _range(camera)
+    unexplained = waves - of_camera @ (of_camera.T @ waves)
     free = float(np.square(unexplained).sum() / max(np.square(waves).sum(), 1e-300))
     slow = _range(unexplained)
-    residual = np.eye(len(times)) - known @ known.T
+    residual = np.eye(len(times)) - of_camera @ of_camera.T
     gram = residual @ products @ residual
     total = float(np.trace(gram))
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
         """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera."""
-        permuted = np.concatenate([slow, known], 1)[rows]
+        permuted = np.concatenate([slow, of_camera], 1)[rows]
         energies = np.einsum("vk,vk->k", permuted, gram @ permuted)
         left = total - energies[slow.shape[1] :].sum()
         return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0

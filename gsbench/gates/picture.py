@@ -90,8 +90,8 @@ def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixel
     by_set = f"{sum(counts.values()):,} Gaussians by effect set"
     for i, title in enumerate(("image", by_set, f"cost of what a pixel shows, 0 to {most:.0f} ns")):
         write_text(titles, title, i * step + 6, 16)
-    for i, (name, number) in enumerate((name, number) for name, number in counts.items() if number):
+    for i, (name, count) in enumerate((name, count) for name, count in counts.items() if count):
         left = i * step + 6
         legend[5:17, left : left + 12] = COLOURS[name]
-        write_text(legend, f"{EFFECT_SETS[name]}: {number:,}", left + 18, 16)
+        write_text(legend, f"{EFFECT_SETS[name]}: {count:,}", left + 18, 16)
     return np.concatenate([titles, row, legend])

@@ -159,9 +159,9 @@ class ProbedView:
         if simplification.order is not None:
             colors = model.shade(raw, live.means, live.opacities, self.query)
             return _growth_of((self.products[..., COLOR] * (colors - live.colors)).sum(-1))
-        whole = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
+        simplified = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
         N, n = len(live.means), simplification.rows
-        changed = Gaussians3D(*(x[:n] for x in tensors_of(whole)))
+        changed = Gaussians3D(*(x[:n] for x in tensors_of(simplified)))
         thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
         pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
         both = self._draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))

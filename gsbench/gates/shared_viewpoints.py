@@ -40,9 +40,9 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
         extent: the radius of the scene; it replaces the distance to the scene if the cameras look at no common point.
     """
     poses = _poses(views, extent)
-    exact = _groups(list(range(len(views))), poses, SAME)
-    fixed = [group for group in exact if len(group) > 1]
-    loose = sorted(v for group in exact if len(group) == 1 for v in group)
+    of_one_position = _groups(list(range(len(views))), poses, SAME)
+    fixed = [group for group in of_one_position if len(group) > 1]
+    loose = sorted(v for group in of_one_position if len(group) == 1 for v in group)
     times = np.array([view.time for view in views], dtype=np.float64)
     span = float(np.ptp(times))
     near = [group for group in _groups(loose, poses, NEAR)

@@ -110,19 +110,19 @@ def _time_left(runs: Sequence[RunStatus]) -> str:
 
 
 def _details(run: RunStatus) -> str:
-    parts = []
+    phrases = []
     if run.state in ("running", "queued"):
         if run.step is not None:
-            parts.append(f"step {run.step}/{run.steps}" if run.steps else "loads")
+            phrases.append(f"step {run.step}/{run.steps}" if run.steps else "loads")
         if run.psnr is not None:
-            parts.append(f"val {run.psnr:.2f} dB")
+            phrases.append(f"val {run.psnr:.2f} dB")
         if run.seconds_left is not None:
-            parts.append(f"{plan.duration(run.seconds_left)} left")
+            phrases.append(f"{plan.duration(run.seconds_left)} left")
         if run.job is not None:
-            parts.append(f"job {run.job}")
+            phrases.append(f"job {run.job}")
     if run.reason:
-        parts.append(run.reason)
-    return ", ".join(parts)
+        phrases.append(run.reason)
+    return ", ".join(phrases)
 
 
 def _show(folder: Path, in_json: bool) -> list[RunStatus]:
@@ -157,8 +157,8 @@ def _retry(folder: Path, launch: list[str]) -> int:
     return _verdict(_show(folder, False))
 
 
-def _job(folder: Path, number: int) -> int:
-    """Do run `number` of the plan in `folder`, in a job of Slurm."""
+def _job(folder: Path, run_number: int) -> int:
+    """Do run `run_number` of the plan in `folder`, in a job of Slurm."""
     from gsbench.launch.command import compose_run, hydra_with
     from gsbench.launch.processes import do_planned
 
@@ -166,8 +166,8 @@ def _job(folder: Path, number: int) -> int:
     sys.path.append(os.getcwd())  # `python -P` leaves it out, but a model of the user's may be there
     planned = plan.read(folder / plan.FILE_NAME)
     with hydra_with(Path(planned.config_dir) if planned.config_dir else None):
-        config = compose_run(planned.runs[number])
-        return 0 if do_planned(config, folder, number, at_once=0).reason is None else 1
+        config = compose_run(planned.runs[run_number])
+        return 0 if do_planned(config, folder, run_number, at_once=0).reason is None else 1
 
 
 if __name__ == "__main__":

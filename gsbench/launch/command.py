@@ -165,9 +165,9 @@ def _with_paths(config: DictConfig) -> DictConfig:
 def check_complete(config: DictConfig) -> None:
     """Raise InputError if a composed config names no experiment, no scene or no folder of data, with what to type."""
     if OmegaConf.is_missing(config, "experiment"):
-        known = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
+        experiments = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
         raise InputError(f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
-                         f"{known}. What each is: python -m gsbench --help")  # fmt: skip
+                         f"{experiments}. What each is: python -m gsbench --help")  # fmt: skip
     if OmegaConf.is_missing(config.scene, "name"):
         raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
     if OmegaConf.is_missing(config.data, "root"):
@@ -222,8 +222,8 @@ def _check_group(name: str, choices: str) -> None:
         return
     for choice in choices.split(","):
         if NO_NAME.fullmatch(choice.lower()):
-            known = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
-            raise InputError(f"{name} '{choice}' is not known. {did_you_mean(choice, known)}")
+            valid = sorted(path.stem for path in (CONF / name).glob("*.yaml"))
+            raise InputError(f"{name} '{choice}' is not known. {did_you_mean(choice, valid)}")
 
 
 def _register_scene(overrides: Sequence[str]) -> None:

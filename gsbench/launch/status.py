@@ -100,12 +100,12 @@ def read(folder: Path) -> Experiment:
             experiment.damaged.append(str(error))
             continue
         ended = plan.read_ended(path.parent)
-        for number, overrides in enumerate(planned.runs):
-            run = PlannedRun(overrides, planned, path.parent, number, ended.get(number))
+        for run_number, overrides in enumerate(planned.runs):
+            run = PlannedRun(overrides, planned, path.parent, run_number, ended.get(run_number))
             experiment.planned[identity(overrides)] = run
     # An experiment may have parts in other folders: +exp=tuning +trial=fast writes to results/tuning.fast.
-    for part in (folder, *sorted(folder.parent.glob(f"{folder.name}.*"))):
-        _read_runs(part, experiment)
+    for results_folder in (folder, *sorted(folder.parent.glob(f"{folder.name}.*"))):
+        _read_runs(results_folder, experiment)
     finished = {run for run, record in experiment.records.items() if record.status == "ok"}
     jobs = {run.job for key, run in experiment.planned.items() if run.job and key not in finished}
     experiment.queue = queue(jobs | {at.job for _, at in experiment.progress.values() if at.job})
@@ -208,14 +208,14 @@ def _explained(experiment: Experiment, run: Identity, state: RunStatus, ends: di
     """Add to a broken run without a record how its Slurm job ended, and the line of its log that says why."""
     if state.state not in BROKEN or state.job is None or state.record is not None:
         return state
-    parts = [state.reason or ""]
+    phrases = [state.reason or ""]
     if state.state == "lost":
-        parts.append(f"job {state.job} ended: {ends.get(state.job, 'Slurm no longer knows how')}")
+        phrases.append(f"job {state.job} ended: {ends.get(state.job, 'Slurm no longer knows how')}")
     planned = experiment.planned.get(run)
     if planned and planned.job == state.job:
         log = plan.log_of(planned.folder, planned.number)
-        parts.append(f"its log ends: {cause_in(log)}; {log}")
-    return replace(state, reason="; ".join(parts))
+        phrases.append(f"its log ends: {cause_in(log)}; {log}")
+    return replace(state, reason="; ".join(phrases))
 
 
 def cause_in(log: Path) -> str:

@@ -54,8 +54,8 @@ def launch(configs: Sequence[RunConfig], config_dir: Path | None) -> Outcome:
         elif planned.launcher == "parallel":
             launch_parallel(configs, folder)
         else:
-            for number, config in enumerate(configs):
-                do_planned(config, folder, number)
+            for run_number, config in enumerate(configs):
+                do_planned(config, folder, run_number)
     except InputError:
         plan.forget(folder)
         raise

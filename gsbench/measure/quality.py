@@ -199,9 +199,9 @@ def evaluate(
         ),
     }
     least_side = {"ssim": SSIM_LEAST_SIDE}
-    for backbone, known in BACKBONES.items():
+    for backbone, network in BACKBONES.items():
         measures[f"lpips_{backbone}"] = partial(lpips, backbone=backbone, weights=(weights or {}).get(backbone))
-        least_side[f"lpips_{backbone}"] = known.least_side
+        least_side[f"lpips_{backbone}"] = network.least_side
     if not isinstance(background, tuple | list) or len(background) != 3:
         raise InputError(f"evaluate: expected a background of three numbers, got {background!r:.80}")
     for value in background:
@@ -213,21 +213,21 @@ def evaluate(
         _check_images(render, truth, 1, f"evaluate: {name}")
         side = min(truth.shape[:2])
         shown = quantise(render) if quantised else render
-        here: dict[str, float] = {}
+        of_view: dict[str, float] = {}
         for metric, measure in measures.items():
             if side < least_side.get(metric, 1):
                 missing[metric] = f"needs {least_side[metric]} pixels a side, {name} has {side}"
                 continue
             try:
-                here[metric] = measure(shown, truth)
+                of_view[metric] = measure(shown, truth)
             except BackboneMissing as reason:
                 missing[metric] = str(reason)
-        for metric, value in here.items():
+        for metric, value in of_view.items():
             scores[metric].append(value)
             if math.isnan(value):
                 missing.setdefault(metric, f"not a number in {name}")
-        del here["psnr_background_only"]  # a property of the split and not of the render
-        per_view.append(ViewScore(name, **here))
+        del of_view["psnr_background_only"]  # a property of the split and not of the render
+        per_view.append(ViewScore(name, **of_view))
     if not per_view:
         raise InputError("evaluate: expected at least one image, got none")
     metrics = {metric: None if metric in missing else fmean(values) for metric, values in scores.items()}

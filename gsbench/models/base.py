@@ -239,8 +239,8 @@ class GaussianModel(nn.Module, ABC):
         raw = {name: parameter.data for name, parameter in self.splats.items()}
         raw["opacities"].copy_(trained.logits)
         raw["sh0"].view(-1, 3).copy_(trained.dc)
-        known = min(trained.rest.shape[1], (self.sh_degree + 1) ** 2 - 1)
-        raw["shN"][:, :known] = trained.rest[:, :known]  # in 4DGS these are the coefficients that are constant in time
+        terms = min(trained.rest.shape[1], (self.sh_degree + 1) ** 2 - 1)
+        raw["shN"][:, :terms] = trained.rest[:, :terms]  # in 4DGS these are the coefficients that are constant in time
         for name, value in self.shaped_as(trained, raw).items():
             raw[name].copy_(value)
 

@@ -190,11 +190,11 @@ class UniversalBetaModel(BetaModel):
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         reduced = reduce(joint_factor(raw))
-        parts = [unit(raw["means"] - query.center) - raw["directions"]]
+        offsets = [unit(raw["means"] - query.center) - raw["directions"]]
         if "time" in self.observes:
             assert query.time is not None
-            parts.append(query.time - raw["times"])
-        delta = torch.cat(parts, -1)
+            offsets.append(query.time - raw["times"])
+        delta = torch.cat(offsets, -1)
         white = whiten(reduced.T_qq, delta)
         weights = shift_weights(raw["betas"])
         if self.modulation == "whitened":

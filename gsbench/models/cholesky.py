@@ -255,7 +255,7 @@ class CholeskyModel(JointModel):
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
         """Compute Cholesky factors [N, n, n] without the given variables, from present blocks and gain K."""
-        T_qq, kept = blocks.T_qq.clone(), gain.clone()
+        T_qq, gain_left = blocks.T_qq.clone(), gain.clone()
         if "direction" in variables and "time" in self.observes:
             # Without d, the row of t has its whole standard deviation on the diagonal.
             deviation = T_qq[:, -1].norm(dim=-1)
@@ -264,8 +264,8 @@ class CholeskyModel(JointModel):
         for column in [column for x in variables for column in self.columns[x]]:
             T_qq[:, column] = 0
             T_qq[:, column, column] = math.exp(LOG_SIZE_MAX)
-            kept[..., column] = 0
-        return self._assembled(T_qq, kept @ T_qq, blocks.T_pp)
+            gain_left[..., column] = 0
+        return self._assembled(T_qq, gain_left @ T_qq, blocks.T_pp)
 
     def factors(self, raw: Raw) -> Tensor:
         """Compute Cholesky factors from raw parameters, with rows sorted to (position, direction, time), [N, n, n]."""
@@ -274,12 +274,12 @@ class CholeskyModel(JointModel):
 
     def offset(self, raw: Raw, query: CameraTime) -> Tensor:
         """Compute the offset q - mu_q of direction and time from their means, [N, k], ordered (direction, time)."""
-        parts = []
+        offsets = []
         if "direction" in self.observes:
-            parts.append(unit(raw["means"] - query.center) - self.mean_directions(raw))
+            offsets.append(unit(raw["means"] - query.center) - self.mean_directions(raw))
         if query.time is not None and "time" in self.observes:
-            parts.append(query.time - self.mean_times(raw))
-        return torch.cat(parts, -1)
+            offsets.append(query.time - self.mean_times(raw))
+        return torch.cat(offsets, -1)
 
     def mean_directions(self, raw: Raw) -> Tensor:
         """Return the mean directions [N, 3], normalised if the option `unit_directions` is set."""

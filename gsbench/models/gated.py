@@ -122,16 +122,16 @@ class GatedModel(GaussianModel):
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
         """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""
         assert effect_sets.orders is not None
-        whole = {key: value for key, value in state.items() if not key.startswith(_STATE)}
+        unpacked = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.used_entries(effect_sets).items():
             key, shape = f"splats.{name}", (len(effect_sets.orders), *self.splats[name].shape[1:])
             packed, used = state.get(key), mask.expand(shape)
             if not isinstance(packed, Tensor) or tuple(packed.shape) != (int(used.sum()),):
                 raise InputError(f"checkpoint: expected {key} as the {int(used.sum())} entries that matter to its "
                                  f"effect sets")  # fmt: skip
-            whole[key] = packed.new_full(shape, self.constant(name))
-            whole[key][used] = packed
-        return whole
+            unpacked[key] = packed.new_full(shape, self.constant(name))
+            unpacked[key][used] = packed
+        return unpacked
 
 
 class JointModel(GatedModel):

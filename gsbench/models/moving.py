@@ -54,15 +54,17 @@ class MovingGaussians3D(Gaussians3DModel):
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Replace means and opacities by their weighted averages over views; see `GatedModel.frozen`."""
-        exact = {name: value.double() for name, value in raw.items()}
-        shift, opacity = torch.zeros_like(exact["means"]), torch.zeros_like(exact["opacities"])
+        double = {name: value.double() for name, value in raw.items()}
+        shift, opacity = torch.zeros_like(double["means"]), torch.zeros_like(double["opacities"])
         for query, weight in zip(queries, weights.double(), strict=True):
-            moved, factor = self.change(exact, CameraTime(query.center.double(), query.time))
+            moved, factor = self.change(double, CameraTime(query.center.double(), query.time))
             shift += weight[:, None] * moved
-            opacity += weight * factor * torch.sigmoid(exact["opacities"])
-        new = {"means": exact["means"] + shift,
-               "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))}  # fmt: skip
-        return {"static": {name: value.to(raw[name].dtype) for name, value in new.items()}}
+            opacity += weight * factor * torch.sigmoid(double["opacities"])
+        means_over_views = {
+            "means": double["means"] + shift,
+            "opacities": torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)),
+        }
+        return {"static": {name: value.to(raw[name].dtype) for name, value in means_over_views.items()}}
 
     def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
         masks = super().used_entries(effect_sets)

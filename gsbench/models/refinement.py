@@ -88,8 +88,8 @@ class Refinement(nn.Module):
         weights_out = (self.weight_out * self.units[:, None]).split(self.widths)
         biases_out = (self.bias_out * self.units).split(self.widths)
         features = torch.cat(values[: len(self.widths) - 1], -1)
-        parts = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
-        layers = zip(parts, weights_out, biases_out, strict=True)
+        hidden = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
+        layers = zip(hidden, weights_out, biases_out, strict=True)
         residuals = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1).split([x.shape[-1] for x in values], -1)
         return [x + residual for x, residual in zip(values, residuals, strict=True)]
 

@@ -110,17 +110,17 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
             docs="adding_a_model.md",
         )
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
-    known: dict[str, inspect.Parameter] = {}
+    parameters: dict[str, inspect.Parameter] = {}
     for cls in (cls for cls in model.__mro__ if issubclass(cls, GaussianModel)):
         options_of_cls = inspect.signature(cls.__init__, eval_str=True).parameters.values()
-        known = {p.name: p for p in options_of_cls if p.kind is p.KEYWORD_ONLY} | known
+        parameters = {p.name: p for p in options_of_cls if p.kind is p.KEYWORD_ONLY} | parameters
     for option, value in options.items():
-        if option not in known:
-            raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, known)}")
-        if not _is_a(value, known[option].annotation):
-            expected = getattr(known[option].annotation, "__name__", known[option].annotation)
+        if option not in parameters:
+            raise InputError(f"model '{name}' has no option '{option}'. {did_you_mean(option, parameters)}")
+        if not _is_a(value, parameters[option].annotation):
+            expected = getattr(parameters[option].annotation, "__name__", parameters[option].annotation)
             raise InputError(f"model '{name}': {option}: expected {expected}, got {value!r:.80}")
-    for option, parameter in known.items():
+    for option, parameter in parameters.items():
         if parameter.default is parameter.empty and option not in options:
             raise InputError(f"model '{name}' needs the option '{option}', which has no default")
     return model(**options)

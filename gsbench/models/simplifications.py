@@ -86,16 +86,16 @@ def _averages(
 ) -> tuple[Raw, list[Tensor]]:
     """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops."""
 
-    def at(v: int) -> list[Tensor]:
+    def weighted(v: int) -> list[Tensor]:
         moved, sliced, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
         colors = [
             model.shade(moved | {"shN": less["shN"]}, sliced.means, sliced.opacities, queries[v]) for less in fewer
         ]
         return [weight * moved[name] for name in names] + [weight * (sliced.colors - others) for others in colors]
 
-    parts = side_by_side(at, range(len(queries)), model.backend.workers(weights))
-    total = next(parts)
-    for part in parts:
-        for x, y in zip(total, part, strict=True):
+    by_view = side_by_side(weighted, range(len(queries)), model.backend.workers(weights))
+    total = next(by_view)
+    for of_view in by_view:
+        for x, y in zip(total, of_view, strict=True):
             x += y
     return dict(zip(names, total, strict=False)), total[len(names) :]

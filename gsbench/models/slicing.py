@@ -156,8 +156,8 @@ def whiten(T: Tensor, delta: Tensor) -> Tensor:
     rows = T.unbind(1)
     white: list[Tensor] = []
     for i, residual in enumerate(delta.unbind(-1)):
-        for j, known in enumerate(white):
-            residual = residual - rows[i][:, j] * known
+        for j, solved in enumerate(white):
+            residual = residual - rows[i][:, j] * solved
         white.append(residual / rows[i][:, i])
     return torch.stack(white, -1) if white else delta
 

@@ -100,9 +100,9 @@ def price(scenes: list[Values]) -> str:
     Args:
         scenes: for each scene the differences [seeds, views].
     """
-    of = estimate(scenes)
-    mean = bold(number(of.mean, 2, signed=True), int(of.half_over_scenes < abs(of.mean)))
-    return f"{mean} ± {number(of.half_over_scenes, 2)}, {of.gaining} of {of.scenes}"
+    gain = estimate(scenes)
+    mean = bold(number(gain.mean, 2, signed=True), int(gain.half_over_scenes < abs(gain.mean)))
+    return f"{mean} ± {number(gain.half_over_scenes, 2)}, {gain.gaining} of {gain.scenes}"
 
 
 # ---- mini and frontier
@@ -112,10 +112,10 @@ def table1(published: Path) -> str:
     """Return the means of `make table1`, PSNR also by scene, with the newer methods last."""
     chapter = only(published, "mini")
     quantities = ["psnr_db", "ssim", "lpips_alex", "train_s", "fps", "gaussians"]
-    of = means(chapter, *quantities).xs("", level="variant")
+    table = means(chapter, *quantities).xs("", level="variant")
     scenes = chapter.runs.groupby(["model", "scene"]).psnr_db.mean().unstack()
-    models = [model for model in (*MODELS, *SUCCESSORS) if model in of.index]
-    return block(scenes.loc[models].join(of[quantities]), fps=Column("FPS", 0))
+    models = [model for model in (*MODELS, *SUCCESSORS) if model in table.index]
+    return block(scenes.loc[models].join(table[quantities]), fps=Column("FPS", 0))
 
 
 def cost(published: Path, lengths: Sequence[str] = ("250", "1,000", "4,000"), models: Sequence[str] = MODELS) -> str:
@@ -131,8 +131,8 @@ def frontier(published: Path) -> str:
     best = pd.concat({budget: table.head(1) for budget, table in contests(chapter).items()}, names=["budget", ""])
     best = best.assign(best=("`" + best.model + "` " + best.variant).str.rstrip()).droplevel(1)
     newer = [model for model in SUCCESSORS if model in set(chapter.runs.model)]
-    parts = [cost(published, list(LENGTHS)), cost(published, ["1,000", "2,000"], newer) if newer else ""]
-    return "\n\n".join([*filter(None, parts), block(best[["best", "psnr_db"]])])
+    tables = [cost(published, list(LENGTHS)), cost(published, ["1,000", "2,000"], newer) if newer else ""]
+    return "\n\n".join([*filter(None, tables), block(best[["best", "psnr_db"]])])
 
 
 def effects(published: Path) -> str:
@@ -159,10 +159,10 @@ def ablation(published: Path) -> str:
     """Return what each part of 7DGS is worth: the first row has its PSNR, the others the differences to it."""
     chapter = only(published, "ablation")
     keys = {variant: (model, variant) for model, variant in zip(chapter.runs.model, chapter.runs.variant, strict=True)}
-    whole, *parts = [keys[f"ablation={name}"] for name in ABLATIONS]
+    full, *ablated = [keys[f"ablation={name}"] for name in ABLATIONS]
     arrays = stats.grids(chapter)
-    tests = [stats.differences(arrays, [{whole: 1.0}]).assign(significant=False),
-             stats.differences(arrays, [{part: 1.0, whole: -1.0} for part in parts])]  # fmt: skip
+    tests = [stats.differences(arrays, [{full: 1.0}]).assign(significant=False),
+             stats.differences(arrays, [{part: 1.0, full: -1.0} for part in ablated])]  # fmt: skip
     table = changes(pd.concat(tests, ignore_index=True), sorted(arrays))
     table.insert(0, "`+ablation=`", [f"`{name}`" for name in ABLATIONS])
     columns = {"mean": Column("PSNR, dB")}
@@ -200,20 +200,20 @@ def suite_lengths(published: Path) -> str:
     """Return what models reach and what effects change after three lengths, over the dynamic scenes that all have."""
     variants = {n: LENGTHS[n] for n in ("500", "1,000", "2,000")}
     chapters = [study(published / "suite")[kind] for kind in MOVING]
-    runs = pd.concat([of.runs for of in chapters])
+    runs = pd.concat([chapter.runs for chapter in chapters])
     runs = runs[runs.model.isin(MODELS) & runs.variant.isin(variants.values())]
     counts = runs.drop_duplicates(["scene", "model", "variant"]).scene.value_counts()
     shared = set(counts.index[counts == len(MODELS) * len(variants)])
     by_scene = runs[runs.scene.isin(shared)].groupby(["variant", "model", "scene"])[["psnr_db", "train_s"]].mean()
-    of = by_scene.groupby(["variant", "model"]).mean().unstack("model").loc[list(variants.values())]
-    of = of.set_axis(pd.Index(variants, name="iterations"))
+    averages = by_scene.groupby(["variant", "model"]).mean().unstack("model").loc[list(variants.values())]
+    averages = averages.set_axis(pd.Index(variants, name="iterations"))
     arrays = {scene: grid for chapter in chapters for scene, grid in stats.grids(chapter).items() if scene in shared}
     prices = {
         f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in CHANGES]
         for n, variant in variants.items()
     }
     table = pd.DataFrame(prices, pd.Index(CHANGES, name="effect"))
-    return f"{reached(of.psnr_db[MODELS], of.train_s[MODELS])}\n\n{block(table)}"
+    return f"{reached(averages.psnr_db[MODELS], averages.train_s[MODELS])}\n\n{block(table)}"
 
 
 def suite_choices(published: Path) -> str:
@@ -222,15 +222,15 @@ def suite_choices(published: Path) -> str:
     unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()
     runs = runs[~runs.scene.map(unusable)]
     psnr = runs.pivot(index=["scene", "seed"], columns="name", values="psnr_db")
-    whole = [model for model in MODELS if model != "auto"]
-    best = psnr[whole].max(axis=1)
+    fixed = [model for model in MODELS if model != "auto"]
+    best = psnr[fixed].max(axis=1)
     lost = {title: psnr[name] - best for name, title in CHOICES.items()}
     for part in PARTS:
-        val = runs[runs.name.isin(whole)].pivot(index=["scene", "seed"], columns="name", values=f"val {part}")
+        val = runs[runs.name.isin(fixed)].pivot(index=["scene", "seed"], columns="name", values=f"val {part}")
         chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
         lost[f"the best model on val after {100 * part:.0f} % of the iterations"] = chosen - best
-    of = pd.DataFrame(lost).groupby("scene").mean()
-    table = pd.DataFrame({"mean": of.mean(), "worst": of.min(), "near": (of >= -0.1).sum(), "of scenes": len(of)})
+    gap = pd.DataFrame(lost).groupby("scene").mean()
+    table = pd.DataFrame({"mean": gap.mean(), "worst": gap.min(), "near": (gap >= -0.1).sum(), "of scenes": len(gap)})
     return block(table.rename_axis("choice"), mean=Column("mean, dB", 2, signed=True),
                  worst=Column("worst scene, dB", 2, signed=True), near=Column("at most 0.1 dB below", 0))  # fmt: skip
 
@@ -265,9 +265,9 @@ def dnerf(published: Path, quantities: dict[str, str]) -> str:
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == "")].set_index("scene")
-    parts = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
+    by_column = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
              for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
-    table = pd.DataFrame(parts).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
+    table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
@@ -282,14 +282,14 @@ def _minutes(of: pd.Series, device: str) -> pd.Series:
 def trex400(published: Path) -> str:
     """Return trex as the paper trains it, with both initial lambda_t, beside the paper's rows; and other recipes."""
     results = load(published / "dnerf").finished  # a chapter has times of one machine
-    of = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
+    averages = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
     rows: dict[str, pd.Series] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
         for words, device in {"device=cuda,": "GPU", "": "CPU"}.items():
             for start in ("", f"{LAMBDA_T},"):
-                if (model, variant := f"{words}{start}{AT_PAPER}") in of.index:
+                if (model, variant := f"{words}{start}{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
-                    rows[title] = _minutes(of.loc[(model, variant)], device)
+                    rows[title] = _minutes(averages.loc[(model, variant)], device)
         names = {"psnr_db": "psnr_best_on_test_db", "train_min": "GPU min"}
         rows[f"{model}, paper"] = paper.average("D-NeRF", ["trex"], model).rename(names)
     others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
@@ -297,7 +297,7 @@ def trex400(published: Path) -> str:
               ("7dgs_noagr", "quick", f",{LAMBDA_T}")]  # fmt: skip
     for model, name, more in others:
         start = "λ_t from 0.05, " if LAMBDA_T in more else ""
-        rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(of.loc[(model, f"recipe={name}{more}")], "CPU")
+        rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(averages.loc[(model, f"recipe={name}{more}")], "CPU")
     table = pd.DataFrame(rows).T.rename_axis("trex, 400 x 400").astype(float)
     intervals = ["psnr_db ±", "psnr_best_on_test_db ±"]
     return block(table[["seeds", *OF_TREX, *intervals]], **OF_TREX)
@@ -308,9 +308,9 @@ def on_demand(published: Path) -> str:
     rows: dict[str, dict[str, float]] = {}
     columns: dict[str, Column] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
-        of = pd.concat([_removal(chapter, model) for chapter in study(published / "effects").values()])
-        ends = {f"{name} {end}": of[name].agg(end) for name in of for end in ("min", "max")}
-        rows[model] = ends | {"scenes": len(of)}
+        by_scene = pd.concat([_removal(chapter, model) for chapter in study(published / "effects").values()])
+        ends = {f"{name} {end}": by_scene[name].agg(end) for name in by_scene for end in ("min", "max")}
+        rows[model] = ends | {"scenes": len(by_scene)}
     for name, title, digits in (("psnr_db", "dB", 2), ("frame_ms", "frame time, %", 0), ("model_mb", "MB, %", 0)):
         columns |= {f"{name} {end}": Column(f"{title}, {end}", digits, signed=True) for end in ("min", "max")}
     return block(pd.DataFrame(rows).T[["scenes", *columns]].rename_axis("model"), **columns)
@@ -320,13 +320,13 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
     """Return by scene the change of PSNR, and of frame time and size in per cent, where effects are removed."""
     names = ["psnr_db", "frame_ms", "model_mb"]
     runs = chapter.runs[chapter.runs.model == model]
-    of = runs.groupby(["variant", "scene"])[names].mean()
+    averages = runs.groupby(["variant", "scene"])[names].mean()
     gated = runs.groupby("variant").on_demand.any()
     rows = [pd.DataFrame(columns=names)]
     for less in gated.index[gated]:
         words = set(less.split(","))
         full = max(gated.index[~gated], key=lambda variant: len(words & set(variant.split(","))))
-        new, old = of.loc[less], of.loc[full].reindex(of.loc[less].index)
+        new, old = averages.loc[less], averages.loc[full].reindex(averages.loc[less].index)
         rows.append((100 * (new / old - 1)).assign(psnr_db=new.psnr_db - old.psnr_db))
     return pd.concat(rows).astype(float)
 

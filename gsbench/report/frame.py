@@ -88,14 +88,14 @@ def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
             faults = [*faults, printable(f"{path}: the same run as {once[run][0]}; keep one of them")]
         else:
             once[run] = path, record
-    kept = [once[run] for run in sorted(once)]
-    runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in kept], dtype=object)
+    unique = [once[run] for run in sorted(once)]
+    runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in unique], dtype=object)
     first = [*(column.name for column in RUNS), "path", "record"]
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
     runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
-    views = [view for i, (_, record) in enumerate(kept) for view in _views(i, record)]
-    points = [(i, point) for i, (_, record) in enumerate(kept) for point in record.curve]
-    curves = [{"run": i} | {name: getattr(point, of) for name, of in CURVES.items()} for i, point in points]
+    views = [view for i, (_, record) in enumerate(unique) for view in _views(i, record)]
+    points = [(i, point) for i, (_, record) in enumerate(unique) for point in record.curve]
+    curves = [{"run": i} | {name: getattr(point, key) for name, key in CURVES.items()} for i, point in points]
     return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
 
 
@@ -145,8 +145,8 @@ def psnr_val(r: Record) -> float:
         return _number((r.metrics or {}).get("psnr"))
     gates = r.on_demand.gates if r.on_demand else []
     lost = sum(gate.measured_db for gate in gates if gate.step is None and gate.checked_on == "val")
-    kept = [point for point in r.curve if r.stop is None or point.iteration == r.stop.kept]
-    return _number(kept[-1].psnr_val) - lost if kept else math.nan
+    points = [point for point in r.curve if r.stop is None or point.iteration == r.stop.kept]
+    return _number(points[-1].psnr_val) - lost if points else math.nan
 
 
 def iterations(r: Record) -> float:

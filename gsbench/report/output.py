@@ -28,9 +28,9 @@ def tables(results: Results, columns: Sequence[str] = (), *, latex: bool = False
         latex: whether they are for --latex.
     """
     return [
-        table(chapter, columns) if of.key == "experiment" else of
+        table(chapter, columns) if section.key == "experiment" else section
         for chapter in results.chapters()
-        for of in built(chapter, attrgetter("in_latex" if latex else "in_terminal"))
+        for section in built(chapter, attrgetter("in_latex" if latex else "in_terminal"))
     ]
 
 

@@ -104,7 +104,7 @@ def table1(runs: pd.DataFrame) -> pd.DataFrame:
     """
     numbers = [name + end for name in TABLE_1 for end in ("", " ±", " paper", " difference")]
     names = ["table", "dataset", "experiment", "scene", "scenes", "model", "recipe", "seeds", *numbers]
-    rows = [_rows(kind, dataset, of) for kind, dataset, of in _tables(runs) if (of.status == "ok").any()]
+    rows = [_rows(kind, dataset, group) for kind, dataset, group in _tables(runs) if (group.status == "ok").any()]
     return pd.concat([pd.DataFrame(columns=names), *rows], ignore_index=True)[names]
 
 
@@ -113,14 +113,14 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     for dataset in paper.PROTOCOLS:
         yield "paper", dataset, _at_paper(runs, dataset)
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
-    pools = [of for _, of in runs[runs.departs != ""].groupby("pool")]
-    for of in sorted(pools, key=lambda of: -_effort(of)):  # the sort is stable, and groups are in order of their names
-        if (of.status == "ok").any():
-            nearest.setdefault(of.pool.iloc[0][:2], of)
+    pools = [pool for _, pool in runs[runs.departs != ""].groupby("pool")]
+    for pool in sorted(pools, key=lambda pool: -_effort(pool)):  # equal ones stay in order of their names
+        if (pool.status == "ok").any():
+            nearest.setdefault(pool.pool.iloc[0][:2], pool)
     for kind in ("other protocol", "other data"):
-        for (paper_dataset, dataset), of in nearest.items():
+        for (paper_dataset, dataset), pool in nearest.items():
             if (kind == "other protocol") == (paper_dataset == dataset):
-                yield kind, dataset, of
+                yield kind, dataset, pool
 
 
 def _at_paper(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
@@ -146,8 +146,8 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
     if runs.scene.nunique() > 1 and covered:
         averaged[paper.AVERAGE] = covered
         groups.append((paper.AVERAGE, plain[plain.scene.isin(covered)]))
-    parts = [stats.means(of, RECIPE, TABLE_1).assign(scene=name) for name, of in groups if len(of)]
-    table = pd.concat(parts, ignore_index=True).assign(table=kind, dataset=dataset)
+    tables = [stats.means(of, RECIPE, TABLE_1).assign(scene=name) for name, of in groups if len(of)]
+    table = pd.concat(tables, ignore_index=True).assign(table=kind, dataset=dataset)
     numbers = [paper.average(dataset if kind == "paper" else "", averaged[scene], model)
                for scene, model in zip(table.scene, table.model, strict=True)]  # fmt: skip
     of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda of: of.psnr_db)
@@ -164,17 +164,17 @@ def _once(runs: pd.DataFrame, by: Sequence[str] = RECIPE) -> pd.DataFrame:
 
 def table2(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the paper's averages over each of its data sets, and those of models that finished all its scenes."""
-    parts = []
+    tables = []
     for dataset, protocol in paper.PROTOCOLS.items():
-        parts.append(_quoted(dataset))
+        tables.append(_quoted(dataset))
         at_paper = _at_paper(runs, dataset)
         if (at_paper.status == "ok").any():
             means = stats.means(_once(of_one_machine(at_paper)), RECIPE, TABLE_2)
             means = means[means.scenes == len(protocol.scenes)]
             named = {"method": means.model, "source": "measured, experiment " + means.experiment}
-            parts.append(means.assign(dataset=dataset, **named))
+            tables.append(means.assign(dataset=dataset, **named))
     names = ["dataset", "method", "source", "recipe", "seeds", *(name + end for name in TABLE_2 for end in ("", " ±"))]
-    return pd.concat(parts, ignore_index=True).reindex(columns=names)
+    return pd.concat(tables, ignore_index=True).reindex(columns=names)
 
 
 def _quoted(dataset: str) -> pd.DataFrame:
@@ -268,12 +268,12 @@ def _protocol(record: Record) -> str:
 
     Parts that the name of a protocol does not imply are added: another filter, rounding or background.
     """
-    of = record.protocol
+    settings = record.protocol
     batch = value_at(record, "provenance.config.train.batch_size")
     steps = iterations(record)
-    name = of.get("name", "protocol not recorded")
+    name = settings.get("name", "protocol not recorded")
     implied = {"resize": "pillow" if name == "dgs2026" else None, "quantise": name == "dgs2026", "background": "black"}
-    more = [f"{key} {of.get(key)}" for key, value in implied.items() if of.get(key) != value]
+    more = [f"{key} {settings.get(key)}" for key, value in implied.items() if settings.get(key) != value]
     length = f"{steps if steps > 0 else 0:,.0f} x {batch}"
     return printable(", ".join([name, paper.relative_size(record), length, *more]))
 
@@ -291,14 +291,14 @@ def sections(results: Results) -> dict[str, list[Section]]:
 def _sections1(runs: pd.DataFrame) -> Iterator[Section]:
     """Yield the tables of measured rows, each with the paper's row and the difference below it."""
     rows = table1(runs)
-    for kind, dataset, of in _tables(runs):
+    for kind, dataset, group in _tables(runs):
         table = _with_paper(rows[(rows.table == kind) & (rows.dataset == dataset)])
         is_paper = kind == "paper"
-        title = f"Table 1, {dataset}, at the paper's protocol" if is_paper else f"{kind.upper()}, {_heading(of)}"
+        title = f"Table 1, {dataset}, at the paper's protocol" if is_paper else f"{kind.upper()}, {_heading(group)}"
         if len(table):
             yield Section(f"table1-{kind}-{dataset}", title, TEXT_1 if is_paper else TEXT_OTHER, table)
-        if is_paper and len(of):
-            yield Section(f"seeds-{dataset}", f"Seeds, {dataset}", TEXT_SEEDS, seeds(of, dataset))
+        if is_paper and len(group):
+            yield Section(f"seeds-{dataset}", f"Seeds, {dataset}", TEXT_SEEDS, seeds(group, dataset))
 
 
 def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
@@ -309,12 +309,12 @@ def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows.assign(scene=rows.scene.where(rows.scenes == 1, averages))
     has_paper = rows["psnr_db paper"].notna()
     halves = [f"{name} ±" for name in TABLE_1]
-    parts = [rows[["scene", *TABLE_1, *halves, "seeds"]].assign(model=label)]
+    tables = [rows[["scene", *TABLE_1, *halves, "seeds"]].assign(model=label)]
     for end in ("paper", "difference"):
         lines = rows.loc[has_paper, [f"{name} {end}" for name in TABLE_1]].set_axis(TABLE_1, axis=1)
-        parts.append(lines.assign(scene=rows.scene[has_paper], model=end))
+        tables.append(lines.assign(scene=rows.scene[has_paper], model=end))
     order = [name for column in TABLE_1 for name in (column, f"{column} ±")]
-    table = pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
+    table = pd.concat(tables).sort_index(kind="stable").reset_index(drop=True)
     return table[["scene", "model", *order, "seeds"]].astype(dict.fromkeys([*order, "seeds"], float))
 
 
@@ -329,15 +329,15 @@ def seeds(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
 def pools(runs: pd.DataFrame) -> Section:
     """Count the runs of each protocol, and tell whether a table shows them."""
     rows = []
-    shown = [set(of.index) for _, _, of in _tables(runs)]
-    for (pool, differs), of in runs.groupby(["pool", runs.departs != ""]):
+    shown = [set(pooled.index) for _, _, pooled in _tables(runs)]
+    for (pool, differs), pooled in runs.groupby(["pool", runs.departs != ""]):
         _, dataset, experiment, _, resize, steps = pool
-        settings = sorted({word for departs in of.departs for word in departs.split(", ")}) if differs else []
+        settings = sorted({word for departs in pooled.departs for word in departs.split(", ")}) if differs else []
         rows.append({
-            "data": dataset, "experiment": experiment, "size": ", ".join(sorted(set(of["size"]))),
-            "filter": resize.removesuffix("None"), "iterations": steps, "runs": len(of),
-            "failed": int((of.status != "ok").sum()), "machines": of.machine.nunique(),
-            "differs in": ", ".join(settings), "shown": any(set(of.index) <= table for table in shown),
+            "data": dataset, "experiment": experiment, "size": ", ".join(sorted(set(pooled["size"]))),
+            "filter": resize.removesuffix("None"), "iterations": steps, "runs": len(pooled),
+            "failed": int((pooled.status != "ok").sum()), "machines": pooled.machine.nunique(),
+            "differs in": ", ".join(settings), "shown": any(set(pooled.index) <= table for table in shown),
         })  # fmt: skip
     return Section("pools", "All runs on the paper's data or stand-ins", TEXT_POOLS, pd.DataFrame(rows))
 
@@ -362,12 +362,12 @@ def _sections2(runs: pd.DataFrame) -> Iterator[Section]:
 def _sections_of_successors(results: Results) -> Iterator[Section]:
     rows = successors(results)
     for dataset in SUCCESSOR_SCENES:
-        of = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
-        sources = list(of.protocol[of.row == "published"].unique())
-        of["protocol"] = [f"published ({sources.index(p) + 1})" if p in sources else p for p in of.protocol]
+        lines = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
+        sources = list(lines.protocol[lines.row == "published"].unique())
+        lines["protocol"] = [f"published ({sources.index(p) + 1})" if p in sources else p for p in lines.protocol]
         notes = tuple(f"({i}) {source}" for i, source in enumerate(sources, 1))
         columns = {"scenes": Column("scenes", 0), "seeds": Column("seeds", 0)}
-        table, title = of.drop(columns="row"), f"Successors of 7DGS, {dataset}"
+        table, title = lines.drop(columns="row"), f"Successors of 7DGS, {dataset}"
         yield Section(f"successors-{dataset}", title, TEXT_SUCCESSORS, table, columns, notes=notes)
 
 

@@ -92,12 +92,12 @@ def compare(new: Results, reference: Results) -> Reproduction:
     rows: list[dict[str, Any]] = []
     seeds = [_shared_seeds(runs[:0], runs[:0]).astype({"bit_equal": bool})]
     unmatched: list[dict[str, Any]] = []
-    for key, of in runs.groupby(ROW):
+    for key, matching in runs.groupby(ROW):
         row = dict(zip(ROW, key, strict=True))
-        if of.side.nunique() == 1:
-            unmatched.append(row | {"reason": _why_unmatched(of, runs)})
+        if matching.side.nunique() == 1:
+            unmatched.append(row | {"reason": _why_unmatched(matching, runs)})
             continue
-        left, right = (of[(of.side == side) & (of.status == "ok")] for side in SIDES)
+        left, right = (matching[(matching.side == side) & (matching.status == "ok")] for side in SIDES)
         reason = _incomparable(left, right)
         late = reason or _other_machine(left, right)
         shared = _shared_seeds(left, right)[: 0 if reason else None]
@@ -128,9 +128,9 @@ def _shared_seeds(left: pd.DataFrame, right: pd.DataFrame) -> pd.DataFrame:
     return shared[names].assign(bit_equal=shared.bits_x == shared.bits_y)
 
 
-def _why_unmatched(of: pd.DataFrame, runs: pd.DataFrame) -> str:
+def _why_unmatched(unmatched: pd.DataFrame, runs: pd.DataFrame) -> str:
     """Return why runs of a model on a scene have no counterpart, by the nearest training that the other folder has."""
-    first = of.iloc[0]
+    first = unmatched.iloc[0]
     others = runs[(runs[ROW[:4]] == first[ROW[:4]]).all(axis=1) & (runs.side != first.side)]
     if first.side == "reference" or others.empty:
         return f"only the {first.side} folder has it"
@@ -210,9 +210,9 @@ def _differences(table: pd.DataFrame) -> pd.DataFrame:
     squares = (table.squares / table.unit**2).where(is_compared, 0.0)
     freedom = table.freedom.where(is_compared, 0)
     pool = [table[name] for name in ("experiment", "dataset", "quantity")]
-    pooled, known = squares.groupby(pool).transform("sum"), freedom.groupby(pool).transform("sum")
-    shared = known.clip(upper=POOLED_RUNS)
-    moderated = (shared * pooled / known.where(known > 0) + squares) / (shared + freedom)
+    pooled, pooled_freedom = squares.groupby(pool).transform("sum"), freedom.groupby(pool).transform("sum")
+    shared = pooled_freedom.clip(upper=POOLED_RUNS)
+    moderated = (shared * pooled / pooled_freedom.where(pooled_freedom > 0) + squares) / (shared + freedom)
     error = np.sqrt(moderated * (1 / table.runs_new + 1 / table.runs_reference)) * table.unit
     table["difference"] = (table.new - table.reference).where(is_compared).where(~table.bit_equal, 0.0)
     error = error.where(is_compared & ~table.bit_equal)
@@ -220,7 +220,7 @@ def _differences(table: pd.DataFrame) -> pd.DataFrame:
     p = 2 * stdtr((shared + freedom).astype(float), -(table.difference.abs() / error.where(error > 0)))
     p = p.where(error != 0, (table.difference == 0).astype(float))
     table["low"], table["high"] = table.difference - half, table.difference + half
-    table["p_holm"] = p.groupby(table.quantity).transform(lambda of: holm(of.tolist()))
+    table["p_holm"] = p.groupby(table.quantity).transform(lambda values: holm(values.tolist()))
     return table
 
 
@@ -249,20 +249,22 @@ def in_shown_unit(table: pd.DataFrame) -> pd.Series:
     )
 
 
-def summary(of: Reproduction) -> pd.DataFrame:
+def summary(result: Reproduction) -> pd.DataFrame:
     """Count the verdicts of each quantity over models on scenes, and name the largest difference."""
-    counts = pd.crosstab(of.table.quantity, of.table.verdict)
+    counts = pd.crosstab(result.table.quantity, result.table.verdict)
     counts = counts.reindex(index=list(TITLES), columns=[AGREES, DIFFERS, UNDECIDED], fill_value=0)
-    table = counts.assign(**{"bit-equal": of.table.groupby("quantity").bit_equal.sum()}).fillna(0).astype(int)
-    rows = of.table.assign(largest=in_shown_unit(of.table), on=names_of(of.table) + " on " + of.table.scene)
+    table = counts.assign(**{"bit-equal": result.table.groupby("quantity").bit_equal.sum()}).fillna(0).astype(int)
+    rows = result.table.assign(
+        largest=in_shown_unit(result.table), on=names_of(result.table) + " on " + result.table.scene
+    )
     largest = rows.sort_values("largest", key=abs).dropna(subset="largest").drop_duplicates("quantity", keep="last")
     return table.join(largest.set_index("quantity")[["largest", "on"]]).reset_index(names="quantity")
 
 
-def reasons(of: Reproduction) -> pd.DataFrame:
+def reasons(result: Reproduction) -> pd.DataFrame:
     """Count for each reason the models on scenes that are undecided or not compared."""
-    undecided = of.table[of.table.reason != ""].assign(quantities=lambda rows: rows.quantity.map(TITLES))
-    rows = pd.concat([undecided, of.unmatched.assign(quantities="all")])
+    undecided = result.table[result.table.reason != ""].assign(quantities=lambda rows: rows.quantity.map(TITLES))
+    rows = pd.concat([undecided, result.unmatched.assign(quantities="all")])
     rows = rows.assign(on=names_of(rows) + " on " + rows.scene)
     groups = rows.groupby("reason", sort=False)
     join = lambda values: ", ".join(dict.fromkeys(values))  # noqa: E731
@@ -276,16 +278,16 @@ def reasons(of: Reproduction) -> pd.DataFrame:
     return table.sort_values("models on scenes", ascending=False, kind="stable").reset_index()
 
 
-def sections(of: Reproduction, reference: str) -> list[Section]:
+def sections(result: Reproduction, reference: str) -> list[Section]:
     """Return the comparison with a reference folder: each model on a scene, what is undecided, and the summary."""
-    psnr = of.of("psnr_db").set_index(ROW)
+    psnr = result.of("psnr_db").set_index(ROW)
     table = psnr[[*SIDES, "difference", "verdict"]].assign(**{"difference ±": psnr.high - psnr.difference})
     for quantity in list(TITLES)[1:]:
-        rows = of.of(quantity).set_index(ROW)
+        rows = result.of(quantity).set_index(ROW)
         table[quantity] = in_shown_unit(rows)
-    differing = of.table[of.table.verdict == DIFFERS]
+    differing = result.table[result.table.verdict == DIFFERS]
     table["differs in"] = differing.quantity.map(TITLES).groupby([differing[name] for name in ROW]).agg(", ".join)
-    bits = of.seeds.groupby(ROW).bit_equal
+    bits = result.seeds.groupby(ROW).bit_equal
     table["seeds"], table["bit-equal"] = bits.size(), bits.sum()
     table = table.fillna({"seeds": 0, "bit-equal": 0}).reset_index()
     table["model"] = names_of(table)
@@ -297,23 +299,23 @@ def sections(of: Reproduction, reference: str) -> list[Section]:
         "reference": Column("reference PSNR"),
     }
     columns |= {name: Column(TITLES[name], 1, signed=True) for name in list(TITLES)[1:]}
-    counts = summary(of).assign(quantity=list(TITLES.values()))
+    counts = summary(result).assign(quantity=list(TITLES.values()))
     titles = {"largest": Column("largest difference", 2, signed=True)}
-    parts = [Section("against", f"Against {printable(reference)}", RULE, table, columns)]
-    if len(why := reasons(of)):
-        parts.append(Section("undecided", "What is undecided or not compared", "", why))
-    return [*parts, Section("verdict", f"PSNR {of.verdict}, against {printable(reference)}", "", counts, titles)]
+    shown = [Section("against", f"Against {printable(reference)}", RULE, table, columns)]
+    if len(why := reasons(result)):
+        shown.append(Section("undecided", "What is undecided or not compared", "", why))
+    return [*shown, Section("verdict", f"PSNR {result.verdict}, against {printable(reference)}", "", counts, titles)]
 
 
-def content(of: Reproduction, new: Results, reference: Results) -> dict[str, Any]:
+def content(result: Reproduction, new: Results, reference: Results) -> dict[str, Any]:
     """Return a comparison, and the runs of both folders that it compares, as plain values for JSON."""
     columns = [*ROW, "seed", "status", *LIMITS.index, "machine"]
-    both = of.table[ROW].drop_duplicates()
+    both = result.table[ROW].drop_duplicates()
     sides = zip(SIDES, (new.runs, reference.runs), strict=True)
     runs = {side: runs[columns].merge(both, validate="many_to_one") for side, runs in sides}
-    tables = {"summary": summary(of), "rows": of.table, "seeds": of.seeds, "unmatched": of.unmatched}
+    tables = {"summary": summary(result), "rows": result.table, "seeds": result.seeds, "unmatched": result.unmatched}
     return {
-        "verdict": of.verdict,
+        "verdict": result.verdict,
         "rule": RULE,
         **{name: table.to_dict("records") for name, table in tables.items()},
         "runs": {side: table.to_dict("records") for side, table in runs.items()},

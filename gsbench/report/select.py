@@ -26,11 +26,11 @@ class Selection:
         runs = results.runs
         _check("model", self.models, set(runs.model))
         _check("scene", self.scenes, set(runs.scene))
-        kept = runs.model.isin(self.models or set(runs.model)) & runs.scene.isin(self.scenes or set(runs.scene))
-        if len(runs) and not kept.any():
+        is_selected = runs.model.isin(self.models or set(runs.model)) & runs.scene.isin(self.scenes or set(runs.scene))
+        if len(runs) and not is_selected.any():
             pairs = ", ".join(sorted({printable(pair) for pair in runs.model + " on " + runs.scene}))
             raise InputError(f"--select: expected a model and a scene with runs, got none. There is: {pairs}.")
-        return results.of(kept)
+        return results.of(is_selected)
 
 
 def parse(words: Sequence[str]) -> Selection:

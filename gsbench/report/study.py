@@ -84,21 +84,21 @@ def read(folder: Path) -> tuple[list[Record], list[str]]:
 
 def _records(runs: list[Row], views: list[Row], curves: list[Row], where: str) -> Iterator[Record | InputError]:
     """Yield the record of each run, or what is wrong with it."""
-    parts: dict[str, tuple[list[Any], list[Any]]] = {run.get("run", ""): ([], []) for run in runs}
-    if len(parts) < len(runs):
+    by_run: dict[str, tuple[list[Any], list[Any]]] = {run.get("run", ""): ([], []) for run in runs}
+    if len(by_run) < len(runs):
         raise InputError(f"{where}: run: expected another number in each row")
     for kind, (rows, columns) in enumerate(((views, VIEWS), (curves, CURVES))):
         for row in rows:
-            if row.get("run") not in parts:
+            if row.get("run") not in by_run:
                 raise InputError(f"{where}: expected the run {row.get('run')!r:.80}, which the other tables name")
             numbers = [_value(row.get(name, "")) for name in columns]
             view = {"name": _value(row.get("view", ""))} | dict(zip(VIEWS.values(), numbers, strict=False))
-            parts[row["run"]][kind].append(numbers if columns is CURVES else view)
+            by_run[row["run"]][kind].append(numbers if columns is CURVES else view)
     for run in runs:
         place = f"{where}: run {run['run']}"
         try:
             plain = _nested({name: text for name, text in run.items() if text and name != "run"}, place)
-            plain["per_view"], plain["curve"] = parts[run["run"]]
+            plain["per_view"], plain["curve"] = by_run[run["run"]]
             yield files.parsed(plain, place)
         except InputError as error:
             yield error

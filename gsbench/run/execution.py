@@ -257,15 +257,15 @@ def _record_of(execution: Execution) -> Record:
     spec, spare = execution.spec, [bytearray(SPARE)]
     try:
         model, scene = execution.prepare()
-        kept = finished(spec, scene)
-        record = kept or execution.measure(execution.fit(model, scene))
+        earlier = finished(spec, scene)
+        record = earlier or execution.measure(execution.fit(model, scene))
     except Exception as error:
         spare.clear()
-        kept, record = None, _ended_badly(execution, error)
-    if kept is not None:
-        print(f"{spec.name}: finished before, kept: {summary(kept)}; measured {_where(spec, kept)}; "
+        earlier, record = None, _ended_badly(execution, error)
+    if earlier is not None:
+        print(f"{spec.name}: finished before, kept: {summary(earlier)}; measured {_where(spec, earlier)}; "
               f"{spec.folder / records.FILE_NAME}")  # fmt: skip
-        return kept
+        return earlier
     try:
         write(record, spec.folder)
     except OSError as error:  # the sweep continues with its other runs; the checkpoint of this run is unchanged
@@ -336,11 +336,11 @@ def summary(record: Record) -> str:
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
     psnr, choice = record.metrics["psnr"], record.length_choice
-    kept = f"{choice.kept} iterations kept, " if choice else ""
-    exact = f". {printable(sentence(record.exact))}" if record.exact else ""
+    length = f"{choice.kept} iterations kept, " if choice else ""
+    exact_views = f". {printable(sentence(record.exact))}" if record.exact else ""
     return (
-        f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {kept}"
-        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{exact}{too_long(record)}"
+        f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {length}"
+        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{exact_views}{too_long(record)}"
     )
 
 
@@ -407,9 +407,9 @@ def _outdated(spec: RunSpec, scene: Scene, record: Record) -> str:
 def _lacks_lpips(spec: RunSpec, scene: Scene, record: Record) -> str:
     """Return why an earlier run must be measured again for LPIPS (its weights were added); "" if its record is kept."""
     camera, weights = evaluated_views(scene, spec.config.scene.eval_split)[0].camera, lpips_weights(spec.config)
-    new = [name for name, known in perceptual.BACKBONES.items()
+    new = [name for name, backbone in perceptual.BACKBONES.items()
            if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, weights.get(name))
-           and min(camera.width, camera.height) >= known.least_side]  # fmt: skip
+           and min(camera.width, camera.height) >= backbone.least_side]  # fmt: skip
     if not new:
         return ""
     what = f"it has no LPIPS ({', '.join(new)}), whose weights are here now"

@@ -144,10 +144,10 @@ def _printed(value: Any) -> str:
 
 def _cut(words: list[str]) -> str:
     """Join words by commas; if the result is too long, keep the first words and append a hash of all words."""
-    whole = ",".join(words)
-    if len(whole) <= LONGEST_VARIANT:
-        return whole
-    ending = f",{_digest(whole)}"
+    variant = ",".join(words)
+    if len(variant) <= LONGEST_VARIANT:
+        return variant
+    ending = f",{_digest(variant)}"
     while words and len(",".join(words) + ending) > LONGEST_VARIANT:
         words = words[:-1]
     return (",".join(words) + ending).lstrip(",")

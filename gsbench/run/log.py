@@ -86,10 +86,10 @@ class WeightsAndBiases:
     def __init__(self, subject: Subject) -> None:
         import wandb
 
-        known = _read_id(subject)
+        old_id = _read_id(subject)
         self.run: Any = wandb.init(
-            project="gsbench", group=subject.experiment, name=subject.name, id=known, resume="allow" if known else None,
-            dir=str(subject.folder), config=dict(subject.settings),
+            project="gsbench", group=subject.experiment, name=subject.name, dir=str(subject.folder),
+            id=old_id, resume="allow" if old_id else None, config=dict(subject.settings),
             settings=wandb.Settings(init_timeout=WANDB_SECONDS, console="off"),
         )  # fmt: skip
         _write_id(subject, self.run.id)
@@ -114,8 +114,8 @@ class MLflow:
         self.client: Any = mlflow.MlflowClient()
         self.id = _read_id(subject)
         if self.id is None:
-            known = self.client.get_experiment_by_name(subject.experiment)
-            experiment = known.experiment_id if known else self.client.create_experiment(subject.experiment)
+            earlier = self.client.get_experiment_by_name(subject.experiment)
+            experiment = earlier.experiment_id if earlier else self.client.create_experiment(subject.experiment)
             self.id = str(self.client.create_run(experiment, run_name=subject.name).info.run_id)
             values = [(key, str(value)[:LONGEST_PARAMETER]) for key, value in subject.settings.items()]
             for i in range(0, len(values), MOST_PARAMETERS):
@@ -215,8 +215,8 @@ class RunLog:
         self.trainer = trainer
         self.split = spec.config.scene.eval_split
         points = trainer.curve.points
-        known = _read_curve(self.path)
-        lines = [known.get(point, _line(point)) for point in points]
+        earlier_lines = _read_curve(self.path)
+        lines = [earlier_lines.get(point, _line(point)) for point in points]
         self.written = len(points)
         with contextlib.suppress(OSError):  # a full disk ends the run at its checkpoint, which says so
             write_atomically(self.path, "".join(map(_text, lines)).encode(), lasting=False)
@@ -225,7 +225,7 @@ class RunLog:
             spec.config.log, Subject(spec.folder, spec.name, spec.config.experiment, settings, continued)
         )
         for point, line in zip(points, lines, strict=True):
-            if point not in known:  # measured before the run had a log, while models or lengths were compared
+            if point not in earlier_lines:  # measured before the run had a log, while models or lengths were compared
                 self._send(point, line)
 
     def follow(self) -> None:

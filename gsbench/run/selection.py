@@ -63,17 +63,17 @@ class Candidates:
         config = self.settings[name]
         return fitting.trainer_of(build(config), self.scene, config, self.start)
 
-    def chosen(self, known: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
+    def chosen(self, chosen_in: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
         """Return the trainer of the candidate that the run's own checkpoint names, or else of the one to `choose` now.
 
-        The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `known`
+        The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `chosen_in`
         returns the name of the chosen candidate in the state of a checkpoint.
 
         Raises:
             InputError: a checkpoint is damaged.
         """
         state = fitting.saved_state(self.spec, self.scene)
-        name = known(state) if state else None
+        name = chosen_in(state) if state else None
         if name is None:
             trainer = choose()
             fitting.save(trainer.state_dict(), self.spec, self.scene, plain(self.spec, trainer.config))
@@ -248,21 +248,21 @@ def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: 
         comparison = choices_in(state).comparison
         return None if comparison is None else comparison.chosen
 
-    parts = Candidates(spec, scene, start, candidates(spec.config))
-    return parts.chosen(chosen_in, lambda: _trained_models(parts, model))
+    trainings = Candidates(spec, scene, start, candidates(spec.config))
+    return trainings.chosen(chosen_in, lambda: _trained_models(trainings, model))
 
 
-def _trained_models(parts: Candidates, model: ChosenModel) -> Trainer:
+def _trained_models(trainings: Candidates, model: ChosenModel) -> Trainer:
     """Train all candidates, print which is the best, and return its trainer with the costs of all."""
     results: list[Result] = []
-    for name, config in parts.settings.items():
+    for name, config in trainings.settings.items():
         until = Schedule(config.train, config.model.sh_degree, config.agr).compares_after
-        steps = (len(parts.settings) - 1) * until + config.train.iterations
-        results.append(parts.train(name, until, results, steps))
+        steps = (len(trainings.settings) - 1) * until + config.train.iterations
+        results.append(trainings.train(name, until, results, steps))
     chosen = best(results)
     comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
-    print(f"{parts.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
-    trainer = parts.trained(chosen, results, model.screen, model.effort)
+    print(f"{trainings.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
+    trainer = trainings.trained(chosen, results, model.screen, model.effort)
     trainer.hook(Choices).chosen.comparison = comparison
     return trainer
 
@@ -304,8 +304,8 @@ def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, mod
         DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.
         Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
     """
-    parts = Candidates(spec, scene, start, lengths(model.config))
-    return parts.chosen(_kept_length, lambda: _trained_lengths(parts, model))
+    trainings = Candidates(spec, scene, start, lengths(model.config))
+    return trainings.chosen(_kept_length, lambda: _trained_lengths(trainings, model))
 
 
 def _kept_length(state: dict[str, Any]) -> str | None:
@@ -313,18 +313,18 @@ def _kept_length(state: dict[str, Any]) -> str | None:
     return None if length is None else length_name(length.kept)
 
 
-def _trained_lengths(parts: Candidates, model: ChosenModel) -> Trainer:
+def _trained_lengths(trainings: Candidates, model: ChosenModel) -> Trainer:
     """Train one length after the other, print which is the best, and return its trainer with the costs of all."""
     results: list[Result] = []
-    steps = sum(config.train.iterations for config in parts.settings.values())
-    for name, config in parts.settings.items():
-        results.append(parts.train(name, config.train.iterations, results, steps))
+    steps = sum(config.train.iterations for config in trainings.settings.values())
+    for name, config in trainings.settings.items():
+        results.append(trainings.train(name, config.train.iterations, results, steps))
         top = highest(results)
         if top is not results[-1] and top.error is None:
             break
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [result.candidate for result in results])
-    print(f"{parts.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = parts.trained(chosen, results, model.screen, model.effort)
+    print(f"{trainings.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
+    trainer = trainings.trained(chosen, results, model.screen, model.effort)
     trainer.hook(Choices).chosen.length = choice
     return trainer

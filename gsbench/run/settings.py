@@ -60,12 +60,12 @@ def check_values(config: Config) -> None:
 
 def _check_keys(value: Any, place: str = "") -> None:
     """Raise InputError if the settings have an unknown key, which Hydra's `+key=` adds without an error."""
-    known = {field.name for field in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else None
-    members = value if isinstance(value, dict) else vars(value) if known else {}
+    fields = {field.name for field in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else None
+    members = value if isinstance(value, dict) else vars(value) if fields else {}
     for name, member in members.items():
         dotted = f"{place}.{name}".lstrip(".")
-        if known is not None and name not in known:
-            raise InputError(f"config key '{dotted}' is not known. {did_you_mean(name, known)}")
+        if fields is not None and name not in fields:
+            raise InputError(f"config key '{dotted}' is not known. {did_you_mean(name, fields)}")
         _check_keys(member, dotted)
 
 

@@ -56,17 +56,17 @@ class Request:
         self.signal: int | None = None
         self._before: dict[int, Any] = {}
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
+    def _ask(self, signal_number: int, frame: FrameType | None) -> None:
         if self.signal is None:
             _is_new()
-            self.signal = number
+            self.signal = signal_number
         elif time.monotonic() - _asked >= SAME_REQUEST:  # the earlier handler usually ends the process
-            before = self._before.get(number)
+            before = self._before.get(signal_number)
             if callable(before):
-                before(number, frame)
+                before(signal_number, frame)
             elif before == signal.SIG_DFL:
-                signal.signal(number, signal.SIG_DFL)
-                signal.raise_signal(number)
+                signal.signal(signal_number, signal.SIG_DFL)
+                signal.raise_signal(signal_number)
 
 
 @contextmanager
@@ -83,10 +83,10 @@ def requested() -> Iterator[Request]:
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    for number in SIGNALS:
-        before = signal.getsignal(number)
+    for signal_number in SIGNALS:
+        before = signal.getsignal(signal_number)
         if before != signal.SIG_IGN:  # background processes ignore SIGINT
-            request._before[number] = signal.signal(number, request._ask)
+            request._before[signal_number] = signal.signal(signal_number, request._ask)
     try:
         yield request
     except Exception as error:

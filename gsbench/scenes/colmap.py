@@ -83,7 +83,7 @@ def load(root: Path, rendition: Rendition) -> Scene:
     root = root.resolve()
     folder, notes = largest_model(root / "sparse")
     cameras, posed, points = (read_part(folder, part) for part in ("cameras", "images", "points3D"))
-    listed, digests, more = _list_shots(root, posed, read_cameras(cameras))
+    listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
     loaded = shots.read(listed, rendition)
     digests |= {
@@ -99,34 +99,34 @@ def load(root: Path, rendition: Rendition) -> Scene:
         background=rendition.background,
         points=initial,
         fingerprint=files.fingerprint(digests),
-        notes=(*more, *notes, *loaded.notes),
+        notes=(*time_notes, *notes, *loaded.notes),
         up=None,
     )
 
 
 def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[list[Shot], dict[str, str], list[str]]:
     """Return the images of a model in the order of time, the SHA-256 of times.csv by name, if it exists, and notes."""
-    listed = read_images(posed)
-    if len(listed) < HELD_OUT:
+    posed_images = read_images(posed)
+    if len(posed_images) < HELD_OUT:
         raise InputError(f"{posed.path}: expected at least {HELD_OUT} images, as one in {HELD_OUT} is a test view, "
-                         f"got {len(listed)}", docs="data.md#your-own-capture")  # fmt: skip
-    for image in listed:
+                         f"got {len(posed_images)}", docs="data.md#your-own-capture")  # fmt: skip
+    for image in posed_images:
         if image.camera not in lenses:
             raise InputError(f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number "
                              f"{image.camera}")  # fmt: skip
-    names, viewmats = [image.name for image in listed], np.stack([image.viewmat for image in listed])
-    places = times.places_of(viewmats, [lenses[image.camera].key for image in listed])
+    names, viewmats = [image.name for image in posed_images], np.stack([image.viewmat for image in posed_images])
+    places = times.places_of(viewmats, [lenses[image.camera].key for image in posed_images])
     timed, digests = times.of_images(root, times.NamedImages(names, viewmats, places, posed.path))
-    result, finder = [], ImageFinder(root)
-    for image, time in zip(listed, timed.values, strict=True):
+    listed_shots, finder = [], ImageFinder(root)
+    for image, time in zip(posed_images, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"
         path = finder.find(f"{IMAGES}/{image.name}", where)
         name = files.without_suffix(path.relative_to(root / IMAGES).as_posix())
         mask = files.find_inside(root, f"{MASKS}/{name}.png", where) if (root / MASKS).is_dir() else None
         viewmat = torch.from_numpy(image.viewmat)
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
-        result.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
-    ordered = sorted(result, key=lambda shot: (shot.time or 0.0, shot.name))
+        listed_shots.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
+    ordered = sorted(listed_shots, key=lambda shot: (shot.time or 0.0, shot.name))
     return ordered, digests, timed.notes + finder.notes()
 
 
@@ -146,9 +146,9 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
     COLMAP writes a folder 0, 1, .. for each part of a capture that it could not join. Of equals, the first is taken,
     and `sparse` itself last.
     """
-    parts = sorted(sparse.iterdir(), key=lambda path: (len(path.name), path.name)) if sparse.is_dir() else []
+    folders = sorted(sparse.iterdir(), key=lambda path: (len(path.name), path.name)) if sparse.is_dir() else []
     models = [
-        folder for folder in (*parts, sparse) if any((folder / f"images.{kind}").exists() for kind in ("bin", "txt"))
+        folder for folder in (*folders, sparse) if any((folder / f"images.{kind}").exists() for kind in ("bin", "txt"))
     ]
     if len(models) < 2:
         return models[0] if models else sparse, []
@@ -165,10 +165,10 @@ def read_cameras(file: ModelFile) -> dict[int, Lens]:
     """Return the cameras of a model by their numbers."""
     rows = _text_cameras(file) if file.path.suffix == ".txt" else _binary_cameras(file)
     by_name = {}
-    for number, model, width, height, values in rows:
-        if number in by_name:
-            raise InputError(f"{file.path}: camera {number} appears twice: write the model again")
-        by_name[number] = _lens(model, width, height, values, f"{file.path}: camera {number}")
+    for camera, model, width, height, values in rows:
+        if camera in by_name:
+            raise InputError(f"{file.path}: camera {camera} appears twice: write the model again")
+        by_name[camera] = _lens(model, width, height, values, f"{file.path}: camera {camera}")
     return by_name
 
 
@@ -237,22 +237,22 @@ def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
     """Yield the cameras of cameras.bin."""
     reader = _Reader(file)
     for _ in range(reader.unpack(_COUNT)[0]):
-        number, model, width, height = reader.unpack(_CAMERA)
-        known = _MODELS[model] if 0 <= model < len(_MODELS) else f"model {model}"
-        names = _PARAMETERS[_known(known, f"{file.path}: camera {number}")]
-        yield number, known, width, height, reader.unpack(struct.Struct(f"<{len(names)}d"))
+        camera, model, width, height = reader.unpack(_CAMERA)
+        model_name = _MODELS[model] if 0 <= model < len(_MODELS) else f"model {model}"
+        names = _PARAMETERS[_known(model_name, f"{file.path}: camera {camera}")]
+        yield camera, model_name, width, height, reader.unpack(struct.Struct(f"<{len(names)}d"))
     reader.finish()
 
 
 def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
     """Yield the cameras of cameras.txt, whose lines have an id, a model, width, height and the model's parameters."""
-    for number, line in _lines(file):
+    for line_number, line in _lines(file):
         if line:
             words = line.split()
-            with _expects("a camera's id, model, width, height and parameters", file, number, line):
+            with _expects("a camera's id, model, width, height and parameters", file, line_number, line):
                 identifier, width, height = int(words[0]), int(words[2]), int(words[3])
                 values = tuple(float(word) for word in words[4:])
-            yield identifier, _known(words[1], f"{file.path}: line {number}"), width, height, values
+            yield identifier, _known(words[1], f"{file.path}: line {line_number}"), width, height, values
 
 
 def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
@@ -269,16 +269,17 @@ def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:
 def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
     """Yield the images of images.txt, each of which has two lines: the second lists keypoints and may be empty."""
     lines = _lines(file)
-    for number, line in lines:
+    for line_number, line in lines:
         if not line:
             continue
         words = line.split(maxsplit=9)
-        with _expects("an image's id, qw qx qy qz tx ty tz, camera and name", file, number, line):
+        with _expects("an image's id, qw qx qy qz tx ty tz, camera and name", file, line_number, line):
             row = words[9], tuple(float(word) for word in words[1:8]), int(words[8])
-        number, line = next(lines, (number + 1, ""))
+        line_number, line = next(lines, (line_number + 1, ""))
         if not _are_keypoints(line.split()):
-            raise InputError(f"{file.path}: line {number}: expected the keypoints (x y id ..) of image {row[0][:40]!a} "
-                             f"or an empty line, got {line[:60]!a}: write an empty line after each image",
+            raise InputError(f"{file.path}: line {line_number}: expected the keypoints (x y id ..) of image "
+                             f"{row[0][:40]!a} or an empty line, got {line[:60]!a}: write an empty line after each "
+                             "image",
                              docs="data.md#your-own-capture")  # fmt: skip
         yield row
 
@@ -309,9 +310,9 @@ def _binary_points(file: ModelFile) -> list[tuple[float, ...]]:
 def _text_points(file: ModelFile) -> list[tuple[float, ...]]:
     """Return (x, y, z, r, g, b) of each point of points3D.txt; an id is before them, an error and a track behind."""
     rows: list[tuple[float, ...]] = []
-    for number, line in _lines(file):
+    for line_number, line in _lines(file):
         if line:
-            with _expects("an id, x y z and a colour", file, number, line):
+            with _expects("an id, x y z and a colour", file, line_number, line):
                 x, y, z, red, green, blue = (float(word) for word in line.split()[1:7])
             rows.append((x, y, z, red, green, blue))
     return rows

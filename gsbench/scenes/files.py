@@ -86,14 +86,14 @@ class ImageFinder:
     def _images(self, folder: Path) -> dict[str, list[str]]:
         """Return the names of the images in a folder by their names without suffix; the folder is listed once."""
         if folder not in self._listed:
-            listed = self._listed.setdefault(folder, {})
+            by_stem = self._listed.setdefault(folder, {})
             try:
                 names = sorted(os.listdir(folder))
             except (OSError, ValueError):  # the error of reading the image names the path
                 names = []
             for name in names:
                 if (stem := without_suffix(name)) != name:
-                    listed.setdefault(stem, []).append(name)
+                    by_stem.setdefault(stem, []).append(name)
         return self._listed[folder]
 
 

@@ -110,13 +110,13 @@ def ply_of(trained: TrainedGaussians) -> bytes:
             raise InputError(f"PLY: expected finite {name}, some are not: has the training diverged?")
     rest = torch.zeros(N, K - 1, 3)
     rest[:, : trained.rest.shape[1]] = trained.rest
-    parts = [trained.means, torch.zeros(N, 3), trained.dc, rest.mT.flatten(1), trained.logits[:, None],
+    columns = [trained.means, torch.zeros(N, 3), trained.dc, rest.mT.flatten(1), trained.logits[:, None],
              trained.log_scales, trained.quats]  # fmt: skip
     names = [*_COLUMNS["means"], "nx", "ny", "nz", *_COLUMNS["dc"], *(f"f_rest_{i}" for i in range(3 * (K - 1))),
              *_COLUMNS["logits"], *_COLUMNS["log_scales"], *_COLUMNS["quats"]]  # fmt: skip
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {N}",
               *(f"property float {name}" for name in names), "end_header\n"]  # fmt: skip
-    return "\n".join(header).encode() + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
+    return "\n".join(header).encode() + torch.cat(columns, 1).numpy().astype("<f4").tobytes()
 
 
 def share_seen(

@@ -149,16 +149,16 @@ def count_readers(
     count: int,
     downscale: int,
     where: str,
-    kept: int = 12,  # bytes a pixel of the reduced image
+    pixel_bytes: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
     """Return how many threads can decode images at the same time, given the free memory and the size of all images."""
     pixels = size[0] * size[1]
-    all_kept, decoding = count * kept * pixels // downscale**2, _DECODING * pixels
+    kept_bytes, decoding_bytes = count * pixel_bytes * pixels // downscale**2, _DECODING * pixels
     what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
-    require(all_kept + decoding, what, "use a larger scene.downscale or fewer images")
+    require(kept_bytes + decoding_bytes, what, "use a larger scene.downscale or fewer images")
     free = available()
     threads = os.cpu_count() or 1
-    return threads if free is None else max(1, min(threads, (free - all_kept) // decoding))
+    return threads if free is None else max(1, min(threads, (free - kept_bytes) // decoding_bytes))
 
 
 def decode_photo(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA, as stored: straight alpha
@@ -217,8 +217,8 @@ def composite(
     """
     background = rendition.background
     if rendition.resize == "pillow":
-        whole = Image.fromarray(_composite_8_bits(pixels, background))
-        reduced = whole.resize(size, Image.Resampling.BICUBIC)
+        unreduced = Image.fromarray(_composite_8_bits(pixels, background))
+        reduced = unreduced.resize(size, Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(reduced)).float() / 255
     values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     image: NDArray[Any] = values[..., :3]

@@ -148,8 +148,8 @@ def read(
         view = View(shot.name, camera, shot.time, image, rendition.background, alpha, regions)
         return view, files.digest(data), images.is_turned(data)
 
-    kept = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # bytes a pixel, alpha and mask too
-    threads = images.count_readers(size, len(shots), downscale, first.where, kept)
+    pixel_bytes = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # with alpha and mask
+    threads = images.count_readers(size, len(shots), downscale, first.where, pixel_bytes)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         views, digests, turned = zip(*pool.map(read_one, shots), strict=True)
     notes = _notes(shots, size, reduced, downscale)

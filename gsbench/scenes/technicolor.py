@@ -154,12 +154,12 @@ def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, 
     scene = IMAGE.fullmatch(listed[0].path.name)
     replaced = {}
     for name in names:
-        parts = IMAGE.fullmatch(f"{name.removesuffix('.png')}.png")
-        if parts is None:
+        match = IMAGE.fullmatch(f"{name.removesuffix('.png')}.png")
+        if match is None:
             raise InputError(f"data.repair: expected names such as Birthday_undist_00173_09, got {name!a:.80}")
-        if scene is None or parts["scene"] != scene["scene"]:
+        if scene is None or match["scene"] != scene["scene"]:
             continue
-        frame, camera = int(parts["frame"]), int(parts["camera"])
+        frame, camera = int(match["frame"]), int(match["camera"])
         if (frame, camera) not in by_number:
             raise InputError(f"data.repair: expected an image that is loaded, got {name!a:.80}: leave it out")
         if camera == TEST_CAMERA:

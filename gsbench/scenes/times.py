@@ -173,7 +173,7 @@ def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of
         rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, strict=True)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected a table name,time: {error}", docs="data.md#times") from None
-    filled = [(number, row) for number, row in enumerate(rows, 1) if any(row)]
+    filled = [(line_number, row) for line_number, row in enumerate(rows, 1) if any(row)]
     columns = [cell.lower() for cell in filled[0][1]] if filled else []
     if any(columns.count(key) != 1 for key in ("name", "time")):
         raise InputError(
@@ -214,9 +214,9 @@ def of_fields(
     Times in [0, 1] stay as they are; a sentence says so if they cover less than half of it. Others, such as seconds or
     numbers of frames, are scaled over all files together. If all are equal, the scene has no times.
     """
-    listed = [value for times in values.values() for value in times]
-    first, last = min(listed), max(listed)
-    if first == last and len(listed) > 1:
+    all_times = [value for times in values.values() for value in times]
+    first, last = min(all_times), max(all_times)
+    if first == last and len(all_times) > 1:
         none: dict[str, list[float | None]] = {file: [None] * len(times) for file, times in values.items()}
         return none, [f"times: none, as all times are {first:.10g}"]
     if first >= 0 and last <= 1:
@@ -228,7 +228,7 @@ def of_fields(
             raise InputError(f"{file}: time: expected the unit of the other files, got {min(times):.10g} to "
                              f"{max(times):.10g}, and over all files {first:.10g} to {last:.10g}: scale all to [0, 1]",
                              docs="data.md#times")  # fmt: skip
-    scaled = iter(_scaled([Fraction(value) for value in listed]))
+    scaled = iter(_scaled([Fraction(value) for value in all_times]))
     note = f"times: the field 'time', {first:.10g} to {last:.10g}, scaled to [0, 1] over all splits"
     return {file: [next(scaled) for _ in times] for file, times in values.items()}, [note]
 
@@ -280,18 +280,18 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
             moments = [match[0] for match in matches]
             break
     pattern = _DECIMAL if _have_decimals(plain) else _WHOLE
-    listed = []
+    by_name = []
     for name, moment in zip(plain, moments, strict=True):
-        numbers, at = [], 0
+        of_name, label_start = [], 0
         for start, end in _spans(name, moment, pattern):
-            label = name[at:start].rpartition("/")[2]
+            label = name[label_start:start].rpartition("/")[2]
             is_moment = moment is not None and (start, end) == moment.span()
             value = (_seconds(moment, source) if is_moment and moment else
                      _exact(name[start:end], f"{source}: image {name[start:end][:40]}"))  # fmt: skip
-            numbers.append(_Number(value, label, is_moment))
-            at = end
-        listed.append(numbers)
-    return listed
+            of_name.append(_Number(value, label, is_moment))
+            label_start = end
+        by_name.append(of_name)
+    return by_name
 
 
 def _spans(name: str, moment: re.Match[str] | None, pattern: re.Pattern[str]) -> list[tuple[int, int]]:
@@ -311,19 +311,19 @@ def _have_decimals(names: Sequence[str]) -> bool:
 
 def _seconds(moment: re.Match[str], source: Path) -> Fraction:
     """Return a date and time of day, or a time of day, in seconds."""
-    parts = moment.groupdict()
-    digits = parts.get("f") or parts.get("g") or ""
+    fields = moment.groupdict()
+    digits = fields.get("f") or fields.get("g") or ""
     fraction = Fraction(int(digits or 0), 10 ** len(digits))
     try:
-        year, month, day = (int(parts.get(key) or 1) for key in "YmD")
+        year, month, day = (int(fields.get(key) or 1) for key in "YmD")
         days = date(year, month, day).toordinal()
     except ValueError:
         raise InputError(f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
                          docs="data.md#times") from None  # fmt: skip
-    hour = int(parts["H"])
-    if half := parts.get("half"):
+    hour = int(fields["H"])
+    if half := fields.get("half"):
         hour = hour % 12 + 12 * (half in "Pp")
-    return days * 86400 + hour * 3600 + int(parts["M"]) * 60 + int(parts["S"]) + fraction
+    return days * 86400 + hour * 3600 + int(fields["M"]) * 60 + int(fields["S"]) + fraction
 
 
 def _exact(text: str, where: str) -> Fraction:
@@ -356,9 +356,9 @@ def _time_among(changing: list[_Column], images: NamedImages) -> _Column | None:
         candidates += _chapters(candidates[0], changing, images)
     if len(candidates) == 1:
         return candidates[0]
-    listed = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
+    first_values = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
     raise InputError(f"{images.source}: image {images.names[0][:80]!a}: expected one number that is the time, "
-                     f"got {listed}, which all change from image to image: write {TABLE}",
+                     f"got {first_values}, which all change from image to image: write {TABLE}",
                      docs="data.md#times")  # fmt: skip
 
 

@@ -180,8 +180,8 @@ def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
         (values,), lines = _times([split])
         timed, digests = times.Times(values, lines), {}
     size = shots.size_of(split.frames[0].path, split.frames[0].where)
-    listed = _shots_of(split.frames, timed.values, size)
-    loaded = shots.read(listed, rendition)
+    listed_shots = _shots_of(split.frames, timed.values, size)
+    loaded = shots.read(listed_shots, rendition)
     digests |= dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
     train, val, test, how = _split_views(split, finder, loaded.views)
     shared = _shared_views({"train": train, "val": val, "test": test}, loaded)
@@ -227,8 +227,8 @@ def _read_split(
     checked = [_read_frame(root, content, frame, source, index, finder) for index, frame in enumerate(frames)]
     unread = sorted(content.keys() - _LENS_KEYS - {"frames", *keys})
     unread += sorted({key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS - set(unread))
-    listed = ", ".join(f"{key[:40]!a}" for key in unread[:_MOST_KEYS]) + (", .." if len(unread) > _MOST_KEYS else "")
-    notes = [f"{name}: keys that are not read: {listed}"] if unread else []
+    shown = ", ".join(f"{key[:40]!a}" for key in unread[:_MOST_KEYS]) + (", .." if len(unread) > _MOST_KEYS else "")
+    notes = [f"{name}: keys that are not read: {shown}"] if unread else []
     return Split(source, checked, content, files.digest(data), notes)
 
 
@@ -308,9 +308,9 @@ def _times(splits: list[Split]) -> tuple[list[list[float | None]], list[str]]:
 
 def _check_all_or_none(splits: Sequence[Split]) -> None:
     """Raise InputError if some frames of a data set have a time and others do not."""
-    listed = [(split, index, frame) for split in splits for index, frame in enumerate(split.frames)]
-    first = listed[0][2].time
-    for split, index, frame in listed:
+    all_frames = [(split, index, frame) for split in splits for index, frame in enumerate(split.frames)]
+    first = all_frames[0][2].time
+    for split, index, frame in all_frames:
         if (frame.time is None) != (first is None):
             has, other = ("no time", "has one") if frame.time is None else ("a time", "has none")
             raise InputError(
@@ -346,16 +346,16 @@ def _split_views(
         train, test = hold_out(sorted(views, key=lambda view: (view.time or 0.0, view.name)), HELD_OUT)
         return train, [], test, f"split: every {HELD_OUT}th view in the order of time is a test view"
     by_path = {frame.path: view for frame, view in zip(split.frames, views, strict=True)}
-    parts: list[list[View]] = []
+    by_split: list[list[View]] = []
     for key, names in zip(_SPLITS, lists, strict=True):
-        where, part = f"{split.source}: {key}", []
+        where, of_split = f"{split.source}: {key}", []
         for name in [] if names is None else names if isinstance(names, list) else [names]:
             view = by_path.get(finder.find(name, where)) if isinstance(name, str) else None
             if view is None:
                 raise InputError(f"{where}: expected file_path of frames, got {_brief(name)}: add its frame")
-            part.append(view)
-        parts.append(part)
-    train, val, test = parts
+            of_split.append(view)
+        by_split.append(of_split)
+    train, val, test = by_split
     if not train or not test:
         raise InputError(f"{split.source}: expected images in train_filenames and test_filenames, got {len(train)} and "
                          f"{len(test)}: list them, or leave out all three lists")  # fmt: skip
@@ -408,8 +408,8 @@ def _check_pinhole(values: Mapping[str, Any], where: str) -> None:
         if values.get(key, False) not in (False, 0):
             raise InputError(f"{where}: {key}: expected a pinhole camera, got {_brief(values[key])}: {_UNDISTORT}")
     coefficients = [(key, values[key]) for key in _DISTORTION if key in values]
-    listed = values.get("distortion_params", [])
-    coefficients += [("distortion_params", value) for value in (listed if isinstance(listed, list) else [listed])]
+    params = values.get("distortion_params", [])
+    coefficients += [("distortion_params", value) for value in (params if isinstance(params, list) else [params])]
     for key, value in coefficients:
         if (coefficient := _number(value, f"{where}: {key}")) != 0:
             raise InputError(f"{where}: {key}: expected a pinhole camera, got {coefficient}: {_UNDISTORT}")

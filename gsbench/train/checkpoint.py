@@ -41,10 +41,10 @@ def save(path: Path, content: Checkpoint) -> None:
 
     def write(file: io.BufferedRandom) -> None:
         file.write(MAGIC + b"0" * DIGEST + b"\n")
-        kept = _WithFirstError(file)
-        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, cast(IO[bytes], kept))
-        if kept.error is not None:
-            raise kept.error
+        stream = _WithFirstError(file)
+        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, cast(IO[bytes], stream))
+        if stream.error is not None:
+            raise stream.error
         file.seek(len(MAGIC) + DIGEST + 1)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(len(MAGIC))

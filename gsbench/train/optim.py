@@ -159,11 +159,11 @@ class Optimizer:
             InputError: the moments do not belong to the parameters of this model.
         """
         self.moments.clear()
-        known = dict(self._keyed())
+        parameters = dict(self._keyed())
         for name, moments in state.items():
-            if name not in known:
-                raise InputError(f"checkpoint: expected moments of {', '.join(known)}, got some of {name!r:.80}")
-            parameter = known[name]
+            if name not in parameters:
+                raise InputError(f"checkpoint: expected moments of {', '.join(parameters)}, got some of {name!r:.80}")
+            parameter = parameters[name]
             self.moments[parameter] = {
                 "step": tensor(moments, "step", (), torch.float32),
                 "exp_avg": tensor(moments, "exp_avg", parameter.shape, parameter.dtype),

@@ -81,17 +81,17 @@ def _parts(views: int) -> list[int]:
     return [0, middle] if views - middle > 1 else [0]
 
 
-def _in_order(parts: Sequence[Sums]) -> Sums:
+def _in_order(sums: Sequence[Sums]) -> Sums:
     """Return the sum of dictionaries of gradients, added in order to the tensors of the first one.
 
     A dictionary that views share is added only once.
     """
-    total = dict(parts[0])
-    done = {id(parts[0])}
-    for part in parts[1:]:
-        if id(part) not in done:
-            done.add(id(part))
-            for key, gradient in part.items():
+    total = dict(sums[0])
+    done = {id(sums[0])}
+    for further in sums[1:]:
+        if id(further) not in done:
+            done.add(id(further))
+            for key, gradient in further.items():
                 add_to(total, key, gradient)
     return total
 

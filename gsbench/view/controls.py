@@ -190,12 +190,12 @@ class Controls:
         panel.float(**PANEL)
         self._watch(self.compare, show_panel)
 
-    def _add_frustum(self, number: int, view: View, size: float) -> viser.CameraFrustumHandle:
+    def _add_frustum(self, index: int, view: View, size: float) -> viser.CameraFrustumHandle:
         """Add the frustum of a training view with its image; a click on it moves camera and time there."""
         view = view.to("cpu")
         pose = ViserPose.of(view.camera)
         frustum = self.client.scene.add_camera_frustum(
-            f"/training/{number}",
+            f"/training/{index}",
             fov=pose.fov,
             aspect=view.camera.width / view.camera.height,
             scale=size,

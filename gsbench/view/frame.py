@@ -170,12 +170,12 @@ class FrameRenderer:
             except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
                 raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
             antialias = run.config.raster.antialias
-            exact = float64_image(gaussians, single, camera, self._background(request), antialias)
-            bound, undecided = STEPS * exact.bound, float(exact.undecided.double().mean())
+            reference = float64_image(gaussians, single, camera, self._background(request), antialias)
+            bound, undecided = STEPS * reference.bound, float(reference.undecided.double().mean())
             return Float32Error(
                 rounding_image(bound.numpy()),
                 float(bound.max()),
-                STEPS * exact.median_bound,
+                STEPS * reference.median_bound,
                 undecided,
                 time.perf_counter() - start,
             )

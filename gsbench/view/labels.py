@@ -31,8 +31,8 @@ def short_names(runs: Sequence[LoadedRun]) -> list[str]:
     Runs that no word distinguishes have their folders as names.
     """
     names = [[label_of(run.config)] for run in runs]
-    for parts in zip_longest(*(_folders_by_weight(run.folder) for run in runs), fillvalue=""):
-        words = [part.split(",") for part in parts]
+    for folders in zip_longest(*(_folders_by_weight(run.folder) for run in runs), fillvalue=""):
+        words = [part.split(",") for part in folders]
         shared = set.intersection(*map(set, words))
         for name, its in zip(names, words, strict=True):
             name += [word for word in its if word and word not in (*shared, name[0])]

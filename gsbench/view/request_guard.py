@@ -213,17 +213,17 @@ async def _free_port(host: str, port: int) -> tuple[list[str], int]:
     if not host or "\0" in host:
         raise InputError(expected)
     loop = asyncio.get_running_loop()
-    for number in range(port, min(port + MOST_PORTS, 65536)):
+    for candidate in range(port, min(port + MOST_PORTS, 65536)):
         try:
-            server = await loop.create_server(asyncio.Protocol, host, number)
+            server = await loop.create_server(asyncio.Protocol, host, candidate)
         except (OSError, ValueError) as error:  # ValueError: not a valid name
             if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
                 continue
-            raise InputError(f"{expected}, port {number}: {one_line(error)}") from None
+            raise InputError(f"{expected}, port {candidate}: {one_line(error)}") from None
         addresses = [str(listener.getsockname()[0]) for listener in server.sockets]
         server.close()
         await server.wait_closed()
-        return addresses, number
+        return addresses, candidate
     raise InputError(f"--port: expected a free one among the {MOST_PORTS} from {port} on, got none")
 
 

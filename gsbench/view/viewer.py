@@ -161,8 +161,8 @@ class Browser:
         self._set_legend({})
         return frame
 
-    def _bounded(self, whole: Frame) -> tuple[Frame, Notes]:
-        """Render a frame with the bound on the error of float32, or return `whole` if no shown model has one."""
+    def _bounded(self, usual: Frame) -> tuple[Frame, Notes]:
+        """Render a frame with the bound on the error of float32, or return the `usual` one if no model has it."""
         notes: Notes = {}
 
         def render(renderer: FrameRenderer, colours: str, camera: Camera) -> Frame:
@@ -175,7 +175,7 @@ class Browser:
             return self._rendered(renderer, colours, camera)
 
         frame = self._combined(*self._size(self._float32_resolution, True), render)
-        return frame if any(isinstance(note, Float32Error) for note in notes.values()) else whole, notes
+        return frame if any(isinstance(note, Float32Error) for note in notes.values()) else usual, notes
 
     def _show_bound(self, frame: Frame, notes: Notes) -> None:
         self._set_image(frame, JPEG_AT_REST)

@@ -42,9 +42,9 @@ def spec(
         legend: whether the chart has a legend of its own; a page has one above its figures.
     """
     table = figure.table.copy()
-    for name, of in figure.table.items():
-        if not is_bool_dtype(of):
-            table[name] = of.map(_rounded if is_float_dtype(of) else text)
+    for name, column in figure.table.items():
+        if not is_bool_dtype(column):
+            table[name] = column.map(_rounded if is_float_dtype(column) else text)
     chart = DRAWINGS[figure.draw](table, look, **figure.options)
     if "scene" in table:
         chart = chart.add_params(alt.param("scene", value=scene or table.scene.iloc[0]))

@@ -57,10 +57,12 @@ def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Sectio
     """Return the page as text; no script but its own can run in it, and none may evaluate text."""
     articles = [_article(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
     look = styles(name for article in articles for name in article.series)
-    keyed = [(f"{article.key}-{of.key}", of) for article in articles for of in article.sections]
-    keyed += [(f"more-{of.key}", of) for of in more]
-    specs = {f"{key}-{i}": charts.spec(figure, look) for key, of in keyed for i, figure in enumerate(of.figures)}
-    views = {key: list(map(asdict, of.images)) for key, of in keyed if of.key == "gallery"}
+    keyed = [(f"{article.key}-{section.key}", section) for article in articles for section in article.sections]
+    keyed += [(f"more-{section.key}", section) for section in more]
+    specs = {
+        f"{key}-{i}": charts.spec(figure, look) for key, section in keyed for i, figure in enumerate(section.figures)
+    }
+    views = {key: list(map(asdict, section.images)) for key, section in keyed if section.key == "gallery"}
     scripts = [library(), _asset("page.js")]
     return _template().render(
         title=short(title)[:80] or "results",
@@ -88,9 +90,9 @@ def figures(results: Results, folder: Path) -> list[Path]:
     return [
         path
         for article in articles
-        for of in article.sections
-        for figure in of.figures
-        for path in charts.write(figure, look, folder / f"{article.title} {of.key} {figure.caption}")
+        for section in article.sections
+        for figure in section.figures
+        for path in charts.write(figure, look, folder / f"{article.title} {section.key} {figure.caption}")
     ]
 
 
@@ -104,17 +106,17 @@ def _article(key: str, chapter: Results) -> Article:
     return Article(key, title_of(runs), summary, built(chapter), sorted(runs.series.unique()), best)
 
 
-def table(of: Section) -> dict[str, Any]:
+def table(section: Section) -> dict[str, Any]:
     """Return what the template shows as a table: rows of (text, class); turned if it is wide and short.
 
     A column without any text is left out.
     """
-    shown = of.shown().iloc[:MOST_ROWS]
+    shown = section.shown().iloc[:MOST_ROWS]
     columns = []
-    for name, title in zip(of.shown_columns, shown, strict=True):
+    for name, title in zip(section.shown_columns, shown, strict=True):
         if shown[title].ne("").any():
-            kind = "number" if of.is_number(name) else ""
-            ranked = zip(shown[title], of.rank(name), strict=False)
+            kind = "number" if section.is_number(name) else ""
+            ranked = zip(shown[title], section.rank(name), strict=False)
             columns.append([(title, kind), *((cell, f"{kind} best" if rank == 1 else kind) for cell, rank in ranked)])
     turned = len(columns) > TURNED > len(shown)
     if columns and not turned:  # a group is named in its first row
@@ -122,7 +124,7 @@ def table(of: Section) -> dict[str, Any]:
         columns[0] = [(text, "repeated" if text == above else kind)
                       for (text, kind), above in zip(columns[0], [None, *texts], strict=False)]  # fmt: skip
     rows = columns if turned else list(zip(*columns, strict=True))
-    return {"rows": rows, "turned": turned, "more": len(of.table) - len(shown)}
+    return {"rows": rows, "turned": turned, "more": len(section.table) - len(shown)}
 
 
 def _keys(figure: Figure) -> dict[str, list[str]]:

@@ -37,8 +37,8 @@ def contests(chapter: Results) -> dict[str, pd.DataFrame]:
     Where a run has no PSNR on val, all are chosen on the evaluated views.
     """
     table = points(chapter, basis(chapter))
-    by = "psnr_db" if table.psnr_val_db.isna().any() else "psnr_val_db"
-    ordered = table.sort_values(by, ascending=False, kind="stable")
+    chosen_by = "psnr_db" if table.psnr_val_db.isna().any() else "psnr_val_db"
+    ordered = table.sort_values(chosen_by, ascending=False, kind="stable")
     return {name: ordered[ordered[cost] <= most].drop_duplicates("series") for name, (cost, most) in BUDGETS.items()}
 
 
@@ -59,7 +59,7 @@ def budgets(chapter: Results, tests: pd.DataFrame) -> Section:
         "worse than": tests.significant & (tests["mean"] < 0), "untested": tests.p_holm.isna(),
     }).groupby(tests.name).sum()  # fmt: skip
     best = {budget: table.head(1).reset_index(drop=True) for budget, table in contests(chapter).items()}
-    table = pd.concat([of.reindex([0]).assign(budget=budget) for budget, of in best.items()], ignore_index=True)
+    table = pd.concat([first.reindex([0]).assign(budget=budget) for budget, first in best.items()], ignore_index=True)
     table = table.join(counts, on="budget").fillna(dict.fromkeys(counts, 0))
     table.loc[table.model.isna(), list(counts)] = math.nan
     text = (
@@ -86,8 +86,8 @@ def is_beside_others(runs: pd.DataFrame) -> pd.Series:
 def frontier(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table and the figures of all configurations, over the mean of scenes and on each scene."""
     names, scenes = sorted(chapter.finished.runs.scene.unique()), basis(chapter)
-    parts = [_frontier(chapter, scenes)] + [_frontier(chapter, [name]) for name in names if [name] != scenes]
-    table = pd.concat(parts, ignore_index=True)
+    by_scenes = [_frontier(chapter, scenes)] + [_frontier(chapter, [name]) for name in names if [name] != scenes]
+    table = pd.concat(by_scenes, ignore_index=True)
     if table.empty:
         return None
     drawn = pd.concat([table.assign(kind="mean"), *_single_runs(chapter), *_of_paper(chapter)], ignore_index=True)
@@ -112,9 +112,9 @@ def _frontier(chapter: Results, scenes: list[str]) -> pd.DataFrame:
     """Return the points of some scenes, which of them are dominated, and which are on the frontier of their model."""
     table = points(chapter, scenes)
     name = scenes[0] if len(scenes) == 1 else f"mean of {len(scenes)} scenes"
-    series = [of for _, of in table.groupby("series")]
+    series = [line for _, line in table.groupby("series")]
     for cost in COSTS:
-        table[f"best {cost}"] = pd.concat([stats.is_on_frontier(of, cost) for of in series] or [pd.Series()])
+        table[f"best {cost}"] = pd.concat([stats.is_on_frontier(line, cost) for line in series] or [pd.Series()])
     return table.assign(scene=name, dominated=stats.is_dominated(table, "train_s"))
 
 

@@ -51,9 +51,9 @@ def targets(chapter: Results) -> pd.DataFrame:
     ends = runs.groupby(CONFIGURATION)[["train_s", "psnr_val_db"]].mean().dropna().reset_index()
     reached = pd.concat([ends, mean_curves(chapter).merge(ends[CONFIGURATION])], ignore_index=True)
     rows = []
-    for scene, of in ends.groupby("scene"):
+    for scene, ends_of_scene in ends.groupby("scene"):
         psnr = reached[reached.scene == scene]
-        for rule, target in _rules(runs[runs.scene == scene], of.psnr_val_db):
+        for rule, target in _rules(runs[runs.scene == scene], ends_of_scene.psnr_val_db):
             needed = psnr.train_s.where(psnr.psnr_val_db >= target, math.inf).groupby(psnr.series).min()
             rows.append({"scene": scene, "target": rule, "dB": target} | needed.to_dict())
     return pd.DataFrame(rows, columns=["scene", "target", "dB", *sorted(ends.series.unique())])

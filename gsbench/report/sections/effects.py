@@ -29,9 +29,9 @@ def models(chapter: Results) -> tuple[dict[tuple[bool, ...], stats.Key], dict[tu
     Models whose Gaussians lack some effects are left out.
     """
     runs = chapter.finished.runs
-    whole = runs[runs.main & ~runs.groupby(["model", "variant"]).on_demand.transform("any")]
+    ungated = runs[runs.main & ~runs.groupby(["model", "variant"]).on_demand.transform("any")]
     rank = {name: i for i, name in enumerate(PUBLISHED)}
-    first = whole.drop_duplicates(["model", "variant"]).sort_values("model")
+    first = ungated.drop_duplicates(["model", "variant"]).sort_values("model")
     first = first.sort_values("model", key=lambda names: names.map(rank).fillna(len(rank)), kind="stable")
     keys = list(zip(first.model, first.variant, strict=True))
     has = [tuple(map(bool, row)) for row in first[HAS].to_numpy()]
@@ -58,14 +58,14 @@ def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
     columns = {unit: Column(unit, digits, signed=True) for unit, digits in UNITS.values()}
     figures = []
     for quantity, (unit, _) in UNITS.items():
-        of = by_unit[quantity].loc[gains.index]
-        of = of.assign(significant=[verdict(test) for test in of.to_dict("records")])
+        priced = by_unit[quantity].loc[gains.index]
+        priced = priced.assign(significant=[verdict(test) for test in priced.to_dict("records")])
         table[unit], table[f"{unit} ±"], table[f"{unit}: significant"] = (
-            of["mean"],
-            of["high"] - of["mean"],
-            of.significant,
+            priced["mean"],
+            priced["high"] - priced["mean"],
+            priced.significant,
         )
-        drawn = of.drop(columns="weights").rename(columns={"mean": unit}).reset_index()
+        drawn = priced.drop(columns="weights").rename(columns={"mean": unit}).reset_index()
         if drawn[unit].notna().any():
             figures.append(Figure(f"in {unit}", "intervals", drawn, {"label": "name", "value": unit}))
     table["± over scenes"], table["scenes that gain"] = gains["± over scenes"], gains.gaining

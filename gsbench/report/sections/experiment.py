@@ -33,15 +33,15 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
     runs, ok = chapter.runs, chapter.finished.runs
     is_all = set(asked) in (set(), set(WITH_TRAIN))
     names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
-    parts = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
+    by_scene = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
     failed = runs[runs.status != "ok"]
     labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
-    parts.append(pd.DataFrame({"scene": failed.scene, "label": labels}))
+    by_scene.append(pd.DataFrame({"scene": failed.scene, "label": labels}))
     scenes = covered(runs)
     if runs.scene.nunique() > 1 and scenes:
         where = f"average over {len(scenes)} of {runs.scene.nunique()} scenes"
-        parts.append(_means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
-    rows = pd.concat(parts, ignore_index=True)
+        by_scene.append(_means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
+    rows = pd.concat(by_scene, ignore_index=True)
     rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
     shown = [c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows]
     order = ["scene", "label", *shown, "seeds"]
@@ -68,11 +68,11 @@ def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> 
         scenes = [scene] if scene in set(runs.scene) else averaged
         if not scenes or not all((name, label) in first.index for name in scenes):
             continue  # a failed run, or a model of the same name that differs from the paper's in AGR
-        of = first.loc[[(name, label) for name in scenes]]
-        named = of.protocol_paper_dataset.iloc[0] if "protocol_paper_dataset" in of else None
-        numbers = paper.average(str(named), scenes, of.model.iloc[0])
+        measured = first.loc[[(name, label) for name in scenes]]
+        named = measured.protocol_paper_dataset.iloc[0] if "protocol_paper_dataset" in measured else None
+        numbers = paper.average(str(named), scenes, measured.model.iloc[0])
         if len(numbers):
-            title = "paper" if (of.dataset == named).all() else "paper, other data"
+            title = "paper" if (measured.dataset == named).all() else "paper, other data"
             yield pd.DataFrame([numbers.to_dict() | {"scene": scene, "label": title}], index=[i])
 
 

@@ -110,9 +110,9 @@ def cut(path: Path) -> Strip:
     rows = []
     for top in range(0, len(body) - height + 1, height + GAP):
         line = body[top : top + height]
-        parts = [line[:, left : left + width] for left in (0, width + GAP, 2 * (width + GAP))]
-        step = _enlargement(parts)
-        render, truth, error = (part[::step, ::step] for part in parts)
+        panels = [line[:, left : left + width] for left in (0, width + GAP, 2 * (width + GAP))]
+        step = _enlargement(panels)
+        render, truth, error = (panel[::step, ::step] for panel in panels)
         rows.append((render, truth, error))
     return rows
 
@@ -147,7 +147,7 @@ def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quali
     for i in range(min(shared, most)):
         render, error = ({model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()}
                          for kind in (0, 2))  # fmt: skip
-        scores = {model: _score(of, len(rows), i) for model, (of, rows) in models.items()}
+        scores = {model: _score(record_of_model, len(rows), i) for model, (record_of_model, rows) in models.items()}
         truth, (height, width) = _encode(strip[i][1], side, quality), strip[i][1].shape[:2]
         name = names[i] if i < len(names) else f"view {i + 1}"
         shown.append(View(scene, name, truth, render, error, scores, width, height))

@@ -36,9 +36,9 @@ def by_length(runs: pd.DataFrame) -> pd.DataFrame:
     wide = runs.pivot(index=["scene", "model", "seed"], columns="iterations", values=["psnr_db", "psnr_val_db"])
     if wide.empty:
         return pd.DataFrame()
-    whole = wide.notna().all(axis=1)
-    psnr, val = wide.loc[whole, "psnr_db"], wide.loc[whole, "psnr_val_db"]
+    has_all = wide.notna().all(axis=1)
+    psnr, val = wide.loc[has_all, "psnr_db"], wide.loc[has_all, "psnr_val_db"]
     rises = (val.diff(axis=1).iloc[:, 1:] > 0).cumprod(axis=1).sum(axis=1).astype(int)
-    kept = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
+    chosen_psnr = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
     tried = [sum(psnr.columns[: rise + 2]) for rise in rises]
-    return psnr.rename(columns="{:,.0f}".format).rename_axis(columns=None).assign(kept=kept, tried=tried)
+    return psnr.rename(columns="{:,.0f}".format).rename_axis(columns=None).assign(kept=chosen_psnr, tried=tried)

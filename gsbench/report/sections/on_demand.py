@@ -55,7 +55,7 @@ def on_demand(chapter: Results, tests: pd.DataFrame) -> Section | None:
         "runs with and without gates in “What accuracy costs”."
     )
     groups = runs.groupby(["scene", "model", "variant"])
-    pictures = [(f"{scene}, {model}", _picture(of.path)) for (scene, model, _), of in groups]
+    pictures = [(f"{scene}, {model}", _picture(runs_of_group.path)) for (scene, model, _), runs_of_group in groups]
     notes, shown = tuple(_notes(runs)), tuple(images(pictures))
     return Section("on_demand", "Effects on demand", text, table, SHOWN, figures, notes, images=shown)
 
@@ -138,7 +138,7 @@ def _notes(runs: pd.DataFrame) -> list[str]:
     for run in runs.itertuples():
         for note in run.record.on_demand.notes:
             seeds.setdefault(f"{run.scene}, {run.label}: {note}", []).append(str(run.seed))
-    notes = [f"{note} (seed {', '.join(some[:5])})" for note, some in seeds.items()]
+    notes = [f"{note} (seed {', '.join(of_note[:5])})" for note, of_note in seeds.items()]
     more = [f"{len(notes) - MOST_NOTES} more notes are in the records."] if len(notes) > MOST_NOTES else []
     return notes[:MOST_NOTES] + more
 

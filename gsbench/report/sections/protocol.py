@@ -84,9 +84,9 @@ def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
         ("iterations chosen on val; times are those of all lengths (train.lengths)", chosen, 0),
     )
     for name, values, digits in facts:
-        known = pd.Series(values, runs.index, dtype=float).dropna()
-        if len(known):
-            yield [name, span(known, digits), _scenes(runs.loc[known.index], runs), len(known)]
+        recorded = pd.Series(values, runs.index, dtype=float).dropna()
+        if len(recorded):
+            yield [name, span(recorded, digits), _scenes(runs.loc[recorded.index], runs), len(recorded)]
 
 
 def _scenes(some: pd.DataFrame, runs: pd.DataFrame) -> str:
@@ -105,22 +105,22 @@ def _notes(runs: pd.DataFrame) -> Iterator[str]:
         yield "lego is measured on val: the test split of D-NeRF's lego contradicts its motion."
     if tuned := sorted(TUNED & set(runs.scene)):
         yield f"gsbench's own settings were tuned on {', '.join(tuned)} (docs/tuning.md)."
-    if exact := sorted({view for r in runs.record for view in r.exact}):
-        yield printable(sentence(exact))
+    if exact_views := sorted({view for r in runs.record for view in r.exact}):
+        yield printable(sentence(exact_views))
 
 
 @section()
 def runs(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table of every run, with why it failed and the command that repeats it."""
-    of = chapter.runs
-    table = of[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
-    table = table.assign(load=of.load.where(of.machine == of.timed_on),
-                         commit=[_short("commit", value or "not recorded") for value in of.git_commit],
-                         command=of.record.map(command), reason=of.reason)  # fmt: skip
+    all_runs = chapter.runs
+    table = all_runs[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
+    table = table.assign(load=all_runs.load.where(all_runs.machine == all_runs.timed_on),
+                         commit=[_short("commit", value or "not recorded") for value in all_runs.git_commit],
+                         command=all_runs.record.map(command), reason=all_runs.reason)  # fmt: skip
     text = "A time is empty if the run was on another machine than most."
-    table.insert(0, "run", [record.path.as_posix() for record in of.record])
+    table.insert(0, "run", [record.path.as_posix() for record in all_runs.record])
     table = table.sort_values("status", key=lambda status: status == "ok", kind="stable")
-    table = table if (of.status != "ok").any() else table.drop(columns="reason")
+    table = table if (all_runs.status != "ok").any() else table.drop(columns="reason")
     return Section("runs", "Every run", text, table.reset_index(drop=True), folded=True)
 
 

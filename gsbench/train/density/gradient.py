@@ -67,10 +67,10 @@ class GradientDensification(DensificationRule):
         split = wanted & (~small | model.long_in_time())
         clone = wanted & ~split
 
-        kept, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
+        unsplit, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
-        chosen = torch.cat([kept, cloned, parents])
-        self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(kept))
+        chosen = torch.cat([unsplit, cloned, parents])
+        self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(unsplit))
         children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
         model.split_rows(children, generator)
         return chosen, refused

@@ -46,9 +46,9 @@ class Choices(Hook):
         lengths, iterations = lengths_of(config), config.train.iterations
         if lengths is None:
             return
-        parts = 1 << (lengths - 1)
-        if iterations < parts:
-            raise InputError(f"train.lengths={lengths}: expected at least {parts} iterations to "
+        least = 1 << (lengths - 1)
+        if iterations < least:
+            raise InputError(f"train.lengths={lengths}: expected at least {least} iterations to "
                              f"halve {lengths - 1} times, got train.iterations={iterations}")  # fmt: skip
         check_excludes("train.lengths", config, {"effects.compare": "which compares models of one length"})
 

@@ -88,9 +88,9 @@ class EarlyStop(Hook):
             training.report(f"step {stop.iteration}: PSNR on val is equal at {len(equal)} steps, {equal[0].iteration} "
                             f"to {equal[-1].iteration}: it cannot decide, and the last of them is kept")  # fmt: skip
         if self._kept is not None:
-            kept, self._kept = self._kept, None
+            best_state, self._kept = self._kept, None
             now = training.state_dict()
-            training.load_state_dict(now | kept | {"hooks": now["hooks"] | kept["hooks"]})
+            training.load_state_dict(now | best_state | {"hooks": now["hooks"] | best_state["hooks"]})
             training.report(f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends "
                             f"with the Gaussians of that step")  # fmt: skip
 
