@@ -20,8 +20,8 @@ from gsbench.train.checkpoint import Checkpoint
 def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) -> tuple[Record, Path]:
     """Remove AGR, or also time and direction, from a finished run's Gaussians that do not need them.
 
-    The setting `effects.gate=end` does the same at the end of a training. Return the record and the folder of the new
-    run; `folder` is not changed. At most `budget_db` dB of PSNR on val are lost.
+    The setting `effects.gate=end` does the same at the end of a training; here no training is repeated. At most
+    `budget_db` dB of PSNR on val are lost. Return the record and the folder of the new run; `folder` is not changed.
 
     Raises:
         InputError: the run is not finished, effects were already removed at its end, or its data do not exist or have

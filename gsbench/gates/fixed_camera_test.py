@@ -94,7 +94,10 @@ def _pixels(view: View) -> Pixels:
 def _halves(
     images: Pixels,  # [n, H, W, 3]
 ) -> Pixels:  # [2, n, B, 3]
-    """Divide each block of pixels into two halves by a chess-board pattern, and return the mean of each half."""
+    """Divide each block of pixels into two halves by a chess-board pattern, and return the mean of each half.
+
+    Noise is independent in the two halves, so that their product has only the change of the block (`_is_changed`).
+    """
     n, height, width, channels = images.shape
     side = min(max(2, max(height, width) // BLOCKS), height, width)
     rows, columns = height // side, width // side

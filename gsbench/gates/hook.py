@@ -209,8 +209,8 @@ class Gating(Hook):
 def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianModel | None:
     """Return a copy of a model whose means and opacities ignore the view direction; None for a model without direction.
 
-    Direction is replaced by its mean over the training views. AGR, the dependence on time and the SH coefficients of
-    the colours stay.
+    The comparison with this copy tells what direction is worth. Direction is replaced by its mean over the training
+    views. AGR, the dependence on time and the SH coefficients of the colours stay.
     """
     if not has_gates(model) or "direction" not in model.observes:
         return None

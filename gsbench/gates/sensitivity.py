@@ -151,7 +151,10 @@ class ProbedView:
         return Drawn(at, tape, output.image, output.info.means2d[0].detach(), output.info.radii[0])
 
     def growth(self, simplification: Simplification) -> Tensor:
-        """Predict how much the squared error of the view grows if a Gaussian is simplified, for each Gaussian, [N]."""
+        """Predict how much the squared error of the view grows if a Gaussian is simplified, for each Gaussian, [N].
+
+        The first lines of this module have the formulas for colours, removals and motions.
+        """
         model, live = self.model, self.live
         if simplification.raw is None:
             return _growth_of(self.removed)
@@ -160,8 +163,12 @@ class ProbedView:
             colors = model.shade(raw, live.means, live.opacities, self.query)
             return _growth_of((self.products[..., COLOR] * (colors - live.colors)).sum(-1))
         simplified = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
-        N, n = len(live.means), simplification.rows
-        changed = Gaussians3D(*(x[:n] for x in tensors_of(simplified)))
+        changed = Gaussians3D(*(x[: simplification.rows] for x in tensors_of(simplified)))
+        return F.pad(self._growth_of_motion(changed), (0, len(live.means) - simplification.rows))
+
+    def _growth_of_motion(self, changed: Gaussians3D) -> Tensor:
+        """Predict the growth for the first n Gaussians, [n], if each becomes the one in `changed`, near or far."""
+        live, N, n = self.live, len(self.live.means), len(changed.means)
         thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
         pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
         both = self._draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))
@@ -171,12 +178,11 @@ class ProbedView:
         shown = 1 - HIDDEN * live.opacities[:n] * overlap
         scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # the image is linear in each opacity
         thin_products = both.products(self.vectors)[:, N:]
-        there = thin_products * scale[:, None]
-        there[..., OPACITY] = thin_products[..., OPACITY] / shown
-        along = ((self.products[:, :n] + there) * (_matrix_of(changed) - self.matrix[:n])).sum(-1) / 2
-        added = there[..., OPACITY] * changed.opacities
-        error = overlap * _growth_of(along) + (1 - overlap) * _growth_of(self.removed[:, :n], added)
-        return F.pad(error, (0, N - n))
+        products = thin_products * scale[:, None]  # as if `changed` was in the image, instead of `thin`
+        products[..., OPACITY] = thin_products[..., OPACITY] / shown
+        moved = ((self.products[:, :n] + products) * (_matrix_of(changed) - self.matrix[:n])).sum(-1) / 2
+        added = products[..., OPACITY] * changed.opacities
+        return overlap * _growth_of(moved) + (1 - overlap) * _growth_of(self.removed[:, :n], added)
 
 
 def _matrix_of(gaussians: Gaussians3D) -> Tensor:

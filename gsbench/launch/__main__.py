@@ -110,6 +110,7 @@ def _time_left(runs: Sequence[RunStatus]) -> str:
 
 
 def _details(run: RunStatus) -> str:
+    """Return what a line says of a run behind its name: step, PSNR, time left and job, or why it does not run."""
     phrases = []
     if run.state in ("running", "queued"):
         if run.step is not None:
@@ -137,6 +138,7 @@ def _verdict(runs: list[RunStatus]) -> int:
 
 
 def _retry(folder: Path, launch: list[str]) -> int:
+    """Launch the broken runs of sweeps again, and print the commands of other broken runs; return the exit status."""
     from gsbench.launch.sweep import retry  # imports Hydra, which a status does not need
     from gsbench.run.grammar import quoted_value
 

@@ -64,6 +64,7 @@ def do(config: RunConfig) -> Ended:
 
 
 def _done(config: RunConfig, began: float, results: Path) -> Ended:
+    """Do a run that `began` at a time, and return its outcome, with the path of its record relative to `results`."""
     if (limit := too_little_address_space()) is not None:
         raise MemoryError(limit)
     from gsbench.run.execution import UnrecordedError, execute  # imports torch

@@ -124,59 +124,61 @@ def status(experiment: Experiment) -> list[RunStatus]:
 
 
 def _judge(experiment: Experiment, run: Identity) -> RunStatus:
-    """Determine the state of a run.
+    """Determine the state of a run from its progress file (`report`), record, job and plan, which may contradict.
 
     The first of these that exists decides: its live process, its record, its job in Slurm's queue, and a command that
     can still start the run. Otherwise the run was stopped, has failed, is lost or has not started.
     """
     planned = experiment.planned.get(run)
-    path, at = experiment.progress.get(run, (None, None))
+    path, report = experiment.progress.get(run, (None, None))
     _, stopped = experiment.stopped.get(run, (None, None))
     record = experiment.records.get(run) or _kept(experiment, planned)
-    if record and at and at.updated <= record.written:
-        at = None  # the progress file is older than the record
-    went_on = at and stopped and stopped.updated <= at.updated
+    if record and report and report.updated <= record.written:
+        report = None  # the progress file is older than the record
+    went_on = report and stopped and stopped.updated <= report.updated
     if stopped and (went_on or (record and stopped.started <= record.written)):
         stopped = None  # or it was stopped when its record was written already
     state = RunStatus(list(run), "not started")
-    if at and (alive := _alive(at, experiment.queue)):
-        left = at.seconds / at.step * (at.steps - at.step) if at.step else None
+    if report and (alive := _alive(report, experiment.queue)):
+        left = report.seconds / report.step * (report.steps - report.step) if report.step else None
         waits = alive.partition(" ")[2] if alive.startswith("PENDING") else None
-        going = _with_progress(state, at, "running" if waits is None else "queued", waits)
+        going = _with_progress(state, report, "running" if waits is None else "queued", waits)
         return replace(going, seconds_left=left)
-    if record and record.status == "ok" and not at and not stopped:
+    if record and record.status == "ok" and not report and not stopped:
         return replace(state, state="done", psnr=record.psnr, record=str(record.path), train_s=record.train_s)
     if planned and planned.job in experiment.queue.states:
         in_queue = experiment.queue.states[planned.job]
         waits = in_queue.partition(" ")[2] if in_queue.startswith("PENDING") else None
         return replace(state, state="running" if waits is None else "queued", reason=waits or "starts", job=planned.job)
-    last = max(record.written if record else 0, *(file.updated for file in (at, stopped) if file), 0)
+    last = max(record.written if record else 0, *(file.updated for file in (report, stopped) if file), 0)
     is_new = planned is not None and planned.ended is None and planned.plan.started > last
     if planned and is_new and _can_start(planned, experiment.queue):
         return replace(state, state="planned", job=planned.job)
     if stopped:
         return _with_progress(state, stopped, "stopped", f"stopped {_step(stopped)}: the same command continues")
-    if record and not at:
+    if record and not report:
         reason = record.reason if record.status == "failed" else f"{record.status}: {record.reason}"
         return replace(state, state="failed", reason=reason, record=str(record.path))
-    if at:
-        since = plan.duration(time.time() - at.updated)
-        reason = f"process {at.pid} on {at.host} is gone, last seen {since} ago {_step(at)}"
+    if report:
+        since = plan.duration(time.time() - report.updated)
+        reason = f"process {report.pid} on {report.host} is gone, last seen {since} ago {_step(report)}"
         if path and path.with_name(CHECKPOINT).exists():
             reason += ": the same command continues from its last checkpoint"
-        return _with_progress(state, at, "lost", reason)
+        return _with_progress(state, report, "lost", reason)
     if planned and planned.ended and (planned.ended.reason or planned.ended.record):
         reason = planned.ended.reason or f"its record {planned.ended.record} is gone"
         return replace(state, state="failed", reason=reason, job=planned.job)
     return replace(state, state="lost", reason="never started", job=planned.job) if planned and planned.job else state
 
 
-def _with_progress(state: RunStatus, at: Progress, name: str, reason: str | None) -> RunStatus:
-    return replace(state, state=name, reason=reason, job=at.job, step=at.step, steps=at.steps, psnr=at.psnr_val)
+def _with_progress(state: RunStatus, report: Progress, name: str, reason: str | None) -> RunStatus:
+    return replace(
+        state, state=name, reason=reason, job=report.job, step=report.step, steps=report.steps, psnr=report.psnr_val
+    )
 
 
-def _step(at: Progress) -> str:
-    return f"at step {at.step} of {at.steps}" if at.steps else "before its first step"
+def _step(report: Progress) -> str:
+    return f"at step {report.step} of {report.steps}" if report.steps else "before its first step"
 
 
 def _kept(experiment: Experiment, planned: PlannedRun | None) -> RecordStatus | None:
@@ -186,13 +188,13 @@ def _kept(experiment: Experiment, planned: PlannedRun | None) -> RecordStatus | 
     return experiment.records_by_path.get(experiment.folder.parent / planned.ended.record)
 
 
-def _alive(at: Progress, queue: Queue) -> str | None:
+def _alive(report: Progress, queue: Queue) -> str | None:
     """Return the state of a run that has a progress file: `RUNNING`, `PENDING` with a reason, or None if it ended."""
-    if at.job is None:
-        return "RUNNING" if is_alive(at) else None
+    if report.job is None:
+        return "RUNNING" if is_alive(report) else None
     if queue.silent:
-        return "RUNNING" if time.time() - at.updated < SILENT else None
-    return queue.states.get(at.job)
+        return "RUNNING" if time.time() - report.updated < SILENT else None
+    return queue.states.get(report.job)
 
 
 def _can_start(run: PlannedRun, queue: Queue) -> bool:
@@ -251,13 +253,13 @@ def _read_runs(folder: Path, experiment: Experiment) -> None:
                 experiment.records[run] = record
             continue
         try:
-            at = progress.read(path)
+            report = progress.read(path)
         except InputError:
             continue  # the run has just removed it, or it is damaged; then the run counts as lost
         kind = experiment.stopped if path.name == progress.STOPPED else experiment.progress
-        run = identity(at.overrides)
-        if run not in kind or kind[run][1].updated < at.updated:
-            kind[run] = path, at
+        run = identity(report.overrides)
+        if run not in kind or kind[run][1].updated < report.updated:
+            kind[run] = path, report
 
 
 def _files(folder: Path) -> Iterator[Path]:

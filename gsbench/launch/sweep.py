@@ -102,6 +102,7 @@ def retry(experiment: Experiment, more: Sequence[str]) -> int:
 
 
 def _launch_again(experiment: Experiment, group: Sequence[PlannedRun], more: Sequence[str]) -> None:
+    """Launch runs of one plan again, from the folder where their command was typed, as their paths start there."""
     results = f"results={quoted_value(str(experiment.folder.parent.resolve()))}"
     planned = group[0].plan
     try:

@@ -49,10 +49,10 @@ class Regions:
     @property
     def digest(self) -> str:
         """Return the SHA-256 of all masks and of the names of their views."""
-        whole = hashlib.sha256()
+        sha = hashlib.sha256()
         for name, mask in sorted(self.masks.items()):
-            whole.update(f"{name}\n{mask.shape}\n".encode() + np.packbits(mask).tobytes())
-        return whole.hexdigest()
+            sha.update(f"{name}\n{mask.shape}\n".encode() + np.packbits(mask).tobytes())
+        return sha.hexdigest()
 
 
 def find_regions(views: Sequence[View]) -> dict[str, Regions]:

@@ -189,6 +189,7 @@ class UniversalBetaModel(BetaModel):
         return raw
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
+        """Condition on direction and time; Beta weights of their offsets delta shift means and narrow covariances."""
         reduced = reduce(joint_factor(raw))
         offsets = [unit(raw["means"] - query.center) - raw["directions"]]
         if "time" in self.observes:

@@ -191,7 +191,7 @@ class CholeskyModel(JointModel):
         return torch.cat([torch.cat([T_pq, T_pp], -1), q_rows], 1)[:, order]
 
     def used_entries(self, effect_sets: EffectSets) -> dict[str, Tensor]:
-        """Return masks of the parameter entries that are used: a static Gaussian uses none of time and direction."""
+        """Return masks of the entries that affect an image; in a static Gaussian, time and direction do not."""
         masks = super().used_entries(effect_sets)
         if effect_sets.orders is None:
             return masks
@@ -254,7 +254,7 @@ class CholeskyModel(JointModel):
         return changed
 
     def _without(self, blocks: Reduced, gain: Tensor, variables: list[str]) -> Tensor:
-        """Compute Cholesky factors [N, n, n] without the given variables, from present blocks and gain K."""
+        """Compute Cholesky factors [N, n, n] that ignore the given variables, from present blocks and gain K."""
         T_qq, gain_left = blocks.T_qq.clone(), gain.clone()
         if "direction" in variables and "time" in self.observes:
             # Without d, the row of t has its whole standard deviation on the diagonal.

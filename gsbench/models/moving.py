@@ -181,6 +181,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         }
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Compute shifts of means [N, 3] and opacity factors [N] from the offsets delta of direction and time."""
         assert query.time is not None
         direction = unit(raw["means"] - query.center).detach()
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)

@@ -109,7 +109,11 @@ def table1(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
-    """Yield the kind, the data set and the runs of each table."""
+    """Yield the kind, the data set and the runs of each table.
+
+    "paper" has the runs at the paper's protocol. "other protocol" has the runs nearest to it on the paper's data, and
+    "other data" those on data that stand in for the paper's.
+    """
     for dataset in paper.PROTOCOLS:
         yield "paper", dataset, _at_paper(runs, dataset)
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
@@ -135,7 +139,10 @@ def _effort(runs: pd.DataFrame) -> int:
 
 
 def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of one table: by scene, and on average over the scenes that all models finished."""
+    """Return the rows of one table: by scene, and on average over the scenes that all models finished.
+
+    Averages of different models are then over the same scenes. They are of runs without changes of the recipe.
+    """
     ok = _once(of_one_machine(runs))
     scenes = list(paper.PROTOCOLS[dataset].scenes) if kind == "paper" else sorted(set(runs.scene))
     averaged = {scene: [scene] for scene in scenes}
@@ -146,11 +153,11 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
     if runs.scene.nunique() > 1 and covered:
         averaged[paper.AVERAGE] = covered
         groups.append((paper.AVERAGE, plain[plain.scene.isin(covered)]))
-    tables = [stats.means(of, RECIPE, TABLE_1).assign(scene=name) for name, of in groups if len(of)]
+    tables = [stats.means(group, RECIPE, TABLE_1).assign(scene=name) for name, group in groups if len(group)]
     table = pd.concat(tables, ignore_index=True).assign(table=kind, dataset=dataset)
     numbers = [paper.average(dataset if kind == "paper" else "", averaged[scene], model)
                for scene, model in zip(table.scene, table.model, strict=True)]  # fmt: skip
-    of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda of: of.psnr_db)
+    of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda x: x.psnr_db)
     difference = (table[TABLE_1] - of_paper).drop(columns=TIMES, errors="ignore")
     return table.join(of_paper.add_suffix(" paper")).join(difference.add_suffix(" difference"))
 
@@ -243,11 +250,14 @@ def published(dataset: str) -> pd.DataFrame:
 
 
 def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the published rows of a scene, or of the mean over some scenes."""
+    """Yield the published rows of a scene, or of the mean over some scenes.
+
+    A mean over other scenes than those asked for is replaced by that of the method's rows of the scenes asked for.
+    """
     table = published(dataset)
     every = SUCCESSOR_SCENES[dataset]
     for of in table[table.scene == scene].to_dict("records"):
-        note = "" if of["scenes"] == of["scenes"] else "; the number of scenes of this mean is not stated"
+        note = "; the number of scenes of this mean is not stated" if pd.isna(of["scenes"]) else ""
         if scene == paper.AVERAGE and of["scenes"] != len(scenes) and not (note and len(scenes) == len(every)):
             if of["scenes"] != len(every):
                 continue

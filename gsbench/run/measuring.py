@@ -97,8 +97,8 @@ def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[s
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:
     """Return the function that renders a frame for the FPS measurement, and a note for the record.
 
-    On a GPU frames are "replayed" from a CUDA graph if the model can be captured, otherwise "launched" kernel by
-    kernel.
+    On a GPU frames are "replayed" from a CUDA graph if the model can be captured, so that Python's launches of kernels
+    take no time. Otherwise they are "launched" kernel by kernel.
     """
     if trainer.model.backend.name != "cuda":
         return trainer.render, {}

@@ -123,7 +123,10 @@ def slurm_job() -> str | None:
 
 
 def take_claim(folder: Path, claim: Progress) -> Progress | None:
-    """Claim the run in the existing `folder`; return the progress of the live process that has claimed it, or None.
+    """Claim the run in the existing `folder`, so that only one process trains it.
+
+    Returns:
+        The progress of the live process that has claimed it before; None if this process has it now.
 
     Raises:
         InputError: other processes claim and release the run repeatedly.
@@ -162,7 +165,7 @@ def _remove(path: Path, content: bytes, claim: Progress) -> None:
 
 
 def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) -> None:
-    """Remove this process's claim on the run in `folder`; the claim of another process is kept.
+    """Remove this process's claim on the run in `folder`, so that another may take it; one of another process is kept.
 
     If a signal has stopped the run, its progress becomes stopped.json.
     """

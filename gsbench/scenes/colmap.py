@@ -220,7 +220,7 @@ def _lens(model: str, width: int, height: int, values: tuple[float, ...], where:
     return Lens(width, height, K, (k1, k2, p1, p2))
 
 
-def _known(model: str, where: str) -> str:
+def _check_model(model: str, where: str) -> str:
     """Return the name of a lens model; raise InputError if it is not read."""
     if model not in _PARAMETERS:
         raise InputError(f"{where}: expected a camera {', '.join(_PARAMETERS)}, got {model[:40]!a}: undo its "
@@ -239,7 +239,7 @@ def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
     for _ in range(reader.unpack(_COUNT)[0]):
         camera, model, width, height = reader.unpack(_CAMERA)
         model_name = _MODELS[model] if 0 <= model < len(_MODELS) else f"model {model}"
-        names = _PARAMETERS[_known(model_name, f"{file.path}: camera {camera}")]
+        names = _PARAMETERS[_check_model(model_name, f"{file.path}: camera {camera}")]
         yield camera, model_name, width, height, reader.unpack(struct.Struct(f"<{len(names)}d"))
     reader.finish()
 
@@ -252,7 +252,7 @@ def _text_cameras(file: ModelFile) -> Iterator[_CameraRow]:
             with _expects("a camera's id, model, width, height and parameters", file, line_number, line):
                 identifier, width, height = int(words[0]), int(words[2]), int(words[3])
                 values = tuple(float(word) for word in words[4:])
-            yield identifier, _known(words[1], f"{file.path}: line {line_number}"), width, height, values
+            yield identifier, _check_model(words[1], f"{file.path}: line {line_number}"), width, height, values
 
 
 def _binary_images(file: ModelFile) -> Iterator[_ImageRow]:

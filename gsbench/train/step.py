@@ -63,19 +63,22 @@ def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
     sums: list[Sums] = []
     begins = 0  # first view of the half, or of the thread, that view i belongs to
     for i in range(views):
-        if i in _parts(views) or i in bounds:
+        if i in _halves(views) or i in bounds:
             begins = i
-        sums.append(sums[-1] if i > begins and begins in _parts(views) else {})
+        sums.append(sums[-1] if i > begins and begins in _halves(views) else {})
     return sums
 
 
 def add_up(sums: Sequence[Sums]) -> Sums:
-    """Return the sum of the gradients of all views; each half of the batch is summed first, then the two halves."""
-    ends = [*_parts(len(sums))[1:], len(sums)]
-    return _in_order([_in_order(sums[i:end]) for i, end in zip(_parts(len(sums)), ends, strict=True)])
+    """Return the sum of the gradients of all views; each half of the batch is summed first, then the two halves.
+
+    This order does not depend on the threads, so the sum has the same bits for any number of them.
+    """
+    ends = [*_halves(len(sums))[1:], len(sums)]
+    return _in_order([_in_order(sums[i:end]) for i, end in zip(_halves(len(sums)), ends, strict=True)])
 
 
-def _parts(views: int) -> list[int]:
+def _halves(views: int) -> list[int]:
     """Return the index of the first view of each half of a batch; a batch of at most three views is not halved."""
     middle = (views + 1) // 2
     return [0, middle] if views - middle > 1 else [0]

@@ -26,13 +26,13 @@ def tested(chapter: Results) -> pd.DataFrame:
     Returns:
         A row for each difference: its "section", "quantity", "name", "weights", and the columns of stats.differences.
     """
-    rows = [(key, *row) for key, of in SECTIONS.items() if of.asks for row in of.asks(chapter)]
+    rows = [(key, *row) for key, section in SECTIONS.items() if section.asks for row in section.asks(chapter)]
     asked = pd.DataFrame(rows, columns=["section", "quantity", "name", "weights"])
-    parts = [asked.iloc[:0].join(stats.differences({}, []))]
-    for quantity, of in asked.groupby("quantity", sort=False):
-        of = of.reset_index(drop=True)
-        parts.append(of.join(stats.differences(stats.grids(chapter, str(quantity)), list(of.weights))))
-    return pd.concat(parts[1:] or parts, ignore_index=True)
+    tests = [asked.iloc[:0].join(stats.differences({}, []))]  # without rows, for an experiment without differences
+    for quantity, group in asked.groupby("quantity", sort=False):
+        group = group.reset_index(drop=True)
+        tests.append(group.join(stats.differences(stats.grids(chapter, str(quantity)), list(group.weights))))
+    return pd.concat(tests[1:] or tests, ignore_index=True)
 
 
 def built(chapter: Results, chosen: Callable[[Registered], bool] = lambda _: True) -> list[Section]:

@@ -67,16 +67,16 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
     """
     rows = [_numbers(run.record, is_timed=run.machine == run.timed_on) for run in runs.itertuples()]
     names = [*SHOWN, "evaluated", "checked"]
-    of = pd.DataFrame(rows, runs.index).reindex(columns=["ends", *TEXTS, *names])
-    of = of.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))
-    of[["free", "asleep"]] *= 100
-    of[LOSSES] *= -1
-    of["ms"] -= of.ms_before
+    numbers = pd.DataFrame(rows, runs.index).reindex(columns=["ends", *TEXTS, *names])
+    numbers = numbers.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))
+    numbers[["free", "asleep"]] *= 100
+    numbers[LOSSES] *= -1
+    numbers["ms"] -= numbers.ms_before
     key = [runs[name] for name in ("scene", "model", "variant")]
-    is_evaluated = (of.evaluated.notna() | ~of.ends).groupby(key).transform("all")
-    of["dB"] = of.evaluated.where(is_evaluated, of.checked)
-    of["measured on"] = of.split.where(is_evaluated, of.checked_on).where(of.ends)
-    groups = of.groupby(key)
+    is_evaluated = (numbers.evaluated.notna() | ~numbers.ends).groupby(key).transform("all")
+    numbers["dB"] = numbers.evaluated.where(is_evaluated, numbers.checked)
+    numbers["measured on"] = numbers.split.where(is_evaluated, numbers.checked_on).where(numbers.ends)
+    groups = numbers.groupby(key)
     table = pd.DataFrame({
         "seeds": groups.size(), "screen": groups.decision.agg(_counted), "why": groups.why.first(),
         "compared": groups.compared.first(), "gated": groups.before.count(),
