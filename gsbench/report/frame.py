@@ -121,17 +121,17 @@ def row(r: Record) -> dict[str, Any]:
     return values | {f"stage_{name}": seconds for name, seconds in (r.cost.stage_s if r.cost else {}).items()}
 
 
-def value_at(of: Any, place: str) -> Any:
+def value_at(node: Any, place: str) -> Any:
     """Return the value at a dotted place of a record or of its settings; None if a part of it is missing."""
     for name in place.split("."):
-        of = of.get(name) if isinstance(of, dict) else getattr(of, name, None)
-    return of
+        node = node.get(name) if isinstance(node, dict) else getattr(node, name, None)
+    return node
 
 
 def _views(run: int, r: Record) -> Iterator[dict[str, Any]]:
     """Yield the scores of each view; a finished run without scores of views has one view without a name."""
     for view in r.per_view:
-        yield {"run": run, "view": view.name} | {name: getattr(view, of) for name, of in VIEWS.items()}
+        yield {"run": run, "view": view.name} | {name: getattr(view, field) for name, field in VIEWS.items()}
     if r.status == "ok" and not r.per_view:
         yield {"run": run, "view": "", "psnr_db": (r.metrics or {}).get("psnr")}
 
@@ -168,8 +168,8 @@ def _number(value: float | None) -> float:
 
 def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
     """Return runs without the times of other machines than that of most finished runs, which is in `timed_on`."""
-    of = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
-    machine = str(of.machine.value_counts(sort=False).idxmax())
+    counted = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
+    machine = str(counted.machine.value_counts(sort=False).idxmax())
     times = {name: runs[name].where(runs.machine == machine) for name in TIMES}
     return runs.assign(**times, timed_on=machine)
 

@@ -127,8 +127,8 @@ class Section:
         if math.isnan(value):
             return EMPTY
         column = self.column(name)
-        whole = name not in self.columns and name not in COLUMNS and float(value).is_integer()
-        digits = 0 if whole else column.digits_of(value)
+        is_whole = name not in self.columns and name not in COLUMNS and float(value).is_integer()
+        digits = 0 if is_whole else column.digits_of(value)
         return number(value, digits, signed=column.signed) + ("" if math.isnan(half) else f" ± {number(half, digits)}")
 
 

@@ -50,7 +50,8 @@ def means(runs: pd.DataFrame, by: list[str], quantities: Sequence[str]) -> pd.Da
 def grids(results: Results, quantity: str = "psnr_db") -> Grids:
     """Return a quantity of the finished runs as arrays, with the same seeds and views for all models of a scene.
 
-    PSNR has a column for each view; other quantities, and PSNR of runs without scores of views, have one column.
+    Differences of models are then those on the same view with the same seed. A missing run or view is NaN. PSNR has a
+    column for each view; other quantities, and PSNR of runs without scores of views, have one column.
     """
     names = ["scene", "seed", "model", "variant"]
     runs = results.finished.runs
@@ -105,10 +106,10 @@ def differences(arrays: Grids, asked: Sequence[Weights]) -> pd.DataFrame:
 NOTHING = Estimate(np.nan, 0, 0, "")
 
 
-def row_of(of: Estimate) -> dict[str, object]:
+def row_of(estimated: Estimate) -> dict[str, object]:
     """Return an estimate as a row of `differences`."""
-    row = {"mean": of.mean, "low": of.low, "high": of.high, "over": of.over, "scenes": of.scenes, "p": of.p}
-    return row | {"± over scenes": of.half_over_scenes, "gaining": of.gaining, "by scene": of.each}
+    row = {name: getattr(estimated, name) for name in ("mean", "low", "high", "over", "scenes", "p")}
+    return row | {"± over scenes": estimated.half_over_scenes, "gaining": estimated.gaining, "by scene": estimated.each}
 
 
 def _terms(weights: Weights, sign: int) -> tuple[tuple[str, str, float], ...]:
@@ -176,7 +177,7 @@ def ranks(runs: pd.DataFrame, by: str, quantity: str, higher: bool, show: Callab
 
 def _may_be_zero(difference: pd.Series) -> bool:
     """Tell whether the 95 % interval over seeds of a paired difference, by scene and seed, contains zero."""
-    scenes = [of.dropna().to_numpy()[:, None] for _, of in difference.groupby("scene")]
+    scenes = [values.dropna().to_numpy()[:, None] for _, values in difference.groupby("scene")]
     gap = estimate(scenes, generalise=False) if all(map(len, scenes)) else NOTHING
     return abs(gap.mean) <= gap.half
 

@@ -134,8 +134,8 @@ class Candidates:
             error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
             error.__context__ = None
         psnr = None if error or trainer.curve.last is None else trainer.curve.last.psnr_val
-        spent = sum(trainer.stages.seconds.values())
-        return Result(Candidate(name, psnr, spent, one_line(error) if error else None), until, trainer.effort, error)
+        candidate = Candidate(name, psnr, sum(trainer.stages.seconds.values()), one_line(error) if error else None)
+        return Result(candidate, until, trainer.effort, error)
 
     def _run(self, name: str) -> RunSpec:
         """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""

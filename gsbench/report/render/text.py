@@ -29,6 +29,7 @@ def terminal(sections: Sequence[Section], width: int = 120) -> str:
 
 
 def _terminal(section: Section, width: int) -> Iterator[str]:
+    """Yield the lines of a section: title, table with the rows of each scene below its name, text and notes."""
     table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text).map(lambda text: text[:WIDEST])
     has_scenes = "scene" in table.columns[:1]
     scenes = list(dict.fromkeys(table.scene)) if has_scenes else [""]
@@ -94,6 +95,7 @@ def latex(sections: Sequence[Section]) -> str:
 
 
 def _latex(section: Section, number: int) -> list[str]:
+    """Return the lines of a section as a table of LaTeX with a number in its label; notes are comments above it."""
     names = section.shown_columns
     shown = section.shown()
     titles = [tex(section.column(name).title) + ARROWS[section.column(name).better] for name in names]

@@ -19,8 +19,8 @@ BUSY = 0.5  # load by other work from which a run counts as measured beside it
 def points(chapter: Results, scenes: list[str]) -> pd.DataFrame:
     """Return a row for each configuration that finished `scenes`: PSNR with its interval, PSNR on val, and costs."""
     runs = chapter.finished.runs
-    by = ["series", "model", "variant"]
-    table = stats.means(runs[runs.scene.isin(scenes)], by, ["psnr_db", "psnr_val_db", *COSTS])
+    configuration = ["series", "model", "variant"]
+    table = stats.means(runs[runs.scene.isin(scenes)], configuration, ["psnr_db", "psnr_val_db", *COSTS])
     return table[(table.scenes == len(scenes)) & table.psnr_db.notna()].reset_index(drop=True)
 
 

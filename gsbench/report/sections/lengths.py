@@ -38,6 +38,7 @@ def by_length(runs: pd.DataFrame) -> pd.DataFrame:
         return pd.DataFrame()
     has_all = wide.notna().all(axis=1)
     psnr, val = wide.loc[has_all, "psnr_db"], wide.loc[has_all, "psnr_val_db"]
+    # How many times PSNR on val rises from one length to the next, from the shortest on: the place of the kept length.
     rises = (val.diff(axis=1).iloc[:, 1:] > 0).cumprod(axis=1).sum(axis=1).astype(int)
     chosen_psnr = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
     tried = [sum(psnr.columns[: rise + 2]) for rise in rises]

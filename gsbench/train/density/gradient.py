@@ -57,6 +57,8 @@ class GradientDensification(DensificationRule):
     def _add(self, generator: torch.Generator, most: int, allowed: Tensor | None = None) -> tuple[Tensor, int]:
         """Clone and split Gaussians with a large gradient that are `allowed` [N] bool; None: all.
 
+        A small Gaussian is cloned, because it covers too little; a large one, or one that is long in time, is split.
+
         Returns:
             The index before the change of each Gaussian or of its parent, [M], and the number of Gaussians that were
             not cloned or split because of `most`.

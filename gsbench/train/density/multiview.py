@@ -40,15 +40,18 @@ class MultiviewDensification(GradientDensification):
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
-        """Clone and split Gaussians of large gradient and importance, then prune and lower opacities."""
+        """Clone and split Gaussians of large gradient and importance, then prune and lower opacities.
+
+        A faint or large Gaussian is pruned only if a random draw picks it, which is likelier the larger its badness.
+        """
         assert self.score is not None, "expected the score of views, which the trainer gives"
         importance, badness = self.score(generator)
         parents, refused = self._add(generator, most, importance > LEAST_IMPORTANCE)
         candidates = self._faint_or_large(has_reset)
         weights = 1 / (1e-6 + 1 - badness[parents].double())
-        picked = torch.zeros_like(candidates)
-        picked[drawn_once(weights, int(PRUNED_SHARE * int(candidates.sum())), generator)] = True
-        self.rows.select((~(self._unseen() | candidates & picked)).nonzero()[:, 0])
+        is_drawn = torch.zeros_like(candidates)
+        is_drawn[drawn_once(weights, int(PRUNED_SHARE * int(candidates.sum())), generator)] = True
+        self.rows.select((~(self._unseen() | candidates & is_drawn)).nonzero()[:, 0])
         self.model.reset_opacities(MOST_OPACITY)
         return refused
 
