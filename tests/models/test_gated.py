@@ -34,7 +34,7 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.simplifications import shares_of, simplifications_of
 from gsbench.scenes.scene import Points
 
-GATED = [name for name in EVERY if not name.startswith("ubs")]
+GATED = [variant for variant, (name, _) in EVERY.items() if getattr(registry.find(name), "gates", False)]
 OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs") and "agr" not in name]
 QUERY = CameraTime.at(CAMERA, 0.45)
 
