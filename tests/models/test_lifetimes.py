@@ -49,9 +49,7 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
     assert 0 < hidden < len(times) * len(model)
 
 
-@pytest.mark.parametrize(
-    "variant", ["ubs", *(name for name in NAMES if "time" not in registry.find(name).observes)]
-)
+@pytest.mark.parametrize("variant", ["ubs", *(name for name in NAMES if "time" not in registry.find(name).observes)])
 def test_models_without_intervals(variant: str) -> None:
     """Catches a model that is sorted by times that it does not have; rows of UBS are not sorted either."""
     assert fresh(variant).visible_intervals() is None
