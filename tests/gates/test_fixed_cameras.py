@@ -160,3 +160,11 @@ def test_viewpoints_are_those_of_the_cameras() -> None:
         film = filmed(still, 60, orbit=orbit)
         before = [view for view in film.train if view.time < 1]  # an orbit ends where it began
         assert len(group_by_viewpoint(before, film.extent).other) == 59
+
+
+def test_a_channel_with_too_few_pixels_has_the_gain_of_the_others() -> None:
+    """Catches a mean over all channels, also those that were fitted to nothing."""
+    values = np.float32([[[2.0], [4.0], [9.0]], [[5.0], [6.0], [7.0]]])
+    enough = np.array([[[True], [True], [False]], [[False], [False], [False]]])
+    shared = fixed_camera_test._shared(values, enough, 1.0)
+    np.testing.assert_array_equal(shared[..., 0], [[2, 4, 3], [1, 1, 1]])

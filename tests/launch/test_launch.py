@@ -149,6 +149,7 @@ def test_a_sweep_has_the_bits_of_one_process_and_a_retry_does_what_is_missing(sq
         first = gsbench("-m", *words)  # scene=all: the scene has no file in conf/
         assert first.returncode == 0, first.stderr
         assert len(re.findall(r"1 of 2 runs have ended; about \d+ s left\n", first.stderr)) == 1
+        assert "gsbench: error" not in first.stderr
         (folder,) = experiment.glob(".sweep/*")
         assert [outcome.reason for outcome in plan.read_ended(folder).values()] == [None, None]
         assert states(experiment) == ["done", "done"]

@@ -126,6 +126,13 @@ def test_a_row_is_of_one_recipe_and_protocol():
         ["", 1, "", True], ["", 2, "batch size", True], ["pillow", 1, "filter, quantisation", False]]  # fmt: skip
 
 
+def test_a_row_names_its_experiment_where_a_table_has_two():
+    """Would catch two rows of one name, whose numbers differ."""
+    two = [at_paper("7dgs"), at_paper("7dgs", experiment="mine")]
+    assert "| 7dgs |" in shown(two[0])
+    assert "| 7dgs mine |" in shown(*two)
+
+
 def test_only_the_pool_nearest_to_the_paper_is_shown():
     """Would catch pages of trials, runs that vanish without a word, and 7DGS-PBR split in two as heart1 is smaller."""
     trials = [at_paper(iterations=n, resolution="100x100", experiment=f"e{n}") for n in (500, 7000, 1000)]
