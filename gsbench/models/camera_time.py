@@ -44,7 +44,11 @@ class CameraTime(NamedTuple):
 
     @classmethod
     def at(cls, center: Tensor, time: float | Tensor | None) -> CameraTime:
-        """Take a position [3] and a time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it."""
+        """Take a position [3] and a time in [0, 1]; a tensor [] is kept, so that a CUDA graph can read it.
+
+        Raises:
+            InputError: `center` is no floating-point tensor [3], or `time` no finite number or tensor [] beside it.
+        """
         check_tensor(center, "query: center")
         if center.shape != (3,):
             raise InputError(f"query: center: expected shape [3], got {list(center.shape)}")
