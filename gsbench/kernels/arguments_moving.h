@@ -1,4 +1,4 @@
-// The arguments of the kernels of gsbench/kernels/moving.py: slices of dGS, dBS and FreeTimeGS. See arguments.h, which
+// The arguments of the kernels of gsbench/kernels/slices.py: slices of dGS, dBS and FreeTimeGS. See arguments.h, which
 // includes this file.
 #pragma once
 

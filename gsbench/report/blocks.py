@@ -266,7 +266,7 @@ def dnerf(published: Path, quantities: dict[str, str]) -> str:
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == "")].set_index("scene")
     by_column = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
-             for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
+                 for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
     table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
