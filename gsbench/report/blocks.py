@@ -13,14 +13,12 @@ from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
 from gsbench.report.section import Column, Section, number
 from gsbench.report.sections import tested
-from gsbench.report.sections.budgets import contests
 from gsbench.report.sections.effects import is_single
 from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
 SUCCESSORS = ["freetime", "dbs", "ndgs", "ubs", "dgs"]
-LENGTHS = {"250": "iterations=250", "500": "iterations=500", "1,000": "",
-           "1,000, threshold 4e-4": "densify.grad_threshold=0.0004", "2,000": "iterations=2000",
+LENGTHS = {"250": "iterations=250", "500": "iterations=500", "1,000": "", "2,000": "iterations=2000",
            "4,000": "iterations=4000"}  # fmt: skip
 MOVING = ["monocular", "rig", "array"]
 KINDS = {"monocular": ["monocular"], "fixed cameras": ["rig", "array"], "all dynamic": MOVING, "static": ["static"]}
@@ -43,10 +41,8 @@ ABLATIONS = {
     "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
 }  # fmt: skip
 OF_TREX = {
-    "psnr_db": Column("PSNR, last iteration"), "psnr_best_on_test_db": Column("best on test (leaks)"),
-    "psnr_val_db": Column("val"), "psnr_train_db": Column("training views", 1), "ssim": Column("SSIM", 3),
-    "lpips_alex": Column("LPIPS-Alex", 3), "CPU min": Column("CPU min", 1), "GPU min": Column("GPU min", 1),
-    "gaussians": Column("Gaussians", 0),
+    "psnr_db": Column("PSNR, last iteration"), "psnr_best_on_test_db": Column("best on test"),
+    "CPU min": Column("CPU min", 1), "GPU min": Column("GPU min", 1), "gaussians": Column("Gaussians", 0),
 }  # fmt: skip
 QUANTITIES = [*(name for name in OF_TREX if not name.endswith("min")), "train_s", "train_cpu_s"]
 
@@ -87,11 +83,11 @@ def reached(psnr: pd.DataFrame, seconds: pd.DataFrame) -> str:
     return block(shown(stats.ranked_rows(psnr)) + ", " + shown(seconds, 1))
 
 
-def changes(tests: pd.DataFrame, scenes: Sequence[str]) -> pd.DataFrame:
-    """Return tested differences: mean (bold if significant) ± half the interval, and the mean of each scene."""
+def changes(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return tested differences: mean (bold if significant) ± half the interval."""
     table = pd.DataFrame({"mean": tests["mean"], "mean ±": tests.high - tests["mean"]})
     table["mean rank"] = tests.significant.astype(int)
-    return table.join(pd.DataFrame(tests["by scene"].tolist(), tests.index, list(scenes)))
+    return table
 
 
 def price(scenes: list[Values]) -> str:
@@ -109,13 +105,11 @@ def price(scenes: list[Values]) -> str:
 
 
 def table1(published: Path) -> str:
-    """Return the means of `make table1`, PSNR also by scene, with the newer methods last."""
-    chapter = only(published, "mini")
-    quantities = ["psnr_db", "ssim", "lpips_alex", "train_s", "fps", "gaussians"]
-    table = means(chapter, *quantities).xs("", level="variant")
-    scenes = chapter.runs.groupby(["model", "scene"]).psnr_db.mean().unstack()
+    """Return the means of `make table1`, with the newer methods last."""
+    quantities = ["psnr_db", "lpips_alex", "train_s", "fps", "gaussians"]
+    table = means(only(published, "mini"), *quantities).xs("", level="variant")
     models = [model for model in (*MODELS, *SUCCESSORS) if model in table.index]
-    return block(scenes.loc[models].join(table[quantities]), fps=Column("FPS", 0))
+    return block(table.loc[models, quantities], fps=Column("FPS", 0))
 
 
 def cost(published: Path, lengths: Sequence[str] = ("250", "1,000", "4,000"), models: Sequence[str] = MODELS) -> str:
@@ -126,13 +120,8 @@ def cost(published: Path, lengths: Sequence[str] = ("250", "1,000", "4,000"), mo
 
 
 def frontier(published: Path) -> str:
-    """Return all lengths of `make frontier`, and the best model within each budget."""
-    chapter = only(published, "frontier")
-    best = pd.concat({budget: table.head(1) for budget, table in contests(chapter).items()}, names=["budget", ""])
-    best = best.assign(best=("`" + best.model + "` " + best.variant).str.rstrip()).droplevel(1)
-    newer = [model for model in SUCCESSORS if model in set(chapter.runs.model)]
-    tables = [cost(published, list(LENGTHS)), cost(published, ["1,000", "2,000"], newer) if newer else ""]
-    return "\n\n".join([*filter(None, tables), block(best[["best", "psnr_db"]])])
+    """Return all lengths of `make frontier`."""
+    return cost(published, list(LENGTHS))
 
 
 def effects(published: Path) -> str:
@@ -143,15 +132,13 @@ def effects(published: Path) -> str:
     gains = tests[tests.quantity == "psnr_db"]
     single = [name for name in gains.index if is_single(name) and not name.endswith("nested")]
     names = [f"{name}, nested" if f"{name}, nested" in gains.index else name for name in single]
-    scenes = sorted(chapter.runs.scene.unique())
-    table = changes(gains.loc[names], scenes)
+    table = changes(gains.loc[names])
     for quantity in ("train_s", "frame_ms", "model_mb"):
         table[quantity] = tests[tests.quantity == quantity]["mean"].loc[names]
     effect = [name.replace(" alone", "").replace(", with", " given") for name in single]
     units = {"mean": ("PSNR, dB", 2), "train_s": ("training, s", 1), "frame_ms": ("frame, ms", 2),
              "model_mb": ("model, MB", 2)}  # fmt: skip
-    columns = {name: Column(name, signed=True) for name in scenes}
-    columns |= {name: Column(title, digits, signed=True) for name, (title, digits) in units.items()}
+    columns = {name: Column(title, digits, signed=True) for name, (title, digits) in units.items()}
     return block(table.set_axis(pd.Index(effect, name="effect")), **columns)
 
 
@@ -163,21 +150,13 @@ def ablation(published: Path) -> str:
     arrays = stats.grids(chapter)
     tests = [stats.differences(arrays, [{full: 1.0}]).assign(significant=False),
              stats.differences(arrays, [{part: 1.0, full: -1.0} for part in ablated])]  # fmt: skip
-    table = changes(pd.concat(tests, ignore_index=True), sorted(arrays))
+    table = changes(pd.concat(tests, ignore_index=True))
     table.insert(0, "`+ablation=`", [f"`{name}`" for name in ABLATIONS])
     columns = {"mean": Column("PSNR, dB")}
     return block(table.set_axis(pd.Index(ABLATIONS.values(), name="changed")), **columns)
 
 
 # ---- the suite
-
-
-def suite_scenes(published: Path) -> str:
-    """Return PSNR of every model on every scene of the suite."""
-    runs = pd.concat([chapter.runs for chapter in study(published / "suite").values()])
-    runs = runs[(runs.variant == "") & runs.model.isin(MODELS)].rename(columns={"dataset": "kind"})
-    psnr = runs.groupby(["kind", "scene", "model"]).psnr_db.mean().unstack()[MODELS]
-    return block(stats.ranked_rows(psnr).reorder_levels(["scene", "kind"]))
 
 
 def suite_kinds(published: Path, names: Sequence[str] = tuple(CHANGES)) -> str:
@@ -197,23 +176,19 @@ def _minus(name: str, variant: str = "") -> stats.Weights:
 
 
 def suite_lengths(published: Path) -> str:
-    """Return what models reach and what effects change after three lengths, over the dynamic scenes that all have."""
+    """Return what effects change after three lengths of training, over the dynamic scenes that all models finished."""
     variants = {n: LENGTHS[n] for n in ("500", "1,000", "2,000")}
     chapters = [study(published / "suite")[kind] for kind in MOVING]
     runs = pd.concat([chapter.runs for chapter in chapters])
     runs = runs[runs.model.isin(MODELS) & runs.variant.isin(variants.values())]
     counts = runs.drop_duplicates(["scene", "model", "variant"]).scene.value_counts()
     shared = set(counts.index[counts == len(MODELS) * len(variants)])
-    by_scene = runs[runs.scene.isin(shared)].groupby(["variant", "model", "scene"])[["psnr_db", "train_s"]].mean()
-    averages = by_scene.groupby(["variant", "model"]).mean().unstack("model").loc[list(variants.values())]
-    averages = averages.set_axis(pd.Index(variants, name="iterations"))
     arrays = {scene: grid for chapter in chapters for scene, grid in stats.grids(chapter).items() if scene in shared}
     prices = {
         f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in CHANGES]
         for n, variant in variants.items()
     }
-    table = pd.DataFrame(prices, pd.Index(CHANGES, name="effect"))
-    return f"{reached(averages.psnr_db[MODELS], averages.train_s[MODELS])}\n\n{block(table)}"
+    return block(pd.DataFrame(prices, pd.Index(CHANGES, name="effect")))
 
 
 def suite_choices(published: Path) -> str:
@@ -230,9 +205,10 @@ def suite_choices(published: Path) -> str:
         chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
         lost[f"the best model on val after {100 * part:.0f} % of the iterations"] = chosen - best
     gap = pd.DataFrame(lost).groupby("scene").mean()
-    table = pd.DataFrame({"mean": gap.mean(), "worst": gap.min(), "near": (gap >= -0.1).sum(), "of scenes": len(gap)})
+    table = pd.DataFrame({"mean": gap.mean(), "worst": gap.min(), "near": (gap >= -0.1).sum()})
     return block(table.rename_axis("choice"), mean=Column("mean, dB", 2, signed=True),
-                 worst=Column("worst scene, dB", 2, signed=True), near=Column("at most 0.1 dB below", 0))  # fmt: skip
+                 worst=Column("worst scene, dB", 2, signed=True),
+                 near=Column(f"scenes at most 0.1 dB below, of {len(gap)}", 0))  # fmt: skip
 
 
 def _val_on_the_way(chapter: Results) -> pd.DataFrame:
@@ -247,10 +223,10 @@ def _val_on_the_way(chapter: Results) -> pd.DataFrame:
 
 
 def lengths(published: Path) -> str:
-    """Return PSNR after four lengths, and after the one that `train.lengths=4` keeps."""
+    """Return PSNR of 7DGS after four lengths, and after the one that `train.lengths=4` keeps."""
     runs = pd.concat([of.runs for name in ("lengths", "suite") for of in study(published / name).values()])
     runs = runs[runs.variant.isin(["", "iterations=2000", "iterations=4000", "iterations=8000"])]
-    table = by_length(runs).dropna().droplevel("seed")
+    table = by_length(runs[runs.model == "7dgs"]).dropna().droplevel(["model", "seed"])
     return block(stats.ranked_rows(table.drop(columns=["kept", "tried"])).assign(kept=table.kept))
 
 
@@ -336,7 +312,7 @@ README: dict[str, Callable[[Path], str]] = {
     "worth": lambda published: suite_kinds(published, list(CHANGES)[:4]),
     "dnerf": lambda published: dnerf(published, BEST | OF_PAPER),
 }
-_OF_RESULTS = (table1, frontier, effects, suite_scenes, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
+_OF_RESULTS = (table1, frontier, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
                trex400, on_demand)  # fmt: skip
 RESULTS: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, LAST | BEST | OF_PAPER),
