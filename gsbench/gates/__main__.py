@@ -51,7 +51,7 @@ def _whole(text: str) -> int:
 
 
 def _answer(options: argparse.Namespace) -> Answer:
-    """Check the options and do the task that they name."""
+    """Check the options, do the task that they name, and return its result for JSON and as lines."""
     if (options.scene is None) == (options.checkpoint is None):
         raise InputError("expected one of SCENE_FOLDER and --checkpoint RUN_FOLDER")
     if not 0 <= options.seed < 2**63:
@@ -62,8 +62,9 @@ def _answer(options: argparse.Namespace) -> Answer:
         from gsbench.gates.finished import gate_finished  # imported here, because a screen needs no training code
 
         record, new = gate_finished(options.checkpoint, options.budget_db, options.data_root)
-        lines = messages.lines(record.on_demand) if record.on_demand else []
-        return {"on_demand": record.on_demand, "written": new}, [*lines, f"Written: {new}"]
+        assert record.on_demand is not None  # what the gate removed
+        lines = [*messages.lines(record.on_demand), f"Written: {new}"]
+        return {"on_demand": record.on_demand, "written": new}, lines
     screen = screen_time(scenes.load(options.scene), options.seed)
     return {"time": screen}, [messages.of_screen(screen)]
 

@@ -118,7 +118,10 @@ def center_of(views: Sequence[View]) -> Tensor | None:
 
 
 def camera_basis(views: Sequence[View]) -> Array:
-    """Compute the spherical harmonics up to degree 2 of each camera's direction from the scene's centre, [V, 9]."""
+    """Compute the spherical harmonics up to degree 2 of each camera's direction from the scene's centre, [V, 9].
+
+    What the residuals share with them is an effect of view direction, which the test of time leaves out.
+    """
     center = center_of(views)
     centers = torch.stack([view.camera.center for view in views]).cpu()
     if center is None:  # cameras side by side: seen from so far in front of them that all lie close together

@@ -201,7 +201,8 @@ class Operation:
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
         """Return the kernel arguments of a call by name: sizes, numbers, and addresses of inputs and `outputs`.
 
-        The entry `rows` holds the tensors, so that their memory is not freed.
+        Outputs are passed for a backward pass only; `run` allocates those of a forward pass itself. The entry `rows`
+        holds the tensors, so that their memory is not freed.
         """
         slots = self.match(tensors, numbers).copy()
         rows = slots["rows"] = in_rows(tensors)

@@ -102,7 +102,10 @@ def retry(experiment: Experiment, more: Sequence[str]) -> int:
 
 
 def _launch_again(experiment: Experiment, group: Sequence[PlannedRun], more: Sequence[str]) -> None:
-    """Launch runs of one plan again, from the folder where their command was typed, as their paths start there."""
+    """Launch runs of one plan again, with the launch settings `more`.
+
+    They start in the folder where their command was typed, because their paths are relative to it.
+    """
     results = f"results={quoted_value(str(experiment.folder.parent.resolve()))}"
     planned = group[0].plan
     try:

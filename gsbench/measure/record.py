@@ -245,7 +245,7 @@ class Record:
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
     regions: dict[str, Region] = field(default_factory=dict)  # by "moving" and "object", if there are such pixels
-    on_demand: OnDemand | None = None  # None: no effect was removed from the model or its Gaussians
+    on_demand: OnDemand | None = None  # what the time screen and the gate did; None: neither ran
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
     length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`

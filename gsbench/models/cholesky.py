@@ -165,6 +165,8 @@ class CholeskyModel(JointModel):
         if "time" in self.observes:
             # The mean time of a child differs by dt = z sigma from its parent's. At any (t, d) its slice has the mean
             # of the parent's slice, since K (q - mu_q) changes by -K_t dt and mu_p by K_t dt.
+            # sigma is at most the length of the clip: that of a Gaussian that stands still grows without end, and AGR
+            # reads mean times.
             sigma = factor[:, -1].norm(dim=-1, keepdim=True).clamp(max=1)
             children["times"], dt = self.shifted_times(raw, torch.where(in_time, z[:, :1] * sigma, 0))
             children["means"] = children["means"] + gain[..., -1] * dt

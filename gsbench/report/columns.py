@@ -55,7 +55,7 @@ RUNS = (
     RunColumn("effect_time", "effects.time", bool, "Gaussians depend on time"),
     RunColumn("effect_direction", "effects.direction", bool, "Gaussians depend on the view direction"),
     RunColumn("effect_refinement", "effects.refinement", bool, "Gaussians depend on AGR, a neural network"),
-    RunColumn("on_demand", "", bool, "effects were removed from the model or from Gaussians"),
+    RunColumn("on_demand", "", bool, "the time screen or a gate ran (`effects.gate`, `model=auto`)"),
     RunColumn("gate", "", str, 'when that was, such as "gate=end"; "" where it is the model\'s default'),
     RunColumn("config", "provenance.config", dict, "all settings, a nested dict"),
     RunColumn("missing", "missing", dict, "why metrics are missing, a dict"),

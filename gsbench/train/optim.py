@@ -52,9 +52,8 @@ class Optimizer:
         self.is_sparse = kind == "sparse_adam"
         # The step count and both moments of each parameter, in the form of torch.optim.Adam.state.
         self.moments: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
-        self.skip: Tensor | None = (
-            None  # [] on a GPU: 1 after a gradient was not finite, so that no step changes anything
-        )
+        # [] on a GPU: 1 from the first step whose loss or gradient was not finite, so that no step changes anything
+        self.skip: Tensor | None = None
 
     @cached_property
     def torch_adam(self) -> torch.optim.Adam:
@@ -72,7 +71,8 @@ class Optimizer:
     ) -> None:
         """Update the parameters that have a gradient, then delete the gradients.
 
-        On a GPU nothing is updated if an earlier gradient was not finite (`skip` is 1).
+        On a GPU nothing is updated from the first step on whose loss or gradient was not finite (`skip` is 1), until
+        `FiniteCheck` ends the training.
         """
         rates = self.rates_at(step, factors)
         if self.is_sparse:
@@ -87,6 +87,7 @@ class Optimizer:
             for group in self.torch_adam.param_groups:
                 group["lr"] = rates[group["name"]]
             if self.skip is not None:
+                # torch's fused Adam changes nothing where it is 1.
                 self.torch_adam.found_inf = self.skip  # type: ignore[attr-defined]
             self.torch_adam.step()
             self.torch_adam.zero_grad(set_to_none=True)

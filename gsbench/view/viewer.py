@@ -152,7 +152,7 @@ class Browser:
 
     def _show(self, *, limited: bool) -> Frame:
         """Render a frame, and show it with its milliseconds and the legend of its colours."""
-        width, height = self._size(self._resolution, limited)
+        width, height = self._size(self._resolution, limited=limited)
         frame = self._combined(width, height, self._rendered)
         self._resolution.took(width * height, frame.ms(SLICE), frame.ms(RASTER))
         self._float32_resolution.took(width * height, 0.0, FLOAT32_FRAMES * frame.ms(RASTER))
@@ -162,7 +162,10 @@ class Browser:
         return frame
 
     def _bounded(self, usual: Frame) -> tuple[Frame, Notes]:
-        """Render a frame with the bound on the error of float32, or return the `usual` one if no model has it."""
+        """Render again with the bound on the error of float32, in fewer pixels if that takes long.
+
+        If no model has the bound, return `usual`, the frame of all pixels that is shown already.
+        """
         notes: Notes = {}
 
         def render(renderer: FrameRenderer, colours: str, camera: Camera) -> Frame:
@@ -174,7 +177,7 @@ class Browser:
                     notes[renderer.name] = f"no bound: {error}"
             return self._rendered(renderer, colours, camera)
 
-        frame = self._combined(*self._size(self._float32_resolution, True), render)
+        frame = self._combined(*self._size(self._float32_resolution, limited=True), render)
         return frame if any(isinstance(note, Float32Error) for note in notes.values()) else usual, notes
 
     def _show_bound(self, frame: Frame, notes: Notes) -> None:
@@ -211,7 +214,7 @@ class Browser:
             frame = beside(frame, others[0]) if layout == SIDE else wiped(frame, others[0], edge)
         return frame._replace(image=labelled(frame.image, edge, *map(_label, shown)))
 
-    def _size(self, resolution: Resolution, limited: bool) -> tuple[int, int]:
+    def _size(self, resolution: Resolution, *, limited: bool) -> tuple[int, int]:
         camera = self.client.camera
         return resolution.size(max(1, camera.image_width), max(1, camera.image_height), limited=limited)
 

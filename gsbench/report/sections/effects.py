@@ -15,7 +15,11 @@ UNITS = {"psnr_db": ("dB", 2), "train_s": ("training s", 1), "frame_ms": ("ms a 
 
 
 def asked(chapter: Results) -> Asked:
-    """Return the weighted sums of models that price each effect and interaction, then those within 7DGS."""
+    """Return the effects and interactions to test, as weighted sums of models, for each quantity.
+
+    Those named "nested" change if 7DGS without direction replaces 4DGS. `section` tests all of them, with Holm's
+    correction for multiple comparisons.
+    """
     cells, nested = models(chapter)
     sums = stats.factorial(cells, FACTORS)
     within = [(f"{name}, nested", weights) for name, weights in stats.factorial(nested, FACTORS)
