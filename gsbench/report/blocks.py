@@ -125,12 +125,13 @@ def frontier(published: Path) -> str:
 
 
 def effects(published: Path) -> str:
-    """Return what time, direction and AGR gain and cost, given the other effects; nested gains where there are any."""
+    """Return what time, direction and AGR gain and cost, alone and given both others; nested gains where there are."""
     chapter = only(published, "frontier")
     tests = tested(chapter)
     tests = tests[tests.section == "effects"].set_index("name")
     gains = tests[tests.quantity == "psnr_db"]
-    single = [name for name in gains.index if is_single(name) and not name.endswith("nested")]
+    single = [name for name in gains.index if is_single(name) and (" alone" in name or " and " in name)]
+    single = [name for name in single if not name.endswith("nested")]
     names = [f"{name}, nested" if f"{name}, nested" in gains.index else name for name in single]
     table = changes(gains.loc[names])
     for quantity in ("train_s", "frame_ms", "model_mb"):
