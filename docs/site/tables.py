@@ -24,7 +24,7 @@ from gsbench.usage import first_sentence
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = ROOT / "results" / "published"
 MODELS_HEAD = "| `model=` | what it does | observes | numbers a Gaussian |\n| --- | --- | --- | ---: |"
-CONFIG_HEAD = "key | default | meaning\n---|---|---"
+CONFIG_HEAD = "key=default | meaning\n---|---"
 MARKS = "<!-- written by docs/site/tables.py: {} -->", "<!-- end -->"
 
 
@@ -58,15 +58,15 @@ def numbers(composed: DictConfig) -> int:
 
 def config() -> str:
     """Return a heading, the purpose and a table of keys for each group of the config."""
-    groups: dict[str, dict[str, str]] = {}
+    groups: dict[str, dict[str, tuple[str, str]]] = {}
     for name, facts in declared(Config).items():
         group = name.partition(".")[0] if "." in name else ""
         rows = groups.setdefault(group, {})
-        cells = " | ".join(("", *cells_of(facts)))
+        cells = cells_of(facts)
         alike = next((key for key in rows if rows[key] == cells and is_alike(key, name)), name)
         rows[merged(alike, name)] = rows.pop(alike, cells)
     return "\n\n".join(
-        "\n".join([*heading(group), CONFIG_HEAD, *(f"`{name}`{cells}" for name, cells in rows.items())])
+        "\n".join([*heading(group), CONFIG_HEAD, *(f"`{name}{cells[0]}` | {cells[1]}" for name, cells in rows.items())])
         for group, rows in groups.items()
     )
 
@@ -78,10 +78,11 @@ def heading(group: str) -> list[str]:
 
 
 def cells_of(facts: Key) -> tuple[str, str]:
-    """Return the default of a key, and its meaning with its range."""
+    """Return the default of a key, as `=default`, and its meaning with its range."""
     allowed = facts.range.replace("at least ", "≥").replace(" to ", "–")
-    default = f"`{facts.shown}`" if facts.shown else "required"
-    return f"{default} {facts.unit}".strip(), f"{facts.help} ({allowed})" if allowed else facts.help
+    unit = facts.unit and f" {facts.unit}"
+    meaning = f"{facts.help} ({allowed}{unit})" if allowed else facts.help
+    return (f"={facts.shown}", meaning) if facts.shown else ("", f"{meaning}; required")
 
 
 def is_alike(first: str, second: str) -> bool:
