@@ -100,7 +100,8 @@ def conditions(bounds: Limits) -> list[str]:
         f"{kernels.native().active()}, commit {git_commit()}.",
         "",
         f"Limits of one thread, measured in the same run: {rates}. Process-CPU milliseconds of one thread unless said;",
-        "the scene's recipe is benchmarks/scene.py. A ratio of 1 would be the limit itself; `reference` is torch.",
+        "the scene's recipe is benchmarks/scene.py. The limit is that of bytes read and written once, of flops or of",
+        "blended alphas. Ratio: the median over the limit, below 1 for data in cache; `reference` is torch.",
     ]
 
 

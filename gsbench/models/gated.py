@@ -32,7 +32,7 @@ class GatedModel(GaussianModel):
     gates: ClassVar[bool] = False  # whether gates may simplify the model
 
     def __init_subclass__(cls, *, gates: bool = False, **more: Any) -> None:
-        """Set `gates`, which is not inherited: a subclass may have parameters that `static`, `frozen`, `kept` miss."""
+        """Set `gates`, which is not inherited: a subclass may have parameters that the methods below do not handle."""
         super().__init_subclass__(**more)
         cls.gates = gates
 
