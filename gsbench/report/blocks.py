@@ -26,6 +26,7 @@ CHANGES = {"time, given direction": ("7dgs_noagr", "6dgs"), "direction": ("6dgs"
            "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
            "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
            "7DGS instead of 4DGS": ("7dgs", "4dgs"), "`model=auto` instead of 7DGS": ("auto", "7dgs")}  # fmt: skip
+EFFECTS = list(CHANGES)[:4]
 CHOICES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS", "auto": "`model=auto`",
            "auto compare=true": "`model=auto effects.compare=true`"}  # fmt: skip
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
@@ -185,10 +186,10 @@ def suite_lengths(published: Path) -> str:
     shared = set(counts.index[counts == len(MODELS) * len(variants)])
     arrays = {scene: grid for chapter in chapters for scene, grid in stats.grids(chapter).items() if scene in shared}
     prices = {
-        f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in CHANGES]
+        f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in EFFECTS]
         for n, variant in variants.items()
     }
-    return block(pd.DataFrame(prices, pd.Index(CHANGES, name="effect")))
+    return block(pd.DataFrame(prices, pd.Index(EFFECTS, name="effect")))
 
 
 def suite_choices(published: Path) -> str:
@@ -309,7 +310,7 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 
 README: dict[str, Callable[[Path], str]] = {
     "cost": lambda published: cost(published, models=["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]),
-    "worth": lambda published: suite_kinds(published, list(CHANGES)[:4], ["all dynamic", "static"]),
+    "worth": lambda published: suite_kinds(published, EFFECTS, ["all dynamic", "static"]),
     "dnerf": lambda published: dnerf(published, BEST | OF_PAPER),
 }
 _OF_RESULTS = (table1, frontier, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
