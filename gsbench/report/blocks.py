@@ -160,15 +160,20 @@ def ablation(published: Path) -> str:
 # ---- the suite
 
 
-def suite_kinds(published: Path, names: Sequence[str] = tuple(CHANGES), titles: Sequence[str] = tuple(KINDS)) -> str:
-    """Return what each effect changes in PSNR, by kind of scene."""
+def suite_kinds(published: Path) -> str:
+    """Return what each effect changes in PSNR, by kind of scene, with the models that are compared."""
+    table = by_kind(published, list(CHANGES), list(KINDS))
+    return block(table.rename(lambda name: f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}"))
+
+
+def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFrame:
+    """Return what effects change in PSNR, by kind of scene."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
     prices = {
         title: [price([v for of in KINDS[title] for v in stats.contrast(arrays[of], _minus(name))]) for name in names]
         for title in titles
     }
-    effect = [f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}" for name in names]
-    return block(pd.DataFrame(prices, pd.Index(effect, name="effect")))
+    return pd.DataFrame(prices, pd.Index(names, name="effect"))
 
 
 def _minus(name: str, variant: str = "") -> stats.Weights:
@@ -310,7 +315,7 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 
 README: dict[str, Callable[[Path], str]] = {
     "cost": lambda published: cost(published, models=["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]),
-    "worth": lambda published: suite_kinds(published, EFFECTS, ["all dynamic", "static"]),
+    "worth": lambda published: block(by_kind(published, EFFECTS, ["all dynamic", "static"])),
     "dnerf": lambda published: dnerf(published, BEST | OF_PAPER),
 }
 _OF_RESULTS = (table1, frontier, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
