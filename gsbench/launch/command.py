@@ -114,9 +114,7 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
     keys = {name.lstrip("+"): words for name, words in values.items()}
     if len(keys.get("exp", ())) > 1:
         raise InputError(f"+exp: expected one experiment, got {len(keys['exp'])}: type a command for each")
-    all_scenes = (
-        keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys and keys["exp"] != ["+exp=stability"]
-    )
+    all_scenes = keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys
     base = _compose([words[0] for name, words in values.items() if name != "scene"])
     axes = [f"{name}={text}" for name, text in (base.hydra.sweeper.params or {}).items()]
     if not (command.multirun or all_scenes or axes or base.launch.by != "local"):

@@ -76,10 +76,6 @@ class Curve:
         change = "" if before is None or before.psnr_val is None else f" ({now.psnr_val - before.psnr_val:+.2f})"
         return f"{text}{now.psnr_val:.2f} dB{change}"
 
-    def seconds_to(self, psnr: float) -> float | None:
-        """Return the training seconds at the first evaluation with at least `psnr` dB, or None if there is none."""
-        return next((p.seconds for p in self.points if p.psnr_val is not None and p.psnr_val >= psnr), None)
-
     def state_dict(self) -> list[tuple[int, float, float | None]]:
         """Return the evaluations as plain tuples, which a checkpoint can store and load with `weights_only=True`."""
         return [(p.iteration, p.seconds, p.psnr_val) for p in self.points]

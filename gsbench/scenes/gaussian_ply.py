@@ -32,7 +32,6 @@ _COLUMNS = {
     "log_scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
-PLY_ROW = 4 * (17 + 3 * ((MAX_DEGREE + 1) ** 2 - 1))  # bytes of a Gaussian in a file of `ply_of`
 _LARGEST = 1e30  # largest accepted number; its square in double and its sums in single precision are finite
 _LARGEST_LOGIT = math.log(ALPHA_MAX / (1 - ALPHA_MAX))
 _VALUE = 40  # bytes that a number of a Gaussian needs while it is read: in the file, in double and in single precision

@@ -231,8 +231,8 @@ def test_on_a_gpu_the_stage_that_caused_the_work_pays_for_it():
     assert speed.peak_memory("cuda") >= 4096 * 4096 * 4
 
 
-def test_the_curve_answers_best_last_and_time_to_accuracy(tmp_path):
-    """Would catch interpolation between points that were never measured, a best that NaN wins, a resume that adds
+def test_the_curve_answers_best_and_last(tmp_path):
+    """Would catch a best that NaN wins, a resume that adds
     points twice, and a state that weights_only=True refuses to load."""
     curve, resumed = Curve(), Curve()
     assert curve.best is curve.last is None
@@ -240,7 +240,6 @@ def test_the_curve_answers_best_last_and_time_to_accuracy(tmp_path):
         curve.add(iteration, seconds, psnr)
     assert curve.best == curve.last == Point(400, 4.0, 24.0)  # of equal ones the last
     assert curve.points[2].psnr_val is None
-    assert [curve.seconds_to(psnr) for psnr in (20.0, 20.1, 24.1)] == [1.0, 2.0, None]
     torch.save(curve.state_dict(), tmp_path / "state.pt")
     resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert resumed.points == curve.points
