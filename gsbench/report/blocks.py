@@ -30,6 +30,7 @@ EFFECTS = list(CHANGES)[:4]
 CHOICES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS", "auto": "`model=auto`",
            "auto compare=true": "`model=auto effects.compare=true`"}  # fmt: skip
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
+POINTS = "initial_points=100000"  # trained with as many as in the paper, before D-NeRF had 10,000
 LAMBDA_T = "lambda_t=0.05"  # trained before lambda_t started at 0.5 on D-NeRF
 PARTS = (0.5, 0.7, 1.0)  # of the training after which the best model on val is chosen
 ABLATIONS = {
@@ -246,13 +247,36 @@ LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "b
 def dnerf(published: Path, quantities: dict[str, str]) -> str:
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
-    rows = rows[(rows.table == "paper") & (rows.recipe == "")].set_index("scene")
+    rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)].set_index("scene")
     by_column = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
                  for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
     table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
+
+
+def dnerf100(published: Path) -> str:
+    """Return PSNR of all models on the eight scenes of D-NeRF at 100 x 100 pixels, and the mean."""
+    runs = only(published, "dnerf100").runs
+    psnr = runs.groupby(["scene", "model"]).psnr_db.mean().unstack()[[*MODELS, *SUCCESSORS]]
+    return block(shown(stats.ranked_rows(pd.concat([psnr, psnr.mean().to_frame("mean").T]).rename_axis("scene"))))
+
+
+def dnerf100_effects(published: Path) -> str:
+    """Return what effects change on D-NeRF, and on how many scenes the change has the sign that it has in the paper."""
+    arrays = stats.grids(only(published, "dnerf100"))
+    in_paper = paper.table1().psnr_db["D-NeRF"].unstack()
+    rows = {}
+    for name, (a, b) in CHANGES.items():
+        gains = stats.contrast_by_scene(arrays, _minus(name))
+        row = {"8 scenes": price(list(gains.values())), "paper": "", "same sign": ""}
+        if {a, b} <= set(in_paper):
+            published_gain = (in_paper[a] - in_paper[b])[list(gains)]
+            same = [(gain.mean() > 0) == (published_gain[scene] > 0) for scene, gain in gains.items()]
+            row |= {"paper": number(published_gain.mean(), 2, signed=True), "same sign": f"{sum(same)} of {len(same)}"}
+        rows[f"{name}: `{a}` - `{b}`"] = row
+    return block(pd.DataFrame(rows).T.rename_axis("effect"))
 
 
 def _minutes(of: pd.Series, device: str) -> pd.Series:
@@ -269,14 +293,14 @@ def trex400(published: Path) -> str:
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
         for words, device in {"device=cuda,": "GPU", "": "CPU"}.items():
             for start in ("", f"{LAMBDA_T},"):
-                if (model, variant := f"{words}{start}{AT_PAPER}") in averages.index:
+                if (model, variant := f"{words}{start}{POINTS},{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
                     rows[title] = _minutes(averages.loc[(model, variant)], device)
         names = {"psnr_db": "psnr_best_on_test_db", "train_min": "GPU min"}
         rows[f"{model}, paper"] = paper.average("D-NeRF", ["trex"], model).rename(names)
     others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
-              ("7dgs", "quick", f",{LAMBDA_T}"), ("4dgs", "quick", ""),
-              ("7dgs_noagr", "quick", f",{LAMBDA_T}")]  # fmt: skip
+              ("7dgs", "quick", f",{LAMBDA_T},{POINTS}"), ("4dgs", "quick", f",{POINTS}"),
+              ("7dgs_noagr", "quick", f",{LAMBDA_T},{POINTS}")]  # fmt: skip
     for model, name, more in others:
         start = "λ_t from 0.05, " if LAMBDA_T in more else ""
         rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(averages.loc[(model, f"recipe={name}{more}")], "CPU")

@@ -141,18 +141,21 @@ def _effort(runs: pd.DataFrame) -> int:
 def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of one table: by scene, and on average over the scenes that all models finished.
 
-    Averages of different models are then over the same scenes. They are of runs without changes of the recipe.
+    Averages of different models are then over the same scenes. They are of the recipe that has the most rows; of equal
+    ones the first by name, and that without changes before all.
     """
     ok = _once(of_one_machine(runs))
     scenes = list(paper.PROTOCOLS[dataset].scenes) if kind == "paper" else sorted(set(runs.scene))
     averaged = {scene: [scene] for scene in scenes}
     groups = [(scene, ok[ok.scene == scene]) for scene in scenes]
-    plain = ok[ok.recipe == ""]
-    models = plain.drop_duplicates(["scene", *RECIPE]).groupby("scene").size()
-    covered = [scene for scene in scenes if models.get(scene) == len(plain[RECIPE].drop_duplicates())]
+    rows = ok.drop_duplicates(["scene", *RECIPE])
+    main = rows.groupby("recipe").size().idxmax() if len(rows) else ""
+    averaged_runs = ok[ok.recipe == main]
+    models = rows[rows.recipe == main].groupby("scene").size()
+    covered = [scene for scene in scenes if models.get(scene) == len(averaged_runs[RECIPE].drop_duplicates())]
     if runs.scene.nunique() > 1 and covered:
         averaged[paper.AVERAGE] = covered
-        groups.append((paper.AVERAGE, plain[plain.scene.isin(covered)]))
+        groups.append((paper.AVERAGE, averaged_runs[averaged_runs.scene.isin(covered)]))
     tables = [stats.means(group, RECIPE, TABLE_1).assign(scene=name) for name, group in groups if len(group)]
     table = pd.concat(tables, ignore_index=True).assign(table=kind, dataset=dataset)
     numbers = [paper.average(dataset if kind == "paper" else "", averaged[scene], model)
