@@ -19,6 +19,7 @@ from gsbench.train.loop import Trainer
 SIZE = 16  # pixels a side
 VIEWS = 12
 POINTS = 80
+NARROW = {"deformable": ["model.options.width=24"]}  # networks small enough for a test
 
 
 def compose(model: str, steps: int, *overrides: str) -> Config:
@@ -30,7 +31,7 @@ def compose(model: str, steps: int, *overrides: str) -> Config:
 def _composed(model: str, steps: int, *overrides: str) -> Config:
     register_schema()
     names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
-             "train.densify.every=25", *overrides]  # fmt: skip
+             "train.densify.every=25", *NARROW.get(model, []), *overrides]  # fmt: skip
     if GlobalHydra.instance().is_initialized():
         composed = hydra.compose("config", names)
     else:

@@ -5,6 +5,7 @@ Models are found in the registry and their options in their constructors: a new 
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,7 @@ def test_start(variant: str) -> None:
     torch.testing.assert_close(model.splats["means"].data, points.means)
     opacity = 0.5 if isinstance(model, BetaModel) else 0.1
     torch.testing.assert_close(torch.sigmoid(model.splats["opacities"]).data, torch.full((N,), opacity))
+    model.set_active(replace(model.active, warms_up=True))  # a field of random weights acts only after it
     size, sliced = nearest_distances(points.means), model.slice(CameraTime.at(CAMERA.float(), 0.4))
     torch.testing.assert_close(covariances(sliced), size.square()[:, None, None] * torch.eye(3), rtol=1e-4, atol=1e-6)
     deviation = size if sliced.beta_exponents is None else size / math.sqrt(8)  # profiles start with exponents of 4
@@ -202,7 +204,7 @@ def test_a_slice_has_its_shapes(variant: str, count: int) -> None:
 def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
     """Catches a query in other coordinates than the mean: at t = mu_t, d = mu_d nothing moves, nothing fades."""
     model = lively(variant)
-    model.set_active(ActiveComponents(3, False, False))
+    model.set_active(ActiveComponents(3, False, False, warms_up=True))
     values = raw(model)
     if "directions" in values:
         model.splats["directions"].data = unit(values["directions"])
@@ -282,8 +284,9 @@ def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
     model = active(variant, 4, sh_degree=degree)
     model.select(torch.arange(3))
     with_effect_sets(model, 1, 2)
-    if held := "precision" in model.splats:  # no gradient flows through the direction of dGS and dBS
+    if held := "precision" in model.splats:  # no gradient flows through the direction of dGS and dBS ..
         model.set_active(ActiveComponents(degree, False, True))
+    held |= "field" in model.groups()  # .. and through the positions that a field reads
     splats, names = raw(model), sorted(set(model.splats) - ({"means"} if held else set()))
     values = [splats[name].requires_grad_() for name in names]
     del model.splats

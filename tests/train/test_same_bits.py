@@ -26,7 +26,7 @@ WITHOUT_AVX512 = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "OPENBLAS_CORETYPE": "Zen",
 }
-SLOW = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "dgs", "freetime", "ndgs", "ubs")
+SLOW = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "deformable", "dgs", "freetime", "ndgs", "ubs")
 
 
 @pytest.mark.parametrize("model", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
@@ -58,7 +58,7 @@ class OtherProcessor(TorchDispatchMode):
         return result
 
 
-@pytest.mark.parametrize("model", ["3dgs", "4dgs", "6dgs", "7dgs", "dbs", "dgs", "freetime", "ndgs", "ubs"])
+@pytest.mark.parametrize("model", ["7dgs", *(name for name in SLOW if name not in ("7dgs_noagr", "auto"))])
 def test_a_training_does_not_depend_on_the_last_bits_of_mkl(model: str) -> None:
     """Catches a float32 function in a training that has other bits on AMD than on Intel, as exp in splits had."""
 

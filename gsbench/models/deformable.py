@@ -1,0 +1,140 @@
+"""Define Deformable-3DGS: 3D Gaussians that one network of position and time moves, turns and resizes.
+
+Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", CVPR 2024,
+arXiv 2309.13101, with the constants of the authors' code.
+"""
+
+import math
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gsbench.kernels.tensors import check_number
+from gsbench.models.base import Raw
+from gsbench.models.camera_time import CameraTime
+from gsbench.models.factors import rotation, sizes
+from gsbench.models.gaussian_batch import Conditioned
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.portable_math import cos, linear, sin
+from gsbench.models.registry import register
+from gsbench.scenes.scene import Points
+
+TIME_FEATURES = 30  # outputs of the time network
+
+
+@register("deformable")
+class DeformableModel(Gaussians3DModel):
+    """Deformable-3DGS: canonical 3D Gaussians, as in 3DGS, and a field phi that deforms them at a time t,
+
+        (dp, ds, dr) = phi(stop(mu_p), t)        mean = mu_p + dp
+        cov = R S S^T R^T with R of the quaternion q / |q| + dr and S = diag(exp(s) + ds)
+
+    No gradient flows through the position that the field reads. A scale exp(s) + ds may become negative, as in the
+    authors' code: its magnitude is the size, because the covariance has its square, and 0 makes a flat Gaussian.
+    Density control sees the canonical Gaussians, which alone are drawn during the warm-up.
+    """  # fmt: skip
+
+    observes: ClassVar[tuple[str, ...]] = ("time",)
+    warm_up = 2_250  # the authors': 3,000 of 40,000
+    field: "DeformationField"  # of an initialised model
+
+    def __init__(
+        self,
+        *,
+        width: int = 256,  # of the hidden layers
+        depth: int = 8,  # the number of hidden layers
+        octaves: int = 10,  # of the encoding of positions
+        time_octaves: int = 6,  # of the encoding of times
+        time_network: bool = True,  # for synthetic scenes; the authors' real scenes have none, and 10 octaves of time
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        check_number(width, "width", 1, 4096)
+        check_number(depth, "depth", 1, 64)
+        check_number(octaves, "octaves", 0, 32)
+        check_number(time_octaves, "time_octaves", 0, 32)
+        self.width, self.depth = width, depth
+        self.octaves, self.time_octaves = octaves, time_octaves
+        self.has_time_network = time_network
+
+    def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
+        """Start as 3DGS does, with a field of random weights: at the end of the warm-up, the Gaussians jump."""
+        super().initialise(points, extent, generator)
+        self.field = DeformationField(
+            self.width, self.depth, self.octaves, self.time_octaves, self.has_time_network, generator
+        )
+
+    def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
+        if self.active.warms_up:
+            return self.static(raw)
+        assert query.time is not None
+        dp, ds, dr = self.field(raw["means"].detach(), query.time)
+        R = rotation(F.normalize(raw["quats"], dim=-1) + dr)
+        S = sizes(raw["scales"]) + ds
+        return Conditioned(raw["means"] + dp, R * S[:, None, :], torch.ones_like(raw["opacities"]))
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        return super().groups() | {"field": list(self.field.parameters())}
+
+
+class DeformationField(nn.Module):
+    """The network phi of Deformable-3DGS (section 3.2), with ReLU after each hidden layer.
+
+    Its input is the encoded position and features of the time: those of a network of two layers, or the encoded time.
+    Hidden layer depth // 2 + 1, counted from 0, reads the input once more, beside the layer before it. Positions are
+    in world units, as the authors have them: gsbench brings scenes to the size of D-NeRF's when it loads them. On a
+    CPU, the field has the same bits for any number of threads (`portable_math`).
+    """
+
+    def __init__(
+        self, width: int, depth: int, octaves: int, time_octaves: int, time_network: bool, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.octaves, self.time_octaves = octaves, time_octaves
+        encoded_time = 1 + 2 * time_octaves
+        self.time_layers = nn.ModuleList()
+        if time_network:
+            self.time_layers.append(Linear(encoded_time, width, generator))
+            self.time_layers.append(Linear(width, TIME_FEATURES, generator))
+        inputs = 3 * (1 + 2 * octaves) + (TIME_FEATURES if time_network else encoded_time)
+        self.rereads = depth // 2 + 1
+        widths = [inputs, *[width] * (depth - 1)]
+        widths = [n + inputs if i == self.rereads else n for i, n in enumerate(widths)]
+        self.layers = nn.ModuleList(Linear(n, width, generator) for n in widths)
+        self.head = Linear(width, 3 + 3 + 4, generator)
+
+    def forward(
+        self,
+        positions: Tensor,  # [N, 3] world units
+        time: Tensor,  # [] in [0, 1]
+    ) -> tuple[Tensor, ...]:
+        """Return shifts of means [N, 3], changes of scales [N, 3] (both world units) and of unit quaternions [N, 4]."""
+        moment = encode(time.reshape(1, 1), self.time_octaves)
+        for i, layer in enumerate(self.time_layers):
+            moment = layer(torch.relu(moment) if i else moment)
+        inputs = torch.cat([encode(positions, self.octaves), moment.expand(len(positions), -1)], -1)
+        hidden = inputs
+        for i, layer in enumerate(self.layers):
+            hidden = torch.relu(layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden))
+        return self.head(hidden).split([3, 3, 4], -1)
+
+
+def encode(x: Tensor, octaves: int) -> Tensor:
+    """Return [x, sin x, cos x, sin 2x, cos 2x, .. cos 2^(octaves-1) x], [N, C] -> [N, C (1 + 2 octaves)]."""
+    return torch.cat([x, *(wave(2.0**k * x) for k in range(octaves) for wave in (sin, cos))], -1)
+
+
+class Linear(nn.Module):
+    """A layer W x + b that torch.nn.Linear's distribution starts, drawn from the run's seed."""
+
+    def __init__(self, inputs: int, outputs: int, generator: torch.Generator) -> None:
+        super().__init__()
+        bound = 1 / math.sqrt(inputs)
+        self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator))
+        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound, generator=generator))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer to [N, inputs]."""
+        return linear(x, self.weight, self.bias)
