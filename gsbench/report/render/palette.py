@@ -9,7 +9,7 @@ markers distinguish the models without colour.
 from collections.abc import Iterable
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "3dgs_agr", "4dgs_agr", "6dgs_agr", "auto",
-          "7dgs_nodir", "7dgs_nodir_agr", "dgs", "freetime", "dbs", "ubs", "ndgs", "deformable")  # fmt: skip
+          "7dgs_nodir", "7dgs_nodir_agr", "dgs", "freetime", "dbs", "ubs", "ndgs")  # fmt: skip
 PAGE = {  # by variable of the page's style sheet: the colour of the light and of the dark theme
     "ink": ("#1b1d21", "#eceef1"), "muted": ("#565b63", "#a9afb8"), "line": ("#dfe1e4", "#33373d"),
     "paper": ("#ffffff", "#141619"), "raised": ("#f6f7f8", "#1d2024"), "focus": ("#0069a8", "#5cbcf2"),
