@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import weakref
 
 import pytest
 import torch
@@ -65,6 +66,22 @@ def test_kernels_and_gradients_are_repeated() -> None:
     repeated(recording)
     assert all(torch.equal(x, y) for x, y in zip(results, work({}), strict=True))
     assert all(x.any() for x in results)
+
+
+def test_a_recording_that_is_too_large_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches hidden layers that are kept for all Gaussians of a batch, 40 GB for four views of 100,000 of them."""
+    monkeypatch.setattr("gsbench.kernels.recording.MOST_BYTES", 1_000)
+    inputs = torch.zeros(125)
+    with Recording() as recording:
+        first = inputs + 1  # 500 bytes
+        second = first.view(5, 25).mul_(2).view(125) + 1
+        assert recording.is_repeatable
+        kept = weakref.ref(first)
+        third = second[:1] + 1
+        del first
+        assert not recording.is_repeatable
+        assert kept() is None
+    assert third.item() == 4
 
 
 def test_a_number_that_was_read_is_read_again() -> None:
