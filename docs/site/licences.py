@@ -38,7 +38,7 @@ NOTES = {
     "vl-convert-python": "brings Vega, Vega-Lite and Vega-Embed under BSD-3-Clause, © University of Washington "
     "Interactive Data Lab and contributors, which are a part of each `report.html`",
     "axe-playwright-python": "axe itself is under MPL-2.0",
-    "plyfile": "tests only read files with it; gsbench writes and reads PLY by code of its own",
+    "plyfile": "under the GPL, but only tests use it, to check gsbench's own PLY code; users do not install it",
 }
 CUDA = re.compile(r"nvidia-|cuda-|triton$")  # what torch for CUDA brings: NVIDIA's own licence
 MARKS = "<!-- written by docs/site/licences.py -->", "<!-- end -->"
