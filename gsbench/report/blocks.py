@@ -1,6 +1,6 @@
 """Make the tables of README.md and docs/results.md from the published studies: each block is one function."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -21,7 +21,14 @@ SUCCESSORS = ["freetime", "dbs", "ndgs", "ubs", "dgs"]
 LENGTHS = {"250": "iterations=250", "500": "iterations=500", "1,000": "", "2,000": "iterations=2000",
            "4,000": "iterations=4000"}  # fmt: skip
 MOVING = ["monocular", "rig", "array"]
-KINDS = {"monocular": ["monocular"], "fixed cameras": ["rig", "array"], "all dynamic": MOVING, "static": ["static"]}
+DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the study dnerf100
+KINDS = {
+    DNERF: [DNERF],
+    "monocular": ["monocular"],
+    "fixed cameras": ["rig", "array"],
+    "all dynamic": MOVING,
+    "static": ["static"],
+}
 CHANGES = {"time, given direction": ("7dgs_noagr", "6dgs"), "direction": ("6dgs", "3dgs"),
            "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
            "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
@@ -113,16 +120,12 @@ def table1(published: Path) -> str:
     return block(table.loc[models, quantities], fps=Column("FPS", 0))
 
 
-def cost(published: Path, lengths: Sequence[str] = ("250", "1,000", "4,000"), models: Sequence[str] = MODELS) -> str:
-    """Return PSNR and seconds of models after some lengths of training."""
+def cost(published: Path) -> str:
+    """Return PSNR and seconds of models after two lengths of training."""
+    lengths, models = ["1,000", "4,000"], ["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]
     of = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
     of = of.loc[[LENGTHS[length] for length in lengths]].set_axis(pd.Index(lengths, name="iterations"))
-    return reached(of.psnr_db[list(models)], of.train_s[list(models)])
-
-
-def frontier(published: Path) -> str:
-    """Return what all models reach in `make frontier`."""
-    return cost(published, ["250", "1,000", "2,000", "4,000"])
+    return reached(of.psnr_db[models], of.train_s[models])
 
 
 def effects(published: Path) -> str:
@@ -170,8 +173,13 @@ def suite_kinds(published: Path) -> str:
 def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFrame:
     """Return what effects change in PSNR, by kind of scene."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
+    arrays[DNERF] = stats.grids(only(published, "dnerf100"))
+    variants = {DNERF: DNERF_VARIANT}
     prices = {
-        title: [price([v for of in KINDS[title] for v in stats.contrast(arrays[of], _minus(name))]) for name in names]
+        title: [
+            price([v for of in KINDS[title] for v in stats.contrast(arrays[of], _minus(name, variants.get(of, "")))])
+            for name in names
+        ]
         for title in titles
     }
     return pd.DataFrame(prices, pd.Index(names, name="effect"))
@@ -183,7 +191,7 @@ def _minus(name: str, variant: str = "") -> stats.Weights:
 
 
 def suite_lengths(published: Path) -> str:
-    """Return what effects change after three lengths of training, over the dynamic scenes that all models finished."""
+    """Return what effects change after two lengths of training, over the dynamic scenes that all models finished."""
     variants = {n: LENGTHS[n] for n in ("500", "1,000", "2,000")}
     chapters = [study(published / "suite")[kind] for kind in MOVING]
     runs = pd.concat([chapter.runs for chapter in chapters])
@@ -244,39 +252,38 @@ def lengths(published: Path) -> str:
 LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
 
 
-def dnerf(published: Path, quantities: dict[str, str]) -> str:
+def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str:
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)].set_index("scene")
     by_column = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
-                 for model in ("4dgs", "7dgs_noagr", "7dgs") for title, quantity in quantities.items()}  # fmt: skip
-    table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna(how="all")
+                 for model in models for title, quantity in quantities.items()}  # fmt: skip
+    table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna()
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
 
 
 def dnerf100(published: Path) -> str:
-    """Return PSNR of all models on the eight scenes of D-NeRF at 100 x 100 pixels, and the mean."""
+    """Return PSNR of models on the eight scenes of D-NeRF at 100 x 100 pixels, and on average."""
     runs = only(published, "dnerf100").runs
-    psnr = runs.groupby(["scene", "model"]).psnr_db.mean().unstack()[[*MODELS, *SUCCESSORS]]
+    psnr = runs.groupby(["scene", "model"]).psnr_db.mean().unstack()
+    psnr = psnr[[model for model in (*MODELS, *SUCCESSORS) if model in psnr]]
     return block(shown(stats.ranked_rows(pd.concat([psnr, psnr.mean().to_frame("mean").T]).rename_axis("scene"))))
 
 
-def dnerf100_effects(published: Path) -> str:
-    """Return what effects change on D-NeRF, and on how many scenes the change has the sign that it has in the paper."""
+def dnerf100_signs(published: Path) -> str:
+    """Return differences of models beside those in the paper, and on how many scenes both have the same sign."""
     arrays = stats.grids(only(published, "dnerf100"))
-    in_paper = paper.table1().psnr_db["D-NeRF"].unstack()
+    in_paper = paper.table1().psnr_db[DNERF].unstack()
     rows = {}
-    for name, (a, b) in CHANGES.items():
-        gains = stats.contrast_by_scene(arrays, _minus(name))
-        row = {"8 scenes": price(list(gains.values())), "paper": "", "same sign": ""}
-        if {a, b} <= set(in_paper):
-            published_gain = (in_paper[a] - in_paper[b])[list(gains)]
-            same = [(gain.mean() > 0) == (published_gain[scene] > 0) for scene, gain in gains.items()]
-            row |= {"paper": number(published_gain.mean(), 2, signed=True), "same sign": f"{sum(same)} of {len(same)}"}
-        rows[f"{name}: `{a}` - `{b}`"] = row
-    return block(pd.DataFrame(rows).T.rename_axis("effect"))
+    for a, b in (("7dgs", "4dgs"), ("7dgs_noagr", "4dgs"), ("7dgs", "7dgs_noagr")):
+        gains = stats.contrast_by_scene(arrays, {(a, DNERF_VARIANT): 1.0, (b, DNERF_VARIANT): -1.0})
+        expected = (in_paper[a] - in_paper[b])[list(gains)]
+        same = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
+        rows[f"`{a}` - `{b}`"] = {"here": price(list(gains.values())), "paper": number(expected.mean(), 2, signed=True),
+                                  "same sign": f"{same} of {len(gains)}"}  # fmt: skip
+    return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
 
 def _minutes(of: pd.Series, device: str) -> pd.Series:
@@ -286,7 +293,7 @@ def _minutes(of: pd.Series, device: str) -> pd.Series:
 
 
 def trex400(published: Path) -> str:
-    """Return trex as the paper trains it, with both initial lambda_t, beside the paper's rows; and other recipes."""
+    """Return trex as the paper trains it, with both initial lambda_t, and by other recipes."""
     results = load(published / "dnerf").finished  # a chapter has times of one machine
     averages = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
     rows: dict[str, pd.Series] = {}
@@ -296,8 +303,6 @@ def trex400(published: Path) -> str:
                 if (model, variant := f"{words}{start}{POINTS},{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
                     rows[title] = _minutes(averages.loc[(model, variant)], device)
-        names = {"psnr_db": "psnr_best_on_test_db", "train_min": "GPU min"}
-        rows[f"{model}, paper"] = paper.average("D-NeRF", ["trex"], model).rename(names)
     others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
               ("7dgs", "quick", f",{LAMBDA_T},{POINTS}"), ("4dgs", "quick", f",{POINTS}"),
               ("7dgs_noagr", "quick", f",{LAMBDA_T},{POINTS}")]  # fmt: skip
@@ -338,13 +343,14 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 
 
 README: dict[str, Callable[[Path], str]] = {
-    "cost": lambda published: cost(published, models=["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]),
-    "worth": lambda published: block(by_kind(published, EFFECTS, ["all dynamic", "static"])),
-    "dnerf": lambda published: dnerf(published, BEST | OF_PAPER),
+    "cost": cost,
+    "worth": lambda published: block(by_kind(published, EFFECTS, [DNERF, "all dynamic"])),
+    "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
+    "dnerf100_signs": dnerf100_signs,
 }
-_OF_RESULTS = (table1, frontier, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
+_OF_RESULTS = (dnerf100, table1, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
                trex400, on_demand)  # fmt: skip
 RESULTS: dict[str, Callable[[Path], str]] = {
-    "dnerf": lambda published: dnerf(published, LAST | BEST | OF_PAPER),
+    "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs_noagr", "7dgs"], LAST | BEST | OF_PAPER),
     **{write.__name__: write for write in _OF_RESULTS},
 }
