@@ -5,6 +5,7 @@ arXiv 2309.13101, with the constants of the authors' code.
 """
 
 import math
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -55,16 +56,12 @@ class DeformableModel(Gaussians3DModel):
         check_number(depth, "depth", 1, 64)
         check_number(octaves, "octaves", 0, 32)
         check_number(time_octaves, "time_octaves", 0, 32)
-        self.width, self.depth = width, depth
-        self.octaves, self.time_octaves = octaves, time_octaves
-        self.has_time_network = time_network
+        self.new_field = partial(DeformationField, width, depth, octaves, time_octaves, time_network)
 
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
         """Start as 3DGS does, with a field of random weights: at the end of the warm-up, the Gaussians jump."""
         super().initialise(points, extent, generator)
-        self.field = DeformationField(
-            self.width, self.depth, self.octaves, self.time_octaves, self.has_time_network, generator
-        )
+        self.field = self.new_field(generator)
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
         if self.active.warms_up:
@@ -93,12 +90,12 @@ class DeformationField(nn.Module):
     ) -> None:
         super().__init__()
         self.octaves, self.time_octaves = octaves, time_octaves
-        encoded_time = 1 + 2 * time_octaves
-        self.time_layers = nn.ModuleList()
+        features = 1 + 2 * time_octaves
+        self.of_time: nn.Module = nn.Identity()
         if time_network:
-            self.time_layers.append(Linear(encoded_time, width, generator))
-            self.time_layers.append(Linear(width, TIME_FEATURES, generator))
-        inputs = 3 * (1 + 2 * octaves) + (TIME_FEATURES if time_network else encoded_time)
+            first, last = Linear(features, width, generator), Linear(width, TIME_FEATURES, generator)
+            self.of_time, features = nn.Sequential(first, nn.ReLU(), last), TIME_FEATURES
+        inputs = 3 * (1 + 2 * octaves) + features
         self.rereads = depth // 2 + 1
         widths = [inputs, *[width] * (depth - 1)]
         widths = [n + inputs if i == self.rereads else n for i, n in enumerate(widths)]
@@ -111,10 +108,8 @@ class DeformationField(nn.Module):
         time: Tensor,  # [] in [0, 1]
     ) -> tuple[Tensor, ...]:
         """Return shifts of means [N, 3], changes of scales [N, 3] (both world units) and of unit quaternions [N, 4]."""
-        moment = encode(time.reshape(1, 1), self.time_octaves)
-        for i, layer in enumerate(self.time_layers):
-            moment = layer(torch.relu(moment) if i else moment)
-        inputs = torch.cat([encode(positions, self.octaves), moment.expand(len(positions), -1)], -1)
+        features = self.of_time(encode(time.reshape(1, 1), self.time_octaves))
+        inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
         hidden = inputs
         for i, layer in enumerate(self.layers):
             hidden = torch.relu(layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden))
@@ -127,7 +122,7 @@ def encode(x: Tensor, octaves: int) -> Tensor:
 
 
 class Linear(nn.Module):
-    """A layer W x + b that torch.nn.Linear's distribution starts, drawn from the run's seed."""
+    """A layer W x + b whose weights start as those of torch.nn.Linear, drawn from the run's seed."""
 
     def __init__(self, inputs: int, outputs: int, generator: torch.Generator) -> None:
         super().__init__()

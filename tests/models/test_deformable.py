@@ -57,7 +57,7 @@ def test_the_field() -> None:
     """Catches a layer that is lost or applied twice, a second input at another layer or in another order, a lost or
     further ReLU, and outputs in another order."""
     field = DeformationField(16, 8, 10, 6, True, seeded(0)).double()
-    numbered = dict(enumerate(field.layers)) | dict(zip((20, 21), field.time_layers, strict=True))
+    numbered = dict(enumerate(field.layers)) | {20: field.of_time[0], 21: field.of_time[2]}
     for number, layer in numbered.items():
         for parameter, values in zip((layer.weight, layer.bias), weights_of(number, *layer.weight.shape), strict=True):
             parameter.data.copy_(values)  # of equal shape
@@ -104,7 +104,8 @@ def test_a_deformed_gaussian() -> None:
 
 def test_a_scale_may_be_negative_or_zero() -> None:
     """Catches a scale that is clipped at 0, where it would learn no more, and NaN in an image or a gradient at 0."""
-    positive, negative, flat = (deformed(doubles(0.05, 0.1, 0.2), doubles(x, 0, 0)) for x in (0.01, -0.11, -0.05))
+    positive, negative, flat = (deformed(doubles(1, 0.1, 0.2), doubles(x, 0, 0)) for x in (-0.9, -1.1, -1.0))
+    assert not flat.slice(QUERY).factors[:, :, 0].any()
     torch.testing.assert_close(covariances(positive.slice(QUERY)), covariances(negative.slice(QUERY)))
     camera = trainer("deformable").scene.train[0].camera
     for model in (negative.float(), flat.float()):
@@ -119,13 +120,14 @@ def test_a_scale_may_be_negative_or_zero() -> None:
 # ---- gradients
 
 
-@pytest.mark.parametrize("depth", [1, 3])
-def test_the_field_has_the_gradients_of_its_values(depth: int) -> None:
-    """Catches a lost or wrong derivative on the way from any weight to the slice (central differences)."""
-    model: Any = lively("deformable", 5, width=3, depth=depth, octaves=2, time_octaves=1)
+@pytest.mark.parametrize(("depth", "time_network"), [(1, True), (3, False)])
+def test_the_field_has_the_gradients_of_its_values(depth: int, time_network: bool) -> None:
+    """Catches a lost or wrong derivative on the way from any weight to the outputs (central differences), a time
+    network that is never left out, and a gradient of a mean through the field."""
+    model: Any = lively("deformable", 5, width=3, depth=depth, octaves=2, time_octaves=1, time_network=time_network)
     model.set_active(FULL)
     names = [name for name, _ in model.field.named_parameters()]
-    assert len(names) == 2 * (2 + depth + 1)
+    assert len(names) == 2 * (2 * time_network + depth + 1)
 
     def sliced(*values: Tensor) -> list[Tensor]:
         field = dict(zip(names, values, strict=True))
@@ -134,7 +136,7 @@ def test_the_field_has_the_gradients_of_its_values(depth: int) -> None:
 
     assert torch.autograd.gradcheck(sliced, [x.detach().requires_grad_() for x in model.field.parameters()])
     model.slice(QUERY).means.sum().backward()
-    torch.testing.assert_close(model.splats["means"].grad, torch.ones(5, 3).double())  # nothing through the field
+    torch.testing.assert_close(model.splats["means"].grad, torch.ones(5, 3).double())  # none through the field
     assert all(x.grad.any() for x in model.field.parameters())
 
 
