@@ -18,8 +18,6 @@ from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
 SUCCESSORS = ["freetime", "dbs", "ndgs", "ubs", "dgs"]
-LENGTHS = {"250": "iterations=250", "500": "iterations=500", "1,000": "", "2,000": "iterations=2000",
-           "4,000": "iterations=4000"}  # fmt: skip
 MOVING = ["monocular", "rig", "array"]
 DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the study dnerf100
 KINDS = {
@@ -122,9 +120,9 @@ def table1(published: Path) -> str:
 
 def cost(published: Path) -> str:
     """Return PSNR and seconds of models after two lengths of training."""
-    lengths, models = ["1,000", "4,000"], ["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]
+    lengths, models = {"1,000": "", "4,000": "iterations=4000"}, ["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]
     of = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
-    of = of.loc[[LENGTHS[length] for length in lengths]].set_axis(pd.Index(lengths, name="iterations"))
+    of = of.loc[list(lengths.values())].set_axis(pd.Index(lengths, name="iterations"))
     return reached(of.psnr_db[models], of.train_s[models])
 
 
@@ -174,36 +172,21 @@ def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFram
     """Return what effects change in PSNR, by kind of scene."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
     arrays[DNERF] = stats.grids(only(published, "dnerf100"))
-    variants = {DNERF: DNERF_VARIANT}
     prices = {
-        title: [
-            price([v for of in KINDS[title] for v in stats.contrast(arrays[of], _minus(name, variants.get(of, "")))])
-            for name in names
-        ]
+        title: [price([v for kind in KINDS[title] for v in _gains(arrays, kind, name)]) for name in names]
         for title in titles
     }
     return pd.DataFrame(prices, pd.Index(names, name="effect"))
 
 
-def _minus(name: str, variant: str = "") -> stats.Weights:
-    a, b = CHANGES[name]
+def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
+    """Return one of CHANGES as differences [seeds, views] of each scene of a kind."""
+    return stats.contrast(arrays[kind], minus(*CHANGES[name], DNERF_VARIANT if kind == DNERF else ""))
+
+
+def minus(a: str, b: str, variant: str) -> stats.Weights:
+    """Return the difference of two models, both trained with the settings of `variant`."""
     return {(a, variant): 1.0, (b, variant): -1.0}
-
-
-def suite_lengths(published: Path) -> str:
-    """Return what effects change after two lengths of training, over the dynamic scenes that all models finished."""
-    variants = {n: LENGTHS[n] for n in ("500", "1,000", "2,000")}
-    chapters = [study(published / "suite")[kind] for kind in MOVING]
-    runs = pd.concat([chapter.runs for chapter in chapters])
-    runs = runs[runs.model.isin(MODELS) & runs.variant.isin(variants.values())]
-    counts = runs.drop_duplicates(["scene", "model", "variant"]).scene.value_counts()
-    shared = set(counts.index[counts == len(MODELS) * len(variants)])
-    arrays = {scene: grid for chapter in chapters for scene, grid in stats.grids(chapter).items() if scene in shared}
-    prices = {
-        f"{n} iterations": [price(stats.contrast(arrays, _minus(name, variant))) for name in EFFECTS]
-        for n, variant in variants.items()
-    }
-    return block(pd.DataFrame(prices, pd.Index(EFFECTS, name="effect")))
 
 
 def suite_choices(published: Path) -> str:
@@ -278,7 +261,7 @@ def dnerf100_signs(published: Path) -> str:
     in_paper = paper.table1().psnr_db[DNERF].unstack()
     rows = {}
     for a, b in (("7dgs", "4dgs"), ("7dgs_noagr", "4dgs"), ("7dgs", "7dgs_noagr")):
-        gains = stats.contrast_by_scene(arrays, {(a, DNERF_VARIANT): 1.0, (b, DNERF_VARIANT): -1.0})
+        gains = stats.contrast_by_scene(arrays, minus(a, b, DNERF_VARIANT))
         expected = (in_paper[a] - in_paper[b])[list(gains)]
         same = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
         rows[f"`{a}` - `{b}`"] = {"here": price(list(gains.values())), "paper": number(expected.mean(), 2, signed=True),
@@ -348,7 +331,7 @@ README: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
     "dnerf100_signs": dnerf100_signs,
 }
-_OF_RESULTS = (dnerf100, table1, effects, suite_kinds, suite_lengths, suite_choices, lengths, ablation,
+_OF_RESULTS = (dnerf100, table1, effects, suite_kinds, suite_choices, lengths, ablation,
                trex400, on_demand)  # fmt: skip
 RESULTS: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs_noagr", "7dgs"], LAST | BEST | OF_PAPER),
