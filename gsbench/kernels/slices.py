@@ -43,7 +43,10 @@ def _conditional_slice(
     defaults: dict[str, Any] | None = None,
     derive: Callable[[dict[str, Tensor], dict[str, Any]], dict[str, int]] = _conditioned,
 ) -> Operation:
-    """Declare an operation whose first `conditioned` Gaussians depend on the camera and the time."""
+    """Declare an operation whose first `conditioned` Gaussians depend on the camera and the time.
+
+    The result of `derive` includes that of `_conditioned`.
+    """
     return Operation(
         name,
         inputs=inputs,

@@ -125,6 +125,7 @@ def _wait(running: Running, most: int, request: Request) -> None:
 
 def _report_end(code: int, overrides: str, request: Request) -> None:
     """Print how a process ended if it was killed; if a signal asked it to end, ask this process to end too."""
+    # -number: the signal killed it; 128 + number: it stopped itself (`Stopped.code`)
     signal_number = -code if code < 0 else code - 128
     if signal_number in stop.SIGNALS:
         request.signal = request.signal or signal_number

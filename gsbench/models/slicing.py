@@ -102,7 +102,8 @@ def slice_gaussians(
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
     """Return the gain K = S_pq S_qq^-1 [N, 3, k] and the conditional covariance S_pp - K S_pq^T [N, 3, 3].
 
-    Here p is position, q is time and direction, and S = F F^T is computed. Rounding may make the result indefinite.
+    Here p is position, q is time and direction, and S = F F^T is computed. Rounding may make the result indefinite. The
+    schemes "schur" and "cholesky" are for comparison, see `slice_gaussians`.
     """
     S = factor @ factor.mT
     S_pp, S_pq, S_qq = S[:, :3, :3], S[:, :3, 3:], S[:, 3:, 3:]

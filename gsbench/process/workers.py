@@ -44,7 +44,8 @@ def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
         torch.set_num_threads(threads)
 
     pool = ThreadPoolExecutor(workers, "gsbench-worker", settle)
-    # A worker is started by each call that finds none idle, and setting its own number sets that of threads to come.
+    # All workers start now: the pool starts one only when a call finds none idle. Setting its own number of threads, a
+    # worker also sets that of threads to come, so the number is restored.
     list(pool.map(lambda _: time.sleep(0.01), range(workers)))
     torch.set_num_threads(before)
     return pool

@@ -96,7 +96,7 @@ def changes(tests: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def price(scenes: list[Values]) -> str:
+def gain_text(scenes: list[Values]) -> str:
     """Return a difference ± half its interval over scenes, bold if significant, and on how many scenes it is positive.
 
     Args:
@@ -169,14 +169,14 @@ def suite_kinds(published: Path) -> str:
 
 
 def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFrame:
-    """Return what effects change in PSNR, by kind of scene."""
+    """Return texts of what effects (keys of CHANGES) change in PSNR, a column a kind of scene (keys of KINDS)."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
     arrays[DNERF] = stats.grids(only(published, "dnerf100"))
-    prices = {
-        title: [price([v for kind in KINDS[title] for v in _gains(arrays, kind, name)]) for name in names]
+    columns = {
+        title: [gain_text([v for kind in KINDS[title] for v in _gains(arrays, kind, name)]) for name in names]
         for title in titles
     }
-    return pd.DataFrame(prices, pd.Index(names, name="effect"))
+    return pd.DataFrame(columns, pd.Index(names, name="effect"))
 
 
 def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
@@ -264,8 +264,11 @@ def dnerf100_signs(published: Path) -> str:
         gains = stats.contrast_by_scene(arrays, minus(a, b, DNERF_VARIANT))
         expected = (in_paper[a] - in_paper[b])[list(gains)]
         same = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
-        rows[f"`{a}` - `{b}`"] = {"here": price(list(gains.values())), "paper": number(expected.mean(), 2, signed=True),
-                                  "same sign": f"{same} of {len(gains)}"}  # fmt: skip
+        rows[f"`{a}` - `{b}`"] = {
+            "here": gain_text(list(gains.values())),
+            "paper": number(expected.mean(), 2, signed=True),
+            "same sign": f"{same} of {len(gains)}",
+        }
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
 

@@ -120,7 +120,7 @@ def read(
     shots: Sequence[Shot],  # at least one
     rendition: Rendition,
     *,
-    in_8_bits: bool | None = None,  # whether pixels stay in 8 bits; None: those of a large scene do
+    in_8_bits: bool | None = None,  # whether pixels stay in 8 bits (not if reduced); None: those of a large scene do
     decode: Callable[[Shot, bytes], Pixels] = lambda shot, data: images.decode_photo(data, shot.where),
 ) -> Shots:
     """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis."""

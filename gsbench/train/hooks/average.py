@@ -76,7 +76,7 @@ class Average(Hook):
         if self.count and training.scene.val and training.config.scene.eval_split != "val":
             self._swap()
             averaged = training.psnr(training.scene.val)
-            if rank(averaged) > rank(psnr):
+            if rank(averaged) > rank(psnr):  # NaN is below all numbers
                 self.kept = finished - self.first
                 training.report(f"step {finished}: PSNR on val is {averaged - psnr:.2f} dB higher with parameters "
                                 f"averaged over the last {self.kept} iterations: the training ends with "
@@ -87,7 +87,7 @@ class Average(Hook):
                 if rank(averaged) == rank(psnr):
                     training.report(f"step {finished}: PSNR on val is {psnr:.2f} dB with the last and with averaged "
                                     f"parameters: it cannot decide, and the last are kept")  # fmt: skip
-        self.reindex()
+        self._forget()  # the final checkpoint need not hold the means
         return psnr
 
     def _swap(self) -> None:
@@ -97,8 +97,11 @@ class Average(Hook):
             parameter.data.copy_(self.means[i])
             self.means[i] = last
 
-    def reindex(self, rows: Tensor | None = None, fresh: Tensor | None = None) -> None:
+    def _forget(self) -> None:
         self.count, self.means = 0, []
+
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        self._forget()
 
     def state_dict(self) -> dict[str, Any]:
         means = {str(i): mean for i, mean in enumerate(self.means)}
