@@ -34,7 +34,7 @@ SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1"
 # Runs of some ten seconds; a job that is killed loses at most one or two of them.
 TINY = ("+exp=mini", "scene.downscale=4", "data.initial_points=1000", "train.curve_points=5",
         "train.checkpoint_minutes=0.02")  # fmt: skip
-STEPS = 600
+STEPS = 1500
 SHORT = (*TINY, f"train.iterations={STEPS}")
 ALL = (*SHORT, f"scene={','.join(SCENES)}", f"model={','.join(MODELS)}", f"seed={','.join(SEEDS)}")
 ONE = (*SHORT, "scene=suzanne", "model=3dgs", "seed=0")  # one of the eight, where a fault needs no more
