@@ -82,9 +82,16 @@ def measure_all(
             results.append(result)
             tell(line(result))
         tell("")
-    machine = {"processor": processor_name(), "cores": os.cpu_count(), "load": os.getloadavg(),
-               "instruction_set": kernels.native().active(), "versions": versions(), "git_commit": git_commit(),
-               "against": other and other.commit, "limits": bounds._asdict()}  # fmt: skip
+    machine = {
+        "processor": processor_name(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg(),
+        "instruction_set": kernels.native().active(),
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "against": other and other.commit,
+        "limits": bounds._asdict(),
+    }
     out.mkdir(parents=True, exist_ok=True)
     content = {"machine": machine, "rows": results}
     write_atomically(out / f"{name}.json", as_json(content).encode())
@@ -110,8 +117,16 @@ def run(row: Row, bounds: Limits) -> dict[str, Any]:
     cost = measure(row.call)
     torch.set_num_threads(1)
     least = row.floor and row.floor[1] / getattr(bounds, row.floor[0]) / 1e6
-    return {"section": row.section, "name": row.name, "threads": row.threads, "target_ms": row.target_ms,
-            "pixels": row.pixels, "least_ms": least, "limit": row.floor and row.floor[0], **cost._asdict()}  # fmt: skip
+    return {
+        "section": row.section,
+        "name": row.name,
+        "threads": row.threads,
+        "target_ms": row.target_ms,
+        "pixels": row.pixels,
+        "least_ms": least,
+        "limit": row.floor and row.floor[0],
+        **cost._asdict(),
+    }
 
 
 def line(result: dict[str, Any]) -> str:

@@ -16,8 +16,18 @@ from gsbench import kernels
 from gsbench.errors import InputError, printable
 
 ROOT = Path(__file__).resolve().parents[1]
-INSTALL = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-build-isolation",
-           "--use-pep517", "--config-settings", "cmake.define.CUDA=off"]  # fmt: skip
+INSTALL = [
+    "-m",
+    "pip",
+    "install",
+    "--quiet",
+    "--disable-pip-version-check",
+    "--no-deps",
+    "--no-build-isolation",
+    "--use-pep517",
+    "--config-settings",
+    "cmake.define.CUDA=off",
+]
 # An editable install puts a finder before PYTHONPATH, by which `import gsbench` would find this tree.
 WITHOUT_EDITABLE = (
     "import runpy, sys; "
@@ -50,11 +60,19 @@ class Built:
 
     def _python(self, code: str, *arguments: str) -> str:
         paths = os.pathsep.join(os.fspath(self.folder / name) for name in ("site", "tree"))
-        done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=self.folder, check=False, text=True,
-                              env={**os.environ, "PYTHONPATH": paths}, capture_output=True)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            cwd=self.folder,
+            check=False,
+            text=True,
+            env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True,
+        )
         if done.returncode:
-            raise InputError(f"--against {self.short}: expected its `python -m benchmarks` to run, got "
-                             f"{_last_line(done.stderr)}: choose a later commit")  # fmt: skip
+            raise InputError(
+                f"--against {self.short}: expected its `python -m benchmarks` to run, got "
+                f"{_last_line(done.stderr)}: choose a later commit"
+            )
         return done.stdout
 
 
@@ -71,8 +89,10 @@ def built(commit: str, log: Path) -> Iterator[Built]:
     """
     full = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{commit}^{{commit}}").decode().strip()
     if not full:
-        raise InputError(f"--against: expected a commit of the repository {ROOT}, got {printable(commit)!r:.80}: "
-                         "`git log` lists them")  # fmt: skip
+        raise InputError(
+            f"--against: expected a commit of the repository {ROOT}, got {printable(commit)!r:.80}: "
+            "`git log` lists them"
+        )
     with TemporaryDirectory(prefix="gsbench-against-") as name:
         other = Built(full, Path(name))
         with tarfile.open(fileobj=io.BytesIO(_git("archive", full))) as files:
@@ -86,13 +106,20 @@ def _install(commit: Built, log: Path) -> None:
     # Only the instruction set that is timed; not every commit has the word `native` for it.
     levels = f"cmake.define.GSB_LEVELS={kernels.native().active()}"
     site, tree = (os.fspath(commit.folder / name) for name in ("site", "tree"))
-    done = subprocess.run([sys.executable, *INSTALL, "--config-settings", levels, "--target", site, tree], check=False,
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, *INSTALL, "--config-settings", levels, "--target", site, tree],
+        check=False,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     if done.returncode:
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text(done.stdout)
-        raise InputError(f"--against {commit.short}: expected it to build, got {_last_line(done.stdout)}: read {log}, "
-                         "or choose another commit")  # fmt: skip
+        raise InputError(
+            f"--against {commit.short}: expected it to build, got {_last_line(done.stdout)}: read {log}, "
+            "or choose another commit"
+        )
 
 
 def _git(*arguments: str) -> bytes:

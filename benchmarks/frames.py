@@ -48,8 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
     times = time_in_turns([frames_of(run, views) for run in runs], asked.count)
     sizes = [run.model.stored_bytes() for run in runs]
     for run, time, size in zip(runs, times, sizes, strict=True):
-        print(f"{run.folder}: {len(run.model)} Gaussians, {time.p50:.3f} ms ({time.p50 / times[0].p50:.2f}), "
-              f"{size / 1e6:.3f} MB ({size / sizes[0]:.2f})")  # fmt: skip
+        print(
+            f"{run.folder}: {len(run.model)} Gaussians, {time.p50:.3f} ms ({time.p50 / times[0].p50:.2f}), "
+            f"{size / 1e6:.3f} MB ({size / sizes[0]:.2f})"
+        )
     return 0
 
 

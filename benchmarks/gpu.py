@@ -22,8 +22,21 @@ from gsbench.measure.provenance import git_commit, versions
 # How many times as fast as theirs ours is to be, on a Hopper-class card.
 TARGETS = {("raster", "forward"): 1.3, ("raster", "backward"): 1.2, ("frame", "forward"): 3.0, ("step", "all"): 2.5}
 AGR_TARGET = 0.2  # of a frame, at most
-COLUMNS = ("section", "case", "pass", "ours_ms", "theirs_ms", "ratio", "target", "ours_mib", "theirs_mib", "ours_gb_s",
-           "ours_galpha_s", "difference", "failed")  # fmt: skip
+COLUMNS = (
+    "section",
+    "case",
+    "pass",
+    "ours_ms",
+    "theirs_ms",
+    "ratio",
+    "target",
+    "ours_mib",
+    "theirs_mib",
+    "ours_gb_s",
+    "ours_galpha_s",
+    "difference",
+    "failed",
+)
 
 
 def main() -> None:
@@ -74,8 +87,11 @@ def target(row: Row) -> str | None:
 
 def agr_shares(rows: list[Row]) -> list[str]:
     """What AGR is of a frame's time, for frames that were measured with and without it."""
-    frames = {(row["section"], row["case"]): row["ours_ms"] for row in rows
-              if row["section"] in ("frame", "replay") and row.get("pass") == "forward"}  # fmt: skip
+    frames = {
+        (row["section"], row["case"]): row["ours_ms"]
+        for row in rows
+        if row["section"] in ("frame", "replay") and row.get("pass") == "forward"
+    }
     lines = []
     for (section, case), with_agr in frames.items():
         without = frames.get((section, case.replace("with AGR", "without AGR")))

@@ -34,11 +34,22 @@ IMPORTED = "from gsbench.kernels import cuda; assert cuda.available(); print(cud
 # What the caller's own PYTHONPATH has (gsplat, hydra) stays importable.
 SOURCES = os.pathsep.join([str(ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]).rstrip(os.pathsep)
 # The tests that use a GPU if there is one.
-TESTS = [str(path) for folder in ("kernels", "raster") for path in sorted((ROOT / "tests" / folder).glob("test_*.py"))
-         if re.search('cuda_device|"cuda"', path.read_text())]  # fmt: skip
+TESTS = [
+    str(path)
+    for folder in ("kernels", "raster")
+    for path in sorted((ROOT / "tests" / folder).glob("test_*.py"))
+    if re.search('cuda_device|"cuda"', path.read_text())
+]
 # torch's caching allocator would hide a buffer that is run over from memcheck.
-SANITIZER = ["env", "PYTORCH_NO_CUDA_MEMORY_CACHING=1",
-             "compute-sanitizer", "--report-api-errors", "no", "--error-exitcode", "3"]  # fmt: skip
+SANITIZER = [
+    "env",
+    "PYTORCH_NO_CUDA_MEMORY_CACHING=1",
+    "compute-sanitizer",
+    "--report-api-errors",
+    "no",
+    "--error-exitcode",
+    "3",
+]
 
 
 class Check:
@@ -132,8 +143,10 @@ def everything(check: Check, capability: str) -> None:
     tests = [python, "-m", "pytest", "-p", "no:cacheprovider", *TESTS]
     if importlib.util.find_spec("xdist") is not None:
         tests += ["-n", str(min(8, os.cpu_count() or 1))]
-    sanitized = {f"compute-sanitizer {tool}": [*SANITIZER, "--tool", tool, python, "-m", "benchmarks.gpu_small"]
-                 for tool in ("memcheck", "racecheck")}  # fmt: skip
+    sanitized = {
+        f"compute-sanitizer {tool}": [*SANITIZER, "--tool", tool, python, "-m", "benchmarks.gpu_small"]
+        for tool in ("memcheck", "racecheck")
+    }
     check.run_at_once({"tests": tests} | sanitized, 150)
     if importlib.util.find_spec("hydra") is None:
         check.note("training", "left out: hydra is not installed")
@@ -150,9 +163,22 @@ def build(check: Check, capability: str) -> bool:
     """Install into a folder of its own, and put the extensions beside the sources, where the other parts find them."""
     shutil.rmtree(BUILD, ignore_errors=True)
     pip = [sys.executable, "-m", "pip", "install", "--no-build-isolation", "--no-deps", "--no-index"]
-    built = check.run("pip install", [*pip, "-C", "cmake.define.CUDA=on", "-C", f"build-dir={BUILD / 'cmake'}",
-                                      "--target", str(BUILD / "site"), "."], 240, CUDAARCHS=capability,
-                      CMAKE_BUILD_PARALLEL_LEVEL=str(os.cpu_count()))  # fmt: skip
+    built = check.run(
+        "pip install",
+        [
+            *pip,
+            "-C",
+            "cmake.define.CUDA=on",
+            "-C",
+            f"build-dir={BUILD / 'cmake'}",
+            "--target",
+            str(BUILD / "site"),
+            ".",
+        ],
+        240,
+        CUDAARCHS=capability,
+        CMAKE_BUILD_PARALLEL_LEVEL=str(os.cpu_count()),
+    )
     for extension in (BUILD / "site/gsbench/kernels").glob("_*.so") if built else ():
         shutil.copy(extension, KERNELS / extension.name)
     return built and check.run("import", [sys.executable, "-c", IMPORTED], 60)

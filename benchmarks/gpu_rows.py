@@ -56,8 +56,16 @@ def raster_case(place: Place, case: str, N: int, size: int) -> Case:
         return gsplat_image(means, quats, scales, opacities, colors, viewmats=viewmats, Ks=Ks, size=size)
 
     # 16 floats a Gaussian and four a pixel.
-    return Case("raster", case, ours, other, [*shared, equal], [*shared, quats, scales],
-                4.0 * (16 * N + 4 * size * size), useful_alphas(N, size))  # fmt: skip
+    return Case(
+        "raster",
+        case,
+        ours,
+        other,
+        [*shared, equal],
+        [*shared, quats, scales],
+        4.0 * (16 * N + 4 * size * size),
+        useful_alphas(N, size),
+    )
 
 
 def backward_rows(place: Place) -> Iterator[Row]:
@@ -108,8 +116,9 @@ def two_ways(place: Place, fitted: GaussianModel, size: int) -> tuple[Call, Call
         fitted.backend = REFERENCE
         batch = fitted.slice(CameraTime.of(view, TIME))
         covars = batch.factors @ batch.factors.mT
-        return gsplat_image(batch.means, None, None, batch.opacities, batch.colors, covars=covars, viewmats=viewmats,
-                            Ks=Ks, size=size)[0]  # fmt: skip
+        return gsplat_image(
+            batch.means, None, None, batch.opacities, batch.colors, covars=covars, viewmats=viewmats, Ks=Ks, size=size
+        )[0]
 
     return ours, other
 

@@ -20,13 +20,24 @@ def why_not(place: Place) -> str | None:
     return None
 
 
-def gsplat_image(means: Tensor, quats: Any, scales: Any, opacities: Tensor, colors: Tensor, *, viewmats: Tensor,
-                 Ks: Tensor, size: int, covars: Tensor | None = None) -> Tensor:  # fmt: skip
+def gsplat_image(
+    means: Tensor,
+    quats: Any,
+    scales: Any,
+    opacities: Tensor,
+    colors: Tensor,
+    *,
+    viewmats: Tensor,
+    Ks: Tensor,
+    size: int,
+    covars: Tensor | None = None,
+) -> Tensor:
     """The same picture by gsplat, not packed: the faster way for one camera that sees most Gaussians."""
     import gsplat
 
-    image, _, _ = gsplat.rasterization(means, quats, scales, opacities, colors, viewmats, Ks, size, size,
-                                       covars=covars, packed=False)  # fmt: skip
+    image, _, _ = gsplat.rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, size, size, covars=covars, packed=False
+    )
     return image
 
 

@@ -82,8 +82,17 @@ def write_capture(root: Path, change: Change) -> None:
         angle, time = 2.4 * i, i / (VIEWS - 1)  # about the golden angle: neighbours in time look from other sides
         eye = RADIUS * torch.tensor([np.cos(angle), np.sin(angle), 0.3 * np.sin(3 * angle) + 0.1], dtype=torch.float64)
         viewmat = look_at(eye, torch.zeros(3).to(eye), torch.tensor([0.0, 0.0, 1.0]).to(eye))
-        image = rasterize(scene.means + time * scene.velocities, scene.factors, scene.opacities, scene.colors,
-                          viewmat[None], K[None], WIDTH, HEIGHT, backend="reference").image[0]  # fmt: skip
+        image = rasterize(
+            scene.means + time * scene.velocities,
+            scene.factors,
+            scene.opacities,
+            scene.colors,
+            viewmat[None],
+            K[None],
+            WIDTH,
+            HEIGHT,
+            backend="reference",
+        ).image[0]
         name = f"view_{i:03d}.png"
         assert cv2.imwrite(
             str(root / "images" / name), (255 * image.numpy()[..., ::-1] + 0.5).clip(0, 255).astype("u1")
@@ -95,8 +104,10 @@ def write_capture(root: Path, change: Change) -> None:
     (root / "times.csv").write_text("\n".join(times) + "\n")
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     (sparse / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}\n")
-    rows = [f"{i} {' '.join(repr(float(value)) for value in xyz)} 128 128 128 0.5"
-            for i, xyz in enumerate(change.scale * points(scene, change.far) + offset, 1)]  # fmt: skip
+    rows = [
+        f"{i} {' '.join(repr(float(value)) for value in xyz)} 128 128 128 0.5"
+        for i, xyz in enumerate(change.scale * points(scene, change.far) + offset, 1)
+    ]
     (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
 
 
@@ -126,11 +137,24 @@ def main() -> int:
         if not (folder / capture).exists():
             write_capture(folder / capture, CHANGES[name])
     status = subprocess.run(
-        [sys.executable, "-m", "gsbench", "-m", "+exp=colmap", f"data.root={folder}", "scene=custom",
-         f"scene.name={','.join(captures.values())}", f"model={','.join(MODELS)}", f"seed={','.join(map(str, SEEDS))}",
-         f"train.iterations={ITERATIONS}", "train.curve_points=1", f"results={folder / 'results'}"],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, check=False,
-    ).returncode  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "gsbench",
+            "-m",
+            "+exp=colmap",
+            f"data.root={folder}",
+            "scene=custom",
+            f"scene.name={','.join(captures.values())}",
+            f"model={','.join(MODELS)}",
+            f"seed={','.join(map(str, SEEDS))}",
+            f"train.iterations={ITERATIONS}",
+            "train.curve_points=1",
+            f"results={folder / 'results'}",
+        ],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        check=False,
+    ).returncode
     psnr = measured(folder / "results")
     print(f"| | {' | '.join(MODELS)} |\n| --- |{' ---: |' * len(MODELS)}")
     for name, capture in captures.items():
@@ -142,9 +166,11 @@ def main() -> int:
             half = float(stats.t.ppf(0.975, len(SEEDS) - 1)) * change.std(ddof=1) / len(SEEDS) ** 0.5
             cells.append(f"{here.mean():.2f}" if name == "as it is" else f"{change.mean():+.2f} ± {half:.2f}")
         print(f"| {name} | {' | '.join(cells)} |")
-    print(f"\nPSNR on test in dB, and how it differs from that of the capture as it is; means over {len(SEEDS)} seeds "
-          f"with 95 % intervals. {ITERATIONS} iterations, {VIEWS} views of {WIDTH}x{HEIGHT}; "
-          f"{processor_name()}, 1 thread.")  # fmt: skip
+    print(
+        f"\nPSNR on test in dB, and how it differs from that of the capture as it is; means over {len(SEEDS)} seeds "
+        f"with 95 % intervals. {ITERATIONS} iterations, {VIEWS} views of {WIDTH}x{HEIGHT}; "
+        f"{processor_name()}, 1 thread."
+    )
     return int(status != 0)
 
 

@@ -43,8 +43,14 @@ def raster_rows(N: int, size: int, threads: int = 1) -> Iterator[Row]:
     targets = RASTER_TARGETS.get((N, size), (None, None)) if threads == 1 else (None, None)
     name = f"{N // 1000}k / {size}x{size}" + (f", {threads} threads" if threads > 1 else "")
     yield Row("raster", f"{name} forward", forward, targets[0], ("alphas", alphas), threads)
-    yield Row("raster", f"{name} backward", lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True),
-              targets[1], ("alphas", 2 * alphas), threads)  # fmt: skip
+    yield Row(
+        "raster",
+        f"{name} backward",
+        lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True),
+        targets[1],
+        ("alphas", 2 * alphas),
+        threads,
+    )
 
 
 @torch.no_grad()
@@ -71,10 +77,18 @@ def observing() -> Iterator[Row]:
             targets = (15.0, 25.0) if name == "7dgs" and backend == "cpu" else (None, None)
             title = f"{name} 100k slice and colours, {backend}"
             values = sum(p.numel() for p in observed.splats.values())
-            yield Row("observe", f"{title} forward", lambda o=observed, q=query: o.slice(q), targets[0],
-                      ("bytes", 4 * values))  # fmt: skip
-            yield Row("observe", f"{title} backward", lambda o=out, p=parameters, u=upstream: torch.autograd.grad(
-                o, p, u, retain_graph=True, allow_unused=True), targets[1], ("bytes", 12 * values))  # fmt: skip
+            yield Row(
+                "observe", f"{title} forward", lambda o=observed, q=query: o.slice(q), targets[0], ("bytes", 4 * values)
+            )
+            yield Row(
+                "observe",
+                f"{title} backward",
+                lambda o=out, p=parameters, u=upstream: torch.autograd.grad(
+                    o, p, u, retain_graph=True, allow_unused=True
+                ),
+                targets[1],
+                ("bytes", 12 * values),
+            )
     yield from refining()
 
 
@@ -89,12 +103,20 @@ def refining() -> Iterator[Row]:
         upstream = [torch.ones_like(x) for x in out]
         inputs = [*values, *refinement.parameters()]
         backend = "cpu" if native else "reference"
-        yield Row("agr", f"AGR 100k forward, {backend}",
-                  lambda n=native: refinement(values, torch.tensor(0.3), by_kernel=n), 20.0 if native else None,
-                  ("flops", refine_flops(100_000)))  # fmt: skip
-        yield Row("agr", f"AGR 100k backward, {backend}",
-                  lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
-                  60.0 if native else None, ("flops", 3 * refine_flops(100_000)))  # fmt: skip
+        yield Row(
+            "agr",
+            f"AGR 100k forward, {backend}",
+            lambda n=native: refinement(values, torch.tensor(0.3), by_kernel=n),
+            20.0 if native else None,
+            ("flops", refine_flops(100_000)),
+        )
+        yield Row(
+            "agr",
+            f"AGR 100k backward, {backend}",
+            lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
+            60.0 if native else None,
+            ("flops", 3 * refine_flops(100_000)),
+        )
 
 
 def loss() -> Iterator[Row]:
@@ -104,18 +126,25 @@ def loss() -> Iterator[Row]:
         image, target = (torch.rand(height, width, 3, generator=g) for _ in range(2))
         image.requires_grad_()
         for backend in (CPU,) if width > 800 else (CPU, REFERENCE):  # where torch would take seconds a call
-            yield Row("loss", f"{width}x{height} forward + backward, {backend.name}",
-                      lambda a=image, b=target, by=backend: torch.autograd.grad(photometric(a, b, 0.2, by), a),
-                      6.0 if (width, backend) == (400, CPU) else None,
-                      ("flops", loss_flops(width * height)), pixels=width * height)  # fmt: skip
+            yield Row(
+                "loss",
+                f"{width}x{height} forward + backward, {backend.name}",
+                lambda a=image, b=target, by=backend: torch.autograd.grad(photometric(a, b, 0.2, by), a),
+                6.0 if (width, backend) == (400, CPU) else None,
+                ("flops", loss_flops(width * height)),
+                pixels=width * height,
+            )
 
 
 def step() -> Iterator[Row]:
     """A whole training step of one view, as the trainer makes it: gradients, then Adam."""
     for name, agr in (("3dgs", False), ("4dgs", False), ("6dgs", False), ("7dgs", False), ("7dgs", True)):
         for backend in (CPU, REFERENCE):
-            yield Row("step", f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend.name}",
-                      training_step(model(name, 10_000, agr=agr, backend=backend), 400, 400, 1))  # fmt: skip
+            yield Row(
+                "step",
+                f"{name}{'+agr' if agr else ''} 10k / 400x400, {backend.name}",
+                training_step(model(name, 10_000, agr=agr, backend=backend), 400, 400, 1),
+            )
     for N, size in ((16, 16), (1_000, 80), (5_000, 80), (10_000, 400), (50_000, 400)):
         for name, agr in (("7dgs", False), ("4dgs", False), ("7dgs", True)):
             for threads in (1, 2):
@@ -146,5 +175,10 @@ def instruction_sets() -> Iterator[Row]:
 
 
 SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {
-    "stages": stages, "raster": raster, "observe": observing, "loss": loss, "step": step, "isa": instruction_sets,
-}  # fmt: skip
+    "stages": stages,
+    "raster": raster,
+    "observe": observing,
+    "loss": loss,
+    "step": step,
+    "isa": instruction_sets,
+}

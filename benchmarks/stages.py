@@ -21,8 +21,14 @@ from gsbench.train.losses import photometric
 
 MODELS = {"7dgs_noagr": ("7dgs", False), "7dgs": ("7dgs", True), "4dgs": ("4dgs", False)}  # name: model, AGR
 SUCCESSORS = ("dgs", "dbs", "ubs", "freetime")  # of which only the slice is timed; other stages cost as above
-STAGES = {"refine": "AGR", "slice_triangular": "slice", "slice_rotated": "slice", "show_colors": "colours",
-          "project": "project", "blend": "blend"}  # fmt: skip
+STAGES = {
+    "refine": "AGR",
+    "slice_triangular": "slice",
+    "slice_rotated": "slice",
+    "show_colors": "colours",
+    "project": "project",
+    "blend": "blend",
+}
 
 
 class Call:
@@ -39,9 +45,14 @@ class Call:
         return self.outputs, slots
 
     def backward(
-        self, tensors: list[Tensor], slots: dict[str, Any], outputs: list[Tensor], upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
-    ) -> list[Tensor | None]:  # fmt: skip
+        self,
+        tensors: list[Tensor],
+        slots: dict[str, Any],
+        outputs: list[Tensor],
+        upstream: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+        sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:
         self.arguments = tensors, slots, outputs, upstream, wanted, sums
         self.gradients = self.operation.backward(*self.arguments)
         return self.gradients
@@ -141,8 +152,12 @@ def stages_of(name: str, N: int, size: int) -> Iterator[Row]:
                 yield from binning(name, calls)
             yield row(f"{STAGES[key]} backward", call.backward_again, backward)
     loss = calls["l1_ssim"]
-    yield row("loss forward + backward", lambda: (loss.forward_again(), loss.backward_again()),
-              ("flops", loss_flops(size * size)), size * size)  # fmt: skip
+    yield row(
+        "loss forward + backward",
+        lambda: (loss.forward_again(), loss.backward_again()),
+        ("flops", loss_flops(size * size)),
+        size * size,
+    )
     updated = sum(p.numel() for p in fitted.parameters() if p.grad is not None)
     yield row("Adam", adam_of(fitted), ("bytes", 7 * 4 * updated))  # four arrays are read and three written
     yield Row("stages", f"{name} whole step", training_step(fitted, size, size, 1))
@@ -158,8 +173,12 @@ def binning(name: str, calls: dict[str, Call]) -> Iterator[Row]:
         "stages", f"{name} check values", lambda: flag_values(RasterInputs(*values)), floor=("bytes", _bytes(values))
     )
     read = _bytes([splats.means2d, splats.depths, splats.half_sizes])
-    yield Row("stages", f"{name} bin", lambda: bin_tiles(splats, viewport, flags),
-              floor=("bytes", read + _bytes(blend.tensors[5:7])))  # fmt: skip
+    yield Row(
+        "stages",
+        f"{name} bin",
+        lambda: bin_tiles(splats, viewport, flags),
+        floor=("bytes", read + _bytes(blend.tensors[5:7])),
+    )
 
 
 def floors(call: Call, project: Call, N: int) -> list[tuple[str, float]]:

@@ -53,7 +53,8 @@ def adam_of(fitted: GaussianModel) -> Callable[[], None]:
         gradients = [p.grad for p, *_ in learning]
         means, squares, steps = ([state[i] for state in learning] for i in (1, 2, 3))
         torch._foreach_add_(steps, 1)
-        adam_all([p.data for p, *_ in learning], gradients, means, squares, steps, [RATE] * len(learning), list(BETAS),
-                 EPS)  # fmt: skip
+        adam_all(
+            [p.data for p, *_ in learning], gradients, means, squares, steps, [RATE] * len(learning), list(BETAS), EPS
+        )
 
     return call

@@ -72,8 +72,11 @@ def _run(parsed: command.Command) -> int:
             return 0 if ended.reason is None else BAD_INPUT if ended.is_refused else FAILED
         outcome = sweep.launch(configs, parsed.config_dir)
     if outcome.broken:
-        print(f"gsbench: {len(outcome.broken)} runs did not end well: python -m gsbench.launch status "
-              f"{shlex.quote(str(outcome.experiment))}", file=sys.stderr)  # fmt: skip
+        print(
+            f"gsbench: {len(outcome.broken)} runs did not end well: python -m gsbench.launch status "
+            f"{shlex.quote(str(outcome.experiment))}",
+            file=sys.stderr,
+        )
     return BAD_INPUT if outcome.is_refused else FAILED if outcome.broken else 0
 
 

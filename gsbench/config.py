@@ -36,8 +36,7 @@ class DataConfig:
     initial_lambda: float = key(0.5, "initial lambda_d of 7DGS")
     initial_lambda_t: float = key(0.5, "its initial lambda_t", absent=0.5)
     initial_points: int = key(100_000, "random points, if needed", low=4)
-    initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see",
-                                           low=1e-6, high=1e6)  # fmt: skip
+    initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see", low=1e-6, high=1e6)
 
 
 @dataclass
@@ -93,8 +92,9 @@ class ModelConfig:
 class DensifyConfig:
     """Set the density control. All steps but `every` scale with `train.iterations`."""
 
-    kind: str = key("gradient", "rule: 3DGS, 3DGS-MCMC, FastGS",
-                    choices=("gradient", "mcmc", "multiview"), absent="gradient")  # fmt: skip
+    kind: str = key(
+        "gradient", "rule: 3DGS, 3DGS-MCMC, FastGS", choices=("gradient", "mcmc", "multiview"), absent="gradient"
+    )
     start: int = key(500, "first step", low=0)
     stop: int = key(15_000, "last step", low=0)
     every: int = key(100, "least steps between two rounds", low=1)
@@ -152,10 +152,12 @@ class ProtocolConfig:
 class EffectsConfig:
     """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
-    gate: str = key("${model.gate}", "end: after training; both: also during it",
-                    choices=("off", "end", "both"), absent="off")  # fmt: skip
-    budget_db: float = key(0.05, "val PSNR that removal at the end may cost", unit="dB", low=0, high=10,
-                           needs="effects.gate")  # fmt: skip
+    gate: str = key(
+        "${model.gate}", "end: after training; both: also during it", choices=("off", "end", "both"), absent="off"
+    )
+    budget_db: float = key(
+        0.05, "val PSNR that removal at the end may cost", unit="dB", low=0, high=10, needs="effects.gate"
+    )
     compare: bool = key(False, "choose for model=auto by val PSNR, after 70 % of the steps", absent=False)
 
 

@@ -39,8 +39,11 @@ def training_keys(plain: Plain) -> Plain:
     def is_set(key: str) -> bool:
         return whole.get(key, facts(key).absent) not in (None, facts(key).absent)
 
-    return {key: value for key, value in whole.items()
-            if facts(key).role == "training" and ((needed := facts(key).needs) is None or is_set(needed))}  # fmt: skip
+    return {
+        key: value
+        for key, value in whole.items()
+        if facts(key).role == "training" and ((needed := facts(key).needs) is None or is_set(needed))
+    }
 
 
 def training_hash(plain: Plain) -> str:
@@ -60,9 +63,9 @@ def training_differences(before: Plain, after: Plain) -> list[str]:
 
 def measuring_differences(before: Plain, after: Plain) -> list[str]:
     """Describe the settings that change only what is measured, and differ between two configs."""
-    return _differences(*(
-        {key: value for key, value in flat(plain) if facts(key).role == "measuring"} for plain in (before, after)
-    ))  # fmt: skip
+    return _differences(
+        *({key: value for key, value in flat(plain) if facts(key).role == "measuring"} for plain in (before, after))
+    )
 
 
 def listed(differences: list[str]) -> str:
@@ -98,9 +101,11 @@ def _decided(keys: Plain) -> Plain:
 def _differences(before: Plain, after: Plain) -> list[str]:
     # Hashes are compared, not values: 1, 1.0 and True are equal to Python, but they are other settings.
     before, after = _decided(before), _decided(after)
-    return [f"{key} {_shown(after, key)} instead of {_shown(before, key)}"
-            for key in sorted(before.keys() | after.keys())
-            if config_hash({"": before.get(key, [])}) != config_hash({"": after.get(key, [])})]  # fmt: skip
+    return [
+        f"{key} {_shown(after, key)} instead of {_shown(before, key)}"
+        for key in sorted(before.keys() | after.keys())
+        if config_hash({"": before.get(key, [])}) != config_hash({"": after.get(key, [])})
+    ]
 
 
 def _shown(config: Plain, key: str) -> str:

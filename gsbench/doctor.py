@@ -83,8 +83,12 @@ def _packages() -> Iterator[Check]:
         yield Check("packages", OK, f"{versions} and {len(core) - 3} more")
     there = [extra for extra, names in extras.items() if all(map(_version, names))]
     lacking = [extra for extra in extras if extra not in there]
-    yield Check("extras", OK if there else ABSENT, ", ".join(there) or "none",
-                f"{how_to_install('NAME')}, NAME of {', '.join(lacking)}" if lacking else "")  # fmt: skip
+    yield Check(
+        "extras",
+        OK if there else ABSENT,
+        ", ".join(there) or "none",
+        f"{how_to_install('NAME')}, NAME of {', '.join(lacking)}" if lacking else "",
+    )
 
 
 def _requirements() -> tuple[list[str], dict[str, list[str]]]:
@@ -126,19 +130,31 @@ def _machine() -> Iterator[Check]:
     yield Check("processor", OK, f"{here.processor}, {here.cores} cores, {usable} for this process")
     threads = torch.get_num_threads()
     fit = threads <= usable
-    yield Check("threads", OK if fit else BROKEN, f"{threads} of torch and the kernels",
-                "" if fit else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow")  # fmt: skip
+    yield Check(
+        "threads",
+        OK if fit else BROKEN,
+        f"{threads} of torch and the kernels",
+        "" if fit else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow",
+    )
     if free is not None:
         enough = free >= LEAST_MEMORY
-        yield Check("memory", OK if enough else BROKEN, f"{free / 2**30:.1f} of {here.memory_gib} GiB free",
-                    "" if enough else "end other programs")  # fmt: skip
+        yield Check(
+            "memory",
+            OK if enough else BROKEN,
+            f"{free / 2**30:.1f} of {here.memory_gib} GiB free",
+            "" if enough else "end other programs",
+        )
 
 
 def _disk() -> Iterator[Check]:
     free = shutil.disk_usage(Path.cwd()).free
     enough = free >= LEAST_DISK
-    yield Check("disk", OK if enough else BROKEN, f"{free / 2**30:.1f} GiB free in {Path.cwd()}",
-                "" if enough else "free a GiB, or set results=FOLDER on another disk")  # fmt: skip
+    yield Check(
+        "disk",
+        OK if enough else BROKEN,
+        f"{free / 2**30:.1f} GiB free in {Path.cwd()}",
+        "" if enough else "free a GiB, or set results=FOLDER on another disk",
+    )
 
 
 def _compiler() -> Iterator[Check]:
@@ -155,15 +171,22 @@ def _kernels() -> Iterator[Check]:
     from gsbench import kernels
 
     if not kernels.available():
-        yield Check("kernels", BROKEN, "not built: the CPU renders by the slow reference",
-                    "install a C++20 compiler, then reinstall (docs/install.md)")  # fmt: skip
+        yield Check(
+            "kernels",
+            BROKEN,
+            "not built: the CPU renders by the slow reference",
+            "install a C++20 compiler, then reinstall (docs/install.md)",
+        )
         return
     error = _difference()
     right = error <= LARGEST_ERROR
     used = f"{kernels.instruction_set()} (here: {', '.join(kernels.native().instruction_sets())})"
-    yield Check("kernels", OK if right else BROKEN,
-                f"for the CPU, instruction set {used}; an image differs by {error:.0e} from the reference",
-                "" if right else "build again: make clean && make setup")  # fmt: skip
+    yield Check(
+        "kernels",
+        OK if right else BROKEN,
+        f"for the CPU, instruction set {used}; an image differs by {error:.0e} from the reference",
+        "" if right else "build again: make clean && make setup",
+    )
 
 
 def _difference() -> float:
@@ -189,16 +212,24 @@ def _gpu() -> Iterator[Check]:
     if not torch.cuda.is_available():
         driver = shutil.which("nvidia-smi") is not None
         why = "a driver is there, but this torch sees no device" if driver else "none; the CPU trains"
-        yield Check("gpu", BROKEN if driver else ABSENT, why,
-                    "install torch with CUDA for this driver (docs/gpu.md)" if driver else "")  # fmt: skip
+        yield Check(
+            "gpu",
+            BROKEN if driver else ABSENT,
+            why,
+            "install torch with CUDA for this driver (docs/gpu.md)" if driver else "",
+        )
         return
     device = torch.cuda.get_device_properties(0)
     name = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
     if cuda.built():
         yield Check("gpu", OK, f"{name}, kernels built")
     else:
-        yield Check("gpu", BROKEN, f"{name}, kernels not built: the GPU renders by the slow reference",
-                    "install nvcc, then reinstall (docs/gpu.md)")  # fmt: skip
+        yield Check(
+            "gpu",
+            BROKEN,
+            f"{name}, kernels not built: the GPU renders by the slow reference",
+            "install nvcc, then reinstall (docs/gpu.md)",
+        )
 
 
 def _weights() -> Iterator[Check]:
@@ -206,8 +237,12 @@ def _weights() -> Iterator[Check]:
 
     for backbone, chosen in BACKBONES.items():
         there = is_here(backbone)
-        yield Check(f"lpips {backbone}", OK if there else ABSENT, f"{chosen.file}{'' if there else ' is not here'}",
-                    "" if there else f"python -m gsbench.fetch lpips-{backbone}")  # fmt: skip
+        yield Check(
+            f"lpips {backbone}",
+            OK if there else ABSENT,
+            f"{chosen.file}{'' if there else ' is not here'}",
+            "" if there else f"python -m gsbench.fetch lpips-{backbone}",
+        )
 
 
 def _data() -> Iterator[Check]:
@@ -217,8 +252,12 @@ def _data() -> Iterator[Check]:
     there = [str(source.target) for source in archives if source.target.exists()]
     absent = [source.name for source in archives if not source.target.exists()]
     embedded = importlib.util.find_spec("gsbench.scenes.sample") is not None
-    yield Check("data", OK if embedded else BROKEN, ", ".join(["the embedded scenes" if embedded else "none", *there]),
-                f"for more: python -m gsbench.fetch {' '.join(absent)}" if absent else "")  # fmt: skip
+    yield Check(
+        "data",
+        OK if embedded else BROKEN,
+        ", ".join(["the embedded scenes" if embedded else "none", *there]),
+        f"for more: python -m gsbench.fetch {' '.join(absent)}" if absent else "",
+    )
 
 
 CHECKS = (_gsbench, _packages, _machine, _disk, _compiler, _kernels, _gpu, _weights, _data)

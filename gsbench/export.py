@@ -98,15 +98,21 @@ def prepare(options: argparse.Namespace) -> Export:
     if options.time is not None and not 0 <= options.time <= 1:
         raise InputError(f"--time: expected a number in [0, 1], got {options.time}")
     if not 0 < options.fps <= 1000 or not 1 <= options.fps * options.seconds <= MOST_FRAMES:
-        raise InputError(f"--fps, --seconds: expected 1 to {MOST_FRAMES} frames of at most 1000 a second, got "
-                         f"{options.fps} x {options.seconds}")  # fmt: skip
+        raise InputError(
+            f"--fps, --seconds: expected 1 to {MOST_FRAMES} frames of at most 1000 a second, got "
+            f"{options.fps} x {options.seconds}"
+        )
     sides = [options.supersample * side for side in (1, options.width, options.height) if side is not None]
     if not all(0 < side <= MOST_SIDE for side in (options.supersample, *sides)):
-        raise InputError(f"--width, --height, --supersample: expected at least 1 and at most {MOST_SIDE} rendered "
-                         f"pixels a side, got {options.width}, {options.height}, {options.supersample}")  # fmt: skip
+        raise InputError(
+            f"--width, --height, --supersample: expected at least 1 and at most {MOST_SIDE} rendered "
+            f"pixels a side, got {options.width}, {options.height}, {options.supersample}"
+        )
     if options.video and any(side is not None and side % 2 for side in (options.width, options.height)):
-        raise InputError(f"--width, --height: expected even numbers for --video, as VP9 encodes no others, got "
-                         f"{options.width}, {options.height}")  # fmt: skip
+        raise InputError(
+            f"--width, --height: expected even numbers for --video, as VP9 encodes no others, got "
+            f"{options.width}, {options.height}"
+        )
     if options.ply:
         check_file("--ply", options.ply, ".ply")
     if options.video:
@@ -135,14 +141,18 @@ def check_clip(options: argparse.Namespace) -> None:
     if options.time is not None:
         raise InputError("--plys: expected no --time, as there is a file for each time: leave it out, or use --ply")
     if frame_count(options) < LEAST_FILES:
-        raise InputError(f"--plys: expected at least {LEAST_FILES} files, --fps {options.fps:g} and --seconds "
-                         f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply")  # fmt: skip
+        raise InputError(
+            f"--plys: expected at least {LEAST_FILES} files, --fps {options.fps:g} and --seconds "
+            f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply"
+        )
     check_parent(folder)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--plys: expected a folder, {folder} is a file: name another")
     if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"--plys: expected a new or an empty folder, {folder} has files, which a viewer would take "
-                         f"for frames: name another")  # fmt: skip
+        raise InputError(
+            f"--plys: expected a new or an empty folder, {folder} has files, which a viewer would take "
+            f"for frames: name another"
+        )
 
 
 def frame_count(options: argparse.Namespace) -> int:
@@ -157,8 +167,10 @@ def export_ply(export: Export) -> list[str]:
     ply = write_ply(run, query, path, keep_harmonics=keep)
     when = "" if query.time is None else f" at time {float(query.time):g}"
     total = len(run.model)
-    text = (f"{path}: {ply.gaussians} Gaussians{when}, colours {colours(export, keep)}; {total - ply.gaussians} of "
-            f"{total} are left out, as their opacity there is below 1/255")  # fmt: skip
+    text = (
+        f"{path}: {ply.gaussians} Gaussians{when}, colours {colours(export, keep)}; {total - ply.gaussians} of "
+        f"{total} are left out, as their opacity there is below 1/255"
+    )
     return [text, *differences(export, path, ply)]
 
 
@@ -169,8 +181,10 @@ def export_clip(export: Export) -> list[str]:
     keep = places[0][1]
     plys = write_clip(export.run, [query for query, _ in places], folder, keep_harmonics=keep)
     counts = [ply.gaussians for ply in plys]
-    text = (f"{folder}: {plys[0].path.name} to {plys[-1].path.name} at times 0 to 1, {min(counts)} to {max(counts)} "
-            f"Gaussians each, colours {colours(export, keep)}")  # fmt: skip
+    text = (
+        f"{folder}: {plys[0].path.name} to {plys[-1].path.name} at times 0 to 1, {min(counts)} to {max(counts)} "
+        f"Gaussians each, colours {colours(export, keep)}"
+    )
     return [text, *differences(export, folder, plys[0])]
 
 
@@ -186,14 +200,20 @@ def differences(export: Export, path: Path, ply: SlicePly) -> list[str]:
     """Return in words how a PLY's Gaussians differ from the model's, as the format of 3DGS has no field for it."""
     notes, step = [], export.run.scene.placement.float_step
     if step > MOST_STEP:
-        notes += [f"{path}: so far from the origin, single precision moves means by up to {step:.1%} of the cameras' "
-                  f"distance: subtract an offset from your poses if the picture is not sharp"]  # fmt: skip
+        notes += [
+            f"{path}: so far from the origin, single precision moves means by up to {step:.1%} of the cameras' "
+            f"distance: subtract an offset from your poses if the picture is not sharp"
+        ]
     if ply.from_profiles:
-        notes += [f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
-                  f"3DGS has no field for b; --images and --video keep the profiles"]  # fmt: skip
+        notes += [
+            f"{path}: their alpha profiles (1 - r^2)^b are now the Gaussians that look like them, as a PLY of "
+            f"3DGS has no field for b; --images and --video keep the profiles"
+        ]
     if export.run.config.raster.antialias:
-        notes += [f"{path}: trained with raster.antialias=true, which a PLY of 3DGS has no field for: switch on "
-                  f"antialiasing (Mip-Splatting) in the viewer, or small Gaussians are too opaque"]  # fmt: skip
+        notes += [
+            f"{path}: trained with raster.antialias=true, which a PLY of 3DGS has no field for: switch on "
+            f"antialiasing (Mip-Splatting) in the viewer, or small Gaussians are too opaque"
+        ]
     return notes
 
 
@@ -237,8 +257,9 @@ def shots_of(export: Export, least: int | None = None) -> list[video.Shot]:
     options = export.options
     shots = [(sized(camera, options.width, options.height, least), time) for camera, time in path_of(export)]
     pixels = options.supersample**2 * max(camera.width * camera.height for camera, _ in shots)
-    require(BYTES_OF_PIXEL * pixels, f"frames of {pixels:,} rendered pixels",
-            "lower --width, --height or --supersample")  # fmt: skip
+    require(
+        BYTES_OF_PIXEL * pixels, f"frames of {pixels:,} rendered pixels", "lower --width, --height or --supersample"
+    )
     return shots
 
 
@@ -284,8 +305,10 @@ def find_view(scene: Scene, name: str) -> View:
     for view in (*scene.train, *scene.val, *scene.test):
         if view.name == name:
             return view
-    raise InputError(f"--camera: expected a training view's number, 0 to {len(scene.train) - 1}, or a view's name such "
-                     f"as {scene.train[0].name}, got {name[:100]!a}")  # fmt: skip
+    raise InputError(
+        f"--camera: expected a training view's number, 0 to {len(scene.train) - 1}, or a view's name such "
+        f"as {scene.train[0].name}, got {name[:100]!a}"
+    )
 
 
 if __name__ == "__main__":

@@ -128,8 +128,9 @@ class Schedule:
         This is the first measurement on val after 70 % of the steps and after densification.
         """
         least = max(round(COMPARE * self.config.iterations), self.densify_stop)
-        return next((done for done in range(least, self.config.iterations) if self.measures(done - 1)),
-                    self.config.iterations)  # fmt: skip
+        return next(
+            (done for done in range(least, self.config.iterations) if self.measures(done - 1)), self.config.iterations
+        )
 
     def measures(self, step: int) -> bool:
         """Return whether PSNR on val is measured after a step for the training curve; always after the last step."""

@@ -49,9 +49,9 @@ class Recipe:
 
 def look_at(azimuth: float, elevation: float, distance: float = DISTANCE) -> Pose:
     """Return the pose of a camera on a sphere around the origin that looks at the origin; angles are in radians."""
-    back = np.array([
-        math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)
-    ])  # fmt: skip
+    back = np.array(
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    )
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
@@ -192,8 +192,14 @@ def _material(
     material = bpy.data.materials.new("material")
     material.use_nodes = True
     surface = material.node_tree.nodes["Principled BSDF"]
-    values = {"Base Color": (*colour, 1.0), "Roughness": roughness, "Metallic": metallic, "IOR": 1.35,
-              "Transmission Weight": transmission, "Specular IOR Level": 0.0 if roughness == 1 else 0.5}  # fmt: skip
+    values = {
+        "Base Color": (*colour, 1.0),
+        "Roughness": roughness,
+        "Metallic": metallic,
+        "IOR": 1.35,
+        "Transmission Weight": transmission,
+        "Specular IOR Level": 0.0 if roughness == 1 else 0.5,
+    }
     for name, value in values.items():
         surface.inputs[name].default_value = value
     if checks:

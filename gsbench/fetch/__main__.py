@@ -99,8 +99,10 @@ def fetch(source: Source) -> str:
         unpack(archive, source.folder)
     finally:
         archive.unlink()  # a damaged archive would block the next attempt
-    return (f"{source.name}: unpacked into {source.folder}; SHA-256 of the archive, to compare with others: {digest}; "
-            f"{scenes(scenes_in(source.folder))}")  # fmt: skip
+    return (
+        f"{source.name}: unpacked into {source.folder}; SHA-256 of the archive, to compare with others: {digest}; "
+        f"{scenes(scenes_in(source.folder))}"
+    )
 
 
 def scenes(folders: dict[Path, list[str]]) -> str:

@@ -41,14 +41,19 @@ def download(source: Source, folder: Path) -> Path:
         raise InputError(f"{source.name}: {one_line(error)}: {by_hand(source, path)}") from None
     except (requests.exceptions.ConnectTimeout, requests.exceptions.ConnectionError) as error:
         broken = "broke off" if "Read" in repr(error) else "cannot be reached (is this machine online?)"
-        raise InputError(f"{source.name}: {urlsplit(url).netloc} {broken}; behind a proxy set HTTPS_PROXY; or "
-                         f"{by_hand(source, path)}", docs="data.md#fetching") from None  # fmt: skip
+        raise InputError(
+            f"{source.name}: {urlsplit(url).netloc} {broken}; behind a proxy set HTTPS_PROXY; or "
+            f"{by_hand(source, path)}",
+            docs="data.md#fetching",
+        ) from None
     except InputError:
         raise
     # ValueError: an invalid length or URL, perhaps of a redirection, which requests does not always wrap
     except (requests.exceptions.RequestException, ValueError) as error:
-        raise InputError(f"{source.name}: {url} broke off or is no answer ({type(error).__name__}): try again, or "
-                         f"{by_hand(source, path)}") from None  # fmt: skip
+        raise InputError(
+            f"{source.name}: {url} broke off or is no answer ({type(error).__name__}): try again, or "
+            f"{by_hand(source, path)}"
+        ) from None
     return path
 
 
@@ -61,8 +66,10 @@ def check(path: Path, source: Source, advice: str) -> None:
     """Raise InputError if the SHA-256 of a file does not begin with the expected digits."""
     digest = sha256_of(path)
     if source.sha256 and not digest.startswith(source.sha256):
-        raise InputError(f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {digest[:8]}..: "
-                         f"{advice}", docs="data.md#fetching")  # fmt: skip
+        raise InputError(
+            f"{source.name}: expected {source.file} with SHA-256 {source.sha256}.., got {digest[:8]}..: {advice}",
+            docs="data.md#fetching",
+        )
 
 
 def sha256_of(path: Path) -> str:

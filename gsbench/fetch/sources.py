@@ -47,9 +47,12 @@ class Source:
                 raise InputError(f"{MIRROR}: expected an address such as https://host/folder, got {mirror!a:.200}")
             return f"{mirror.rstrip('/')}/{self.file}"
         if self.url is None:
-            raise InputError(f"{self.name}: {self.what} has no address that a program can follow: download it in a "
-                             f"browser ({self.published}) and unpack it into {self.folder}, or set {MIRROR} to a "
-                             f"server that has {self.file}", docs="data.md#fetching")  # fmt: skip
+            raise InputError(
+                f"{self.name}: {self.what} has no address that a program can follow: download it in a "
+                f"browser ({self.published}) and unpack it into {self.folder}, or set {MIRROR} to a "
+                f"server that has {self.file}",
+                docs="data.md#fetching",
+            )
         return self.url
 
 

@@ -13,8 +13,17 @@ from gsbench.errors import InputError, one_line
 
 MOST_FILES = 1_000_000
 # Exceptions of zipfile for damaged or encrypted archives; RecursionError (folders 1000 deep) is a RuntimeError.
-DAMAGED = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, zlib.error, lzma.LZMAError, struct.error,
-           ValueError, IndexError)  # fmt: skip
+DAMAGED = (
+    zipfile.BadZipFile,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    ValueError,
+    IndexError,
+)
 
 
 def unpack(archive: Path, folder: Path) -> None:
@@ -32,8 +41,10 @@ def unpack(archive: Path, folder: Path) -> None:
                 check(member, archive)
             size, free = sum(member.file_size for member in members), shutil.disk_usage(folder.parent).free
             if size > free or len(members) > MOST_FILES:
-                raise InputError(f"{archive}: expected at most {MOST_FILES} files and {free} bytes, which are free in "
-                                 f"{folder.parent}, got {len(members)} and {size}")  # fmt: skip
+                raise InputError(
+                    f"{archive}: expected at most {MOST_FILES} files and {free} bytes, which are free in "
+                    f"{folder.parent}, got {len(members)} and {size}"
+                )
             opened.extractall(part)
         part.replace(folder)
     except InputError:

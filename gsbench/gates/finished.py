@@ -54,8 +54,10 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     trainer = execution.trainer(model, scene)
     trainer.load_state_dict(former.state)
     if trainer.step < config.train.iterations:
-        raise InputError(f"{folder}: expected a finished run, this one is at step {trainer.step} of "
-                         f"{config.train.iterations}: run it again, it continues from there")  # fmt: skip
+        raise InputError(
+            f"{folder}: expected a finished run, this one is at step {trainer.step} of "
+            f"{config.train.iterations}: run it again, it continues from there"
+        )
     trainer.hook(Gating).finish()
     content = Checkpoint(training_hash(plain), former.data, trainer.state_dict(), plain, former.scene)
     checkpoint.save(new / checkpoint.FILE_NAME, content)

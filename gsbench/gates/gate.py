@@ -85,8 +85,15 @@ def gate_within(
         loss = before - measure(gated)
         if loss <= budget_db and len(gated):
             counts = gated.count_by_effects() | {"removed": len(model) - len(gated)}
-            gate = Gate(share, _loss_db(choice.predicted), loss, counts, _count_by_order(gated),
-                        bytes_before=model.stored_bytes(), bytes=gated.stored_bytes())  # fmt: skip
+            gate = Gate(
+                share,
+                _loss_db(choice.predicted),
+                loss,
+                counts,
+                _count_by_order(gated),
+                bytes_before=model.stored_bytes(),
+                bytes=gated.stored_bytes(),
+            )
             return GatedCopy(gated, gate, rows, changed)
     return None
 
@@ -206,8 +213,11 @@ def apply(
     for way in sensitivity.simplifications:
         if way.raw is None:
             continue
-        rows = choice.geometry[way.name] if way.order is None else (
-            (choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order)))  # fmt: skip
+        rows = (
+            choice.geometry[way.name]
+            if way.order is None
+            else ((choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order)))
+        )
         for key, value in way.raw.items():
             model.splats[key].data[rows] = value[rows]
     place = torch.arange(len(model), device=now.orders.device)

@@ -78,8 +78,10 @@ class Gating(Hook):
             return
         if len(scene.train) < FEW:
             self.checked, self.checked_on = scene.train, "the training views"
-            self.notes.append(f"{len(scene.train)} training views and no val split: the gate is checked on the "
-                              f"training views, which says little")  # fmt: skip
+            self.notes.append(
+                f"{len(scene.train)} training views and no val split: the gate is checked on the "
+                f"training views, which says little"
+            )
         else:
             self.checked, self.checked_on = scene.train[::HELD_OUT], "held-out training views"
             self.probed = [view for i, view in enumerate(scene.train) if i % HELD_OUT]
@@ -96,8 +98,10 @@ class Gating(Hook):
             return
         with self.training.stages("gate"):
             if len(self.model) < LEAST_IN_TRAINING:
-                self.notes.append(f"at step {step + 1} the model has {len(self.model)} Gaussians: of fewer than "
-                                  f"{LEAST_IN_TRAINING:,} none is simplified in training")  # fmt: skip
+                self.notes.append(
+                    f"at step {step + 1} the model has {len(self.model)} Gaussians: of fewer than "
+                    f"{LEAST_IN_TRAINING:,} none is simplified in training"
+                )
                 return
             most = LOSS_WITH_AGR if self.config.agr else LOSS_IN_TRAINING
             self.simplify(step + 1, most, VIEWS_IN_TRAINING)
@@ -133,21 +137,36 @@ class Gating(Hook):
         # In training AGR changes Gaussians at all times, because the times at which they are visible still change.
         intervals = visible_times(model, self.probed) if step is None else None
         hidden = None if intervals is None else intervals[:, 0].isinf()
-        sensitivity = probe(model, self.probed, self.renderer.background, seed=self.config.seed, most=most,
-                            antialias=self.renderer.antialias, hidden=hidden)  # fmt: skip
+        sensitivity = probe(
+            model,
+            self.probed,
+            self.renderer.background,
+            seed=self.config.seed,
+            most=most,
+            antialias=self.renderer.antialias,
+            hidden=hidden,
+        )
         gated = gate_within(model, sensitivity, budget_db, lambda x: self.renderer.psnr(x, self.checked), intervals)
         if gated is None:
             before = self.renderer.psnr(model, self.checked)
             self.notes.append(
-                f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}" if decides(before) else
-                f"{when} nothing was simplified: a PSNR of {before:.0f} dB on {self.checked_on} cannot show a loss"
-            )  # fmt: skip
+                f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}"
+                if decides(before)
+                else f"{when} nothing was simplified: a PSNR of {before:.0f} dB on {self.checked_on} cannot show a loss"
+            )
             return
         become(self.model, gaussians_of(gated.model))
         self.training.rows.moved(gated.rows, gated.changed)
         seconds = time.perf_counter() - started
-        self.gates.append(replace(gated.gate, step=step, checked_on=self.checked_on, seconds=seconds,
-                                  asleep=share_asleep(self.model, self.probed)))  # fmt: skip
+        self.gates.append(
+            replace(
+                gated.gate,
+                step=step,
+                checked_on=self.checked_on,
+                seconds=seconds,
+                asleep=share_asleep(self.model, self.probed),
+            )
+        )
 
     def rate_factors(self, step: int) -> dict[str, float]:
         """Return the factor of the learning rate of AGR at a step.

@@ -18,19 +18,27 @@ def of_screen(screen: TimeScreen) -> str:
 
 def of_comparison(comparison: ModelComparison) -> str:
     """Return the PSNR on val of each candidate of model=auto, and which of them was chosen."""
-    return (f"PSNR on val after {comparison.iteration} iterations: {_of_candidates(comparison.candidates)}; "
-            f"{comparison.chosen} is trained to the end{_tie(comparison.candidates)}")  # fmt: skip
+    return (
+        f"PSNR on val after {comparison.iteration} iterations: {_of_candidates(comparison.candidates)}; "
+        f"{comparison.chosen} is trained to the end{_tie(comparison.candidates)}"
+    )
 
 
 def of_lengths(choice: LengthChoice) -> str:
     """Return the PSNR on val of each length that was trained, and which of them is kept."""
-    return (f"PSNR on val: {_of_candidates(choice.tried)}; the training of {choice.kept} iterations is kept"
-            f"{_tie(choice.tried)}")  # fmt: skip
+    return (
+        f"PSNR on val: {_of_candidates(choice.tried)}; the training of {choice.kept} iterations is kept"
+        f"{_tie(choice.tried)}"
+    )
 
 
 def _of_candidates(candidates: list[Candidate]) -> str:
-    return ", ".join(f"{x.name} {'-' if x.psnr_val is None else format(x.psnr_val, '.2f')} dB"
-                     if x.reason is None else f"{x.name} failed" for x in candidates)  # fmt: skip
+    return ", ".join(
+        f"{x.name} {'-' if x.psnr_val is None else format(x.psnr_val, '.2f')} dB"
+        if x.reason is None
+        else f"{x.name} failed"
+        for x in candidates
+    )
 
 
 def _tie(candidates: list[Candidate]) -> str:
@@ -65,6 +73,8 @@ def _of_gate(gate: Gate) -> str:
 
 
 def _of_direction(direction: Direction) -> str:
-    return (f"direction: {direction.kept:.0%} of the Gaussians depend on it; if none did, PSNR would change by "
-            f"{-direction.loss_db:+.2f} dB and a frame from {direction.frame_ms:.2f} to "
-            f"{direction.frame_ms_without:.2f} ms")  # fmt: skip
+    return (
+        f"direction: {direction.kept:.0%} of the Gaussians depend on it; if none did, PSNR would change by "
+        f"{-direction.loss_db:+.2f} dB and a frame from {direction.frame_ms:.2f} to "
+        f"{direction.frame_ms_without:.2f} ms"
+    )

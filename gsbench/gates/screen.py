@@ -107,15 +107,19 @@ def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str)
     camera = _indicators(held) if held else camera_basis(views)
     test = follow_time(gradient_products(views, scene, seed, backend), times, camera, seed, held)
     if test.free < LEAST_FREE:
-        reason = (f"the camera moves along with time, so that only {test.free:.0%} of a slow change can be told from "
-                  f"its motion; {LEAST_FREE:.0%} are needed")  # fmt: skip
+        reason = (
+            f"the camera moves along with time, so that only {test.free:.0%} of a slow change can be told from "
+            f"its motion; {LEAST_FREE:.0%} are needed"
+        )
         return _answer(UNDECIDED, reason, test.p, test.z, test.free)
     if test.p <= LEVEL:
         decision, reason = ON, f"a static model's error changes over time (p = {test.p:.3f})"
     elif held:
         decision = UNDECIDED
-        reason = (f"the cameras of {len(held)} positions move a little, and a static model's error does not clearly "
-                  f"change over time (p = {test.p:.3f})")  # fmt: skip
+        reason = (
+            f"the cameras of {len(held)} positions move a little, and a static model's error does not clearly "
+            f"change over time (p = {test.p:.3f})"
+        )
     else:
         decision, reason = OFF, f"a static model's error does not change over time (p = {test.p:.3f})"
     return _answer(decision, reason, test.p, test.z, test.free)

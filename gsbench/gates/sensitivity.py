@@ -128,9 +128,16 @@ class ProbedView:
     """A view, its image by the present model, and the derivatives from which errors are predicted."""
 
     def __init__(
-        self, model: GaussianModel, view: View, query: CameraTime, live: Gaussians3D, background: Tensor,
-        antialias: bool, draws: int, seed: int,
-    ) -> None:  # fmt: skip
+        self,
+        model: GaussianModel,
+        view: View,
+        query: CameraTime,
+        live: Gaussians3D,
+        background: Tensor,
+        antialias: bool,
+        draws: int,
+        seed: int,
+    ) -> None:
         """Draw the present Gaussians `live` of a view, and compute their scalar products; see `probe`."""
         self.model, self.query, self.live = model, query, live
         self.camera, self.background, self.antialias = view.camera, background, antialias

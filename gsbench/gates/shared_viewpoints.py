@@ -45,8 +45,11 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
     loose = sorted(v for group in of_one_position if len(group) == 1 for v in group)
     times = np.array([view.time for view in views], dtype=np.float64)
     span = float(np.ptp(times))
-    near = [group for group in _groups(loose, poses, NEAR)
-            if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span]  # fmt: skip
+    near = [
+        group
+        for group in _groups(loose, poses, NEAR)
+        if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span
+    ]
     held = near if 2 * sum(map(len, near)) > len(loose) else []
     return Viewpoints(fixed, held, sorted(set(loose).difference(*held)))
 

@@ -47,8 +47,10 @@ def gradient_products(views: Sequence[View], scene: Scene, seed: int, backend: s
     model.initialise(points, scene.extent, random)
     model.to(device)
     background = torch.tensor(scene.background, device=device)
-    groups = [{"params": [model.splats[name]], "lr": rate * (scene.extent if name == "means" else 1.0)}
-              for name, rate in RATES.items()]  # fmt: skip
+    groups = [
+        {"params": [model.splats[name]], "lr": rate * (scene.extent if name == "means" else 1.0)}
+        for name, rate in RATES.items()
+    ]
     adam = torch.optim.Adam(groups, eps=1e-15)
     fitted = [model.splats[name] for name in RATES]  # means first
     workers = model.backend.workers(fitted[0])

@@ -24,8 +24,11 @@ def available() -> bool:
 def native() -> ModuleType:
     """Return the compiled extension with the CPU kernels; raises InputError if it is not built."""
     if _native is None:
-        raise InputError("the native kernels are not built in this installation: reinstall with a C++20 compiler, "
-                         "or go on with raster.backend=reference", docs="install.md#without-a-compiler")  # fmt: skip
+        raise InputError(
+            "the native kernels are not built in this installation: reinstall with a C++20 compiler, "
+            "or go on with raster.backend=reference",
+            docs="install.md#without-a-compiler",
+        )
     return _native
 
 

@@ -39,8 +39,9 @@ def adam(
             raise InputError("adam: expected parameter of at least one dimension, got none")
         shape = {"drawn": parameter.shape[:1], "step": torch.Size()}.get(name, parameter.shape)
         if x.shape != shape or x.device != parameter.device:
-            raise InputError(f"adam: expected {name} of shape {list(shape)} on {parameter.device}, got "
-                             f"{list(x.shape)} on {x.device}")  # fmt: skip
+            raise InputError(
+                f"adam: expected {name} of shape {list(shape)} on {parameter.device}, got {list(x.shape)} on {x.device}"
+            )
     if not isinstance(betas, list | tuple) or len(betas) != 2:
         raise InputError(f"adam: expected two betas, got {betas!r:.80}")
     for name, number in (("rate", rate), ("eps", eps), ("betas", betas[0]), ("betas", betas[1])):
@@ -50,9 +51,20 @@ def adam(
     if not len(parameter):
         return
     gradient, drawn = in_rows([gradient, drawn])
-    slots = {"N": len(parameter), "width": parameter[0].numel(), "drawn": address(drawn), "gradient": address(gradient),
-             "rate": rate, "beta1": betas[0], "beta2": betas[1], "eps": eps, "step": address(step),
-             "out.parameter": address(parameter), "out.mean": address(mean), "out.square": address(square)}  # fmt: skip
+    slots = {
+        "N": len(parameter),
+        "width": parameter[0].numel(),
+        "drawn": address(drawn),
+        "gradient": address(gradient),
+        "rate": rate,
+        "beta1": betas[0],
+        "beta2": betas[1],
+        "eps": eps,
+        "step": address(step),
+        "out.parameter": address(parameter),
+        "out.mean": address(mean),
+        "out.square": address(square),
+    }
     library_of(parameter.device.type).call("adam", slots, parameter)
 
 
@@ -76,8 +88,10 @@ def adam_all(
     for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():
         for x, parameter in zip(listed, parameters, strict=True):
             if not (x.shape == parameter.shape and x.dtype == torch.float32 and x.is_cpu and x.is_contiguous()):
-                raise InputError(f"adam_all: expected {name} as contiguous float32 of shape {list(parameter.shape)} on "
-                                 f"the CPU, got {x.dtype} of shape {list(x.shape)} on {x.device}")  # fmt: skip
+                raise InputError(
+                    f"adam_all: expected {name} as contiguous float32 of shape {list(parameter.shape)} on "
+                    f"the CPU, got {x.dtype} of shape {list(x.shape)} on {x.device}"
+                )
     for first in range(0, len(parameters), MAX_ADAM):
         part = slice(first, first + MAX_ADAM)
         slots = {
@@ -103,8 +117,12 @@ def are_finite(arrays: Sequence[Tensor]) -> bool:
     for first in range(0, len(rows), MAX_ADAM):
         part = rows[first : first + MAX_ADAM]
         flags = part[0].new_zeros(1, dtype=torch.int64)
-        slots = {"count": len(part), "numbers": tuple([x.numel() for x in part]), "arrays": addresses(part),
-                 "out.flags": flags.data_ptr()}  # fmt: skip
+        slots = {
+            "count": len(part),
+            "numbers": tuple([x.numel() for x in part]),
+            "arrays": addresses(part),
+            "out.flags": flags.data_ptr(),
+        }
         library_of("cpu").call("flag_arrays", slots, flags)
         if flags.item():
             return False

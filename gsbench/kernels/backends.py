@@ -51,14 +51,19 @@ def resolve(name: str, device: str = "cpu") -> Backend:
         _warn(device)
         return BACKENDS[device] if device in AUTO.devices and _built(device) else REFERENCE
     if name == "cpu" and not kernels.available():
-        raise InputError("raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
-                         "or use raster.backend=reference", docs="install.md#without-a-compiler")  # fmt: skip
+        raise InputError(
+            "raster backend 'cpu' is not built in this installation: reinstall with a C++20 compiler, "
+            "or use raster.backend=reference",
+            docs="install.md#without-a-compiler",
+        )
     if name == "cuda" and not cuda.available():
         why = "no CUDA device was found" if cuda.built() else "it is not built here"
         raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference", docs="gpu.md#building")
     if name in AUTO.devices and device in AUTO.devices and name != device:
-        raise InputError(f"raster backend '{name}' does not render on device '{device}': use device={name}, "
-                         "or raster.backend=auto or reference")  # fmt: skip
+        raise InputError(
+            f"raster backend '{name}' does not render on device '{device}': use device={name}, "
+            "or raster.backend=auto or reference"
+        )
     return BACKENDS[name]
 
 
@@ -71,11 +76,15 @@ def _warn(device: str) -> None:
     if cuda.built() and not cuda.available():
         _warn_once("no CUDA device was found: the CUDA kernels of this installation are idle, the CPU renders")
     if device == "cpu" and not kernels.available():
-        _warn_once("the native kernels are not built in this installation: the CPU renders by the reference backend, "
-                   "which is slow; reinstall with a C++20 compiler, see docs/install.md")  # fmt: skip
+        _warn_once(
+            "the native kernels are not built in this installation: the CPU renders by the reference backend, "
+            "which is slow; reinstall with a C++20 compiler, see docs/install.md"
+        )
     if device == "cuda" and not cuda.built():
-        _warn_once("the CUDA kernels are not built in this installation: the GPU renders by the reference backend, "
-                   "which is slow; see docs/gpu.md")  # fmt: skip
+        _warn_once(
+            "the CUDA kernels are not built in this installation: the GPU renders by the reference backend, "
+            "which is slow; see docs/gpu.md"
+        )
 
 
 @functools.cache

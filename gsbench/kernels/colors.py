@@ -17,12 +17,16 @@ def _bases(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int
     """Return the number of SH coefficients that are stored for each frequency in time."""
     shN, degree, waves = tensors["shN"], numbers["degree"], numbers["waves"]
     if degree not in range(4) or waves not in range(1, MAX_WAVES + 1):
-        raise InputError(f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "
-                         f"degree={degree!r:.40} and waves={waves!r:.40}")  # fmt: skip
+        raise InputError(
+            f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "
+            f"degree={degree!r:.40} and waves={waves!r:.40}"
+        )
     stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
     if stored % waves or stored // waves < (degree + 1) ** 2:
-        raise InputError(f"show_colors: expected (degree + 1)^2 coefficients for each frequency, got degree={degree}, "
-                         f"waves={waves} and {stored} coefficients")  # fmt: skip
+        raise InputError(
+            f"show_colors: expected (degree + 1)^2 coefficients for each frequency, got degree={degree}, "
+            f"waves={waves} and {stored} coefficients"
+        )
     if waves > 1 and "times" not in tensors:
         raise InputError("show_colors: expected times and a time, as colours change with them (waves > 1)")
     return {"bases": stored // waves}

@@ -9,8 +9,11 @@ _LINE = re.compile(r"^constexpr (int|float|double) (\w+) = ([\d.e-]+)f?(?: / ([\
 def _constants(header: str, *kinds: str) -> dict[str, float]:
     """Return the constants of these types in a C++ header of this package, by name."""
     text = resources.files("gsbench.kernels").joinpath(header).read_text()
-    return {name: float(value) / float(divisor or 1)
-            for type_, name, value, divisor in _LINE.findall(text) if type_ in kinds}  # fmt: skip
+    return {
+        name: float(value) / float(divisor or 1)
+        for type_, name, value, divisor in _LINE.findall(text)
+        if type_ in kinds
+    }
 
 
 _thresholds = _constants("math/thresholds.h", "float", "double")

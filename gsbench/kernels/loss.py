@@ -23,12 +23,14 @@ class _Similarity(Operation):
     def __init__(self) -> None:
         super().__init__(
             "l1_ssim",
-            inputs={"image": Input("?one height width 3"),
-                    "target": Input("?one height width 3", Gradient.REFUSED, _TARGET)},
+            inputs={
+                "image": Input("?one height width 3"),
+                "target": Input("?one height width 3", Gradient.REFUSED, _TARGET),
+            },
             outputs={"loss": Output(""), "gradient": Output("numbers", gradient=False)},
             numbers={"ssim_weight": float, "with_gradient": bool},
             derive=lambda tensors, numbers: {"numbers": tensors["image"].numel() if numbers["with_gradient"] else 0},
-        )  # fmt: skip
+        )
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         slots = self.match(tensors, numbers).copy()
@@ -41,9 +43,14 @@ class _Similarity(Operation):
         if library.needs_scratch and slots["with_gradient"]:
             scratch = allocate("derivatives of SSIM", image, (3, 3, height, width))
         in_bytes = target.dtype == torch.uint8
-        slots |= {"image": image.data_ptr(), "target": 0 if in_bytes else target.data_ptr(),
-                  "target_bytes": target.data_ptr() if in_bytes else 0, "out.loss": parts.data_ptr(),
-                  "out.gradient": gradient.data_ptr(), "out.scratch": address(scratch)}  # fmt: skip
+        slots |= {
+            "image": image.data_ptr(),
+            "target": 0 if in_bytes else target.data_ptr(),
+            "target_bytes": target.data_ptr() if in_bytes else 0,
+            "out.loss": parts.data_ptr(),
+            "out.gradient": gradient.data_ptr(),
+            "out.scratch": address(scratch),
+        }
         library.call(self.name, slots, image)
         return [parts.sum() if parts.shape[0] > 1 else parts[0], gradient], slots
 
@@ -51,9 +58,14 @@ class _Similarity(Operation):
         return {}
 
     def backward(
-        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
-    ) -> list[Tensor | None]:  # fmt: skip
+        self,
+        tensors: Tensors,
+        slots: Slots,
+        outputs: Tensors,
+        upstream: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+        sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:
         by_loss = upstream[0]
         return [None if by_loss is None else (by_loss * outputs[1]).view_as(tensors[0]), None]
 
@@ -80,6 +92,8 @@ def l1_ssim(
     check_tensor(target, "l1_ssim: target", _TARGET)
     check_number(ssim_weight, "l1_ssim: ssim_weight", 0, 1)
     if image.dim() not in (3, 4) or image.shape[-1] != 3 or target.shape != image.shape or not image.numel():
-        raise InputError(f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "
-                         f"{list(image.shape)} and {list(target.shape)}")  # fmt: skip
+        raise InputError(
+            f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "
+            f"{list(image.shape)} and {list(target.shape)}"
+        )
     return _similarity(image, target, ssim_weight, image.requires_grad and torch.is_grad_enabled())[0]

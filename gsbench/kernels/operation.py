@@ -275,8 +275,10 @@ class Operation:
         Raises:
             InputError: an argument does not match the declaration.
         """
-        call = (*numbers, *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout)
-                            for i, x in enumerate(tensors)])  # fmt: skip
+        call = (
+            *numbers,
+            *[(x.dim() if i in self._lists else x.shape, x.dtype, x.device, x.layout) for i, x in enumerate(tensors)],
+        )
         slots = self._known.get(call)  # training calls an operation with few different shapes
         if slots is None:
             slots = self._match(tensors, numbers)
@@ -312,8 +314,9 @@ class Operation:
                 known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
                 raise InputError(f"{self.name}: expected {key} of shape {known}, got {actual}")
             if x.device != device:
-                raise InputError(f"{self.name}: expected {key} on {device}, as {next(iter(self.inputs))} is, got it on "
-                                 f"{x.device}")  # fmt: skip
+                raise InputError(
+                    f"{self.name}: expected {key} on {device}, as {next(iter(self.inputs))} is, got it on {x.device}"
+                )
         return slots
 
     def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
@@ -358,8 +361,14 @@ class _Eager(torch.autograd.Function):
         slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
         gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
         # Unlike the registered operator, it makes no zeros that nobody asked for.
-        return None, None, *[(torch.zeros_like(x) if g is None else g) if asked else None
-                             for x, g, asked in zip(tensors, gradients, wanted, strict=True)]  # fmt: skip
+        return (
+            None,
+            None,
+            *[
+                (torch.zeros_like(x) if g is None else g) if asked else None
+                for x, g, asked in zip(tensors, gradients, wanted, strict=True)
+            ],
+        )
 
 
 def _filled(shape: Shape, slots: Slots) -> tuple[int, ...]:
@@ -431,9 +440,11 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     forward_op = torch.library.custom_op(f"gsbench::{name}", forward, mutates_args=(), schema=schema)
     backward_op = torch.library.custom_op(
-        f"gsbench::{name}_backward", backward, mutates_args=(),
+        f"gsbench::{name}_backward",
+        backward,
+        mutates_args=(),
         schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] upstream, bool[] wanted) -> Tensor[]",
-    )  # fmt: skip
+    )
     forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
     backward_op.register_fake(lambda tensors, *_: operation.fake_backward(tensors))
     forward_op.register_autograd(gradient, setup_context=keep)

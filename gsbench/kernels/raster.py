@@ -105,8 +105,13 @@ def _sizes_of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dic
     if sets not in (1, C):
         raise InputError(f"blend: expected one set of colours, or one a camera, got {sets} for {C} cameras")
     tiles = C * count_tiles(numbers["width"], numbers["height"])
-    return {"color_per_camera": int(C > 1 and sets == C), "lists": tiles + 1, "D": D,
-            "sums": GEOMETRY + ("shapes" in tensors) + D, "state": tiles // C * TILE_PIXELS}  # fmt: skip
+    return {
+        "color_per_camera": int(C > 1 and sets == C),
+        "lists": tiles + 1,
+        "D": D,
+        "sums": GEOMETRY + ("shapes" in tensors) + D,
+        "state": tiles // C * TILE_PIXELS,
+    }
 
 
 _blend = Operation(
@@ -207,8 +212,10 @@ def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> 
 def _checked_count(pairs: int) -> int:
     """Return the number of tile intersections; raise InputError if int32 cannot count them."""
     if pairs > MAX_PAIRS:
-        raise InputError(f"{pairs} pairs of a tile and a Gaussian are more than {MAX_PAIRS}: "
-                         "draw fewer cameras at once, a smaller image, or fewer large Gaussians")  # fmt: skip
+        raise InputError(
+            f"{pairs} pairs of a tile and a Gaussian are more than {MAX_PAIRS}: "
+            "draw fewer cameras at once, a smaller image, or fewer large Gaussians"
+        )
     return pairs
 
 
@@ -247,8 +254,14 @@ def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Te
     keys, indices, sorted_keys, order = allocate("depths to sort", like, (4, count), torch.int32).unbind()
     ends = allocate("numbers of tiles", like, (count + 1,), torch.int64)
     scratch = _scratch(library, count, like)
-    out = {"keys": keys, "indices": indices, "sorted_keys": sorted_keys, "order": order, "ends": ends,
-           "scratch": scratch}  # fmt: skip
+    out = {
+        "keys": keys,
+        "indices": indices,
+        "sorted_keys": sorted_keys,
+        "order": order,
+        "ends": ends,
+        "scratch": scratch,
+    }
     slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
     library.call("count_tiles", slots | {"out.scratch_bytes": len(scratch)}, like)
     ends[-1:].copy_(flags)
@@ -275,8 +288,12 @@ def _list_on_gpu(
     out = dict(zip(("tiles", "splats", "sorted_tiles", "ids"), lists, strict=True))
     out |= {"offsets": offsets, "scratch": scratch}
     slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
-    slots |= {"order": address(by_depth[0]), "ends": address(by_depth[1]), "pairs": len(ids),
-              "out.scratch_bytes": len(scratch)}  # fmt: skip
+    slots |= {
+        "order": address(by_depth[0]),
+        "ends": address(by_depth[1]),
+        "pairs": len(ids),
+        "out.scratch_bytes": len(scratch),
+    }
     library.call("fill_tiles", slots, like)
     return Bins(offsets, ids)
 

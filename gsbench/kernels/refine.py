@@ -35,8 +35,17 @@ class _Inputs(NamedTuple):
         """Return the inputs by name from the list of tensors; `intervals` and `time` are None if both are empty."""
         *values, weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time = tensors
         left_out = intervals.shape == time.shape == (0,)
-        return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma,
-                   None if left_out else intervals, None if left_out else time)  # fmt: skip
+        return cls(
+            values,
+            weight_in,
+            bias_in,
+            weight_out,
+            bias_out,
+            units,
+            gamma,
+            None if left_out else intervals,
+            None if left_out else time,
+        )
 
     def named(self) -> list[tuple[str, Tensor]]:
         """Return all tensors in order, each with its name for error messages."""
@@ -95,9 +104,14 @@ class _Refine(Operation):
         return out, slots
 
     def backward(
-        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool], sums: dict[int, Tensor] | None = None,
-    ) -> list[Tensor | None]:  # fmt: skip
+        self,
+        tensors: Tensors,
+        slots: Slots,
+        outputs: Tensors,
+        upstream: Sequence[Tensor | None],
+        wanted: Sequence[bool],
+        sums: dict[int, Tensor] | None = None,
+    ) -> list[Tensor | None]:
         values, weights = slots["rows"], slots["layers"]
         like, networks = values[0], slots["networks"]
         library, features = library_of(like.device.type), networks - 1
@@ -120,8 +134,14 @@ class _Refine(Operation):
         inputs = _Inputs.of(tensors)
         values, weights = in_rows(inputs.values), inputs.layers()
         intervals = None if inputs.intervals is None else in_rows([inputs.intervals])[0]
-        slots |= {"values": addresses(values), "intervals": address(intervals), "time": address(inputs.time),
-                  "rows": values, "layers": weights, "kept": (intervals, inputs.time)}  # fmt: skip
+        slots |= {
+            "values": addresses(values),
+            "intervals": address(intervals),
+            "time": address(inputs.time),
+            "rows": values,
+            "layers": weights,
+            "kept": (intervals, inputs.time),
+        }
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
@@ -135,11 +155,15 @@ class _Refine(Operation):
         networks, rest = divmod(len(inputs.weight_in), HIDDEN)
         last = networks - 1
         if rest or not 1 <= last < len(moved):
-            raise InputError(f"refine: expected {HIDDEN} rows of weight_in for each feature and {HIDDEN} for all other "
-                             f"values, got {len(inputs.weight_in)} for {len(moved)} values")  # fmt: skip
+            raise InputError(
+                f"refine: expected {HIDDEN} rows of weight_in for each feature and {HIDDEN} for all other "
+                f"values, got {len(inputs.weight_in)} for {len(moved)} values"
+            )
         if networks > MAX_NETWORKS or len(moved) > MAX_VALUES:
-            raise InputError(f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
-                             f"got {networks} and {len(moved)}")  # fmt: skip
+            raise InputError(
+                f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
+                f"got {networks} and {len(moved)}"
+            )
         widths = [*moved[:last], sum(moved[last:])]
         like, features, outputs, hidden = inputs.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
         rows = first_rows("refine: rows", numbers[0], like)
@@ -150,10 +174,20 @@ class _Refine(Operation):
             shapes += [(rows, 2), ()]
         for (name, x), shape in zip(listed, shapes, strict=True):
             if tuple(x.shape) != shape or x.device != like.device:
-                raise InputError(f"refine: expected {name} of shape {list(shape)} on {like.device}, got "
-                                 f"{list(x.shape)} on {x.device}")  # fmt: skip
-        return {"N": len(like), "refined": rows, "features": features, "networks": networks, "arrays": len(moved),
-                "outputs": outputs, "widths": tuple(widths), "value_widths": tuple(moved)}  # fmt: skip
+                raise InputError(
+                    f"refine: expected {name} of shape {list(shape)} on {like.device}, got "
+                    f"{list(x.shape)} on {x.device}"
+                )
+        return {
+            "N": len(like),
+            "refined": rows,
+            "features": features,
+            "networks": networks,
+            "arrays": len(moved),
+            "outputs": outputs,
+            "widths": tuple(widths),
+            "value_widths": tuple(moved),
+        }
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         self._match(tensors, numbers)
@@ -188,5 +222,6 @@ def refine(
         raise InputError("refine: expected intervals and time together, got one of them")
     nothing = gamma.new_empty(0) if isinstance(gamma, Tensor) else gamma  # another type is refused with the others
     when = (nothing, nothing) if intervals is None else (intervals, time)
-    return _refine(*values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when,
-                   EVERY_ROW if rows is None else rows)  # fmt: skip
+    return _refine(
+        *values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when, EVERY_ROW if rows is None else rows
+    )

@@ -145,13 +145,17 @@ def _retry(folder: Path, launch: list[str]) -> int:
     stop.listen()
     folder = folder.resolve()  # runs are launched from the folder that the first command was typed in
     experiment = read(folder)
-    single = [run for run in status(experiment)
-              if run.state in BROKEN and identity(run.overrides) not in experiment.planned]  # fmt: skip
+    single = [
+        run for run in status(experiment) if run.state in BROKEN and identity(run.overrides) not in experiment.planned
+    ]
     count = retry(experiment, launch)
     for run in single[:MOST_COMMANDS]:
         words = " ".join(map(shlex.quote, (*run.overrides, f"results={quoted_value(str(folder.parent))}")))
-        print(f"gsbench.launch: not of a sweep, so only its own command starts it again: python -m gsbench "
-              f"{printable(words)}", file=sys.stderr)  # fmt: skip
+        print(
+            f"gsbench.launch: not of a sweep, so only its own command starts it again: python -m gsbench "
+            f"{printable(words)}",
+            file=sys.stderr,
+        )
     if len(single) > MOST_COMMANDS:
         print(f"gsbench.launch: and {len(single) - MOST_COMMANDS} more runs of no sweep", file=sys.stderr)
     if not count and not single:

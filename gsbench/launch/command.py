@@ -76,8 +76,9 @@ def parse(words: Sequence[str]) -> Command:
     unknown = [word for word in others if word.startswith("-")]
     asks = any(word in QUESTIONS for word in unknown)
     if unknown and not asks:
-        raise InputError(f"{unknown[0]}: expected -m, --config-dir=FOLDER or a question, as in python -m gsbench "
-                         f"+exp=mini --cfg job")  # fmt: skip
+        raise InputError(
+            f"{unknown[0]}: expected -m, --config-dir=FOLDER or a question, as in python -m gsbench +exp=mini --cfg job"
+        )
     return Command(others, options.multirun, options.config_dir, asks)
 
 
@@ -123,8 +124,10 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
     axes_first = dict(map(_values, parser.parse_overrides(axes))) | values
     if all_scenes:
         if not base.data.scenes:
-            raise InputError("data.scenes: expected the names of scenes, got an empty list: set them, or "
-                             "scene=custom scene.name=FOLDER")  # fmt: skip
+            raise InputError(
+                "data.scenes: expected the names of scenes, got an empty list: set them, or "
+                "scene=custom scene.name=FOLDER"
+            )
         axes_first.pop("scene", None)
         axes_first["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
     return [list(run) for run in itertools.product(*axes_first.values())], True
@@ -164,15 +167,20 @@ def check_complete(config: DictConfig) -> None:
     """Raise InputError if a composed config names no experiment, no scene or no folder of data, with what to type."""
     if OmegaConf.is_missing(config, "experiment"):
         experiments = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
-        raise InputError(f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
-                         f"{experiments}. What each is: python -m gsbench --help")  # fmt: skip
+        raise InputError(
+            f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
+            f"{experiments}. What each is: python -m gsbench --help"
+        )
     if OmegaConf.is_missing(config.scene, "name"):
         raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
     if OmegaConf.is_missing(config.data, "root"):
-        raise InputError(f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
-                         f"{config.data.dataset} ({', '.join(config.data.scenes)}), each with "
-                         f"transforms_{{train,val,test}}.json and the images they name. "
-                         f"Published at: {config.data.published}", docs="data.md#what-is-read")  # fmt: skip
+        raise InputError(
+            f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
+            f"{config.data.dataset} ({', '.join(config.data.scenes)}), each with "
+            f"transforms_{{train,val,test}}.json and the images they name. "
+            f"Published at: {config.data.published}",
+            docs="data.md#what-is-read",
+        )
 
 
 def explain(error: Exception) -> str:
@@ -210,8 +218,10 @@ def _check_single(values: Mapping[str, Sequence[str]]) -> None:
     for name, words in values.items():
         if len(words) > 1:
             text = ",".join(word.partition("=")[2] for word in words)
-            raise InputError(f"{name}={text}: commas separate the values of a sweep: type -m too for a run of each, or "
-                             f"{typed(name, text, several=False)} for one value")  # fmt: skip
+            raise InputError(
+                f"{name}={text}: commas separate the values of a sweep: type -m too for a run of each, or "
+                f"{typed(name, text, several=False)} for one value"
+            )
 
 
 def _check_group(name: str, choices: str) -> None:

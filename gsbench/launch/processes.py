@@ -132,8 +132,11 @@ def _report_end(code: int, overrides: str, request: Request) -> None:
     elif code < 0:
         why = " (memory may have run out)" if signal_number == signal.SIGKILL else ""
         name = signal.Signals(signal_number).name
-        print(f"\ngsbench: error: {printable(overrides)}: its process was ended by {name}{why}: "
-              "the same command continues from its last checkpoint", file=sys.stderr)  # fmt: skip
+        print(
+            f"\ngsbench: error: {printable(overrides)}: its process was ended by {name}{why}: "
+            "the same command continues from its last checkpoint",
+            file=sys.stderr,
+        )
 
 
 def _end(running: Running, signal_number: int) -> None:

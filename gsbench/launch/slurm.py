@@ -58,12 +58,22 @@ def launch(configs: Sequence["RunConfig"], planned: Plan, folder: Path) -> None:
         InputError: this is no machine of a cluster, Slurm refuses the jobs, or the container image is missing.
     """
     if shutil.which("sbatch") is None:
-        raise InputError("+launch=slurm: expected a machine of a Slurm cluster, sbatch is not on PATH: use its login "
-                         "node, or +launch=parallel", docs="runs.md#slurm-from-a-login-node-to-the-table")  # fmt: skip
+        raise InputError(
+            "+launch=slurm: expected a machine of a Slurm cluster, sbatch is not on PATH: use its login "
+            "node, or +launch=parallel",
+            docs="runs.md#slurm-from-a-login-node-to-the-table",
+        )
     settings, script = configs[0].config.launch, folder / "job.sh"
     command = shlex.quote(sys.executable) if settings.container is None else in_container(configs, folder)
-    script.write_text(SCRIPT.format(setup=settings.setup, command=command, folder=shlex.quote(str(folder)),
-                                    stopped=STOPPED, requeues=settings.requeues))  # fmt: skip
+    script.write_text(
+        SCRIPT.format(
+            setup=settings.setup,
+            command=command,
+            folder=shlex.quote(str(folder)),
+            stopped=STOPPED,
+            requeues=settings.requeues,
+        )
+    )
     options = {
         "job-name": configs[0].config.experiment,
         "partition": settings.partition,
@@ -78,8 +88,11 @@ def launch(configs: Sequence["RunConfig"], planned: Plan, folder: Path) -> None:
         "requeue": True,  # when its node fails
         **settings.sbatch,
     }
-    flags = [f"--{name}" if value is True else f"--{name}={value}"
-             for name, value in options.items() if value is not None and value is not False]  # fmt: skip
+    flags = [
+        f"--{name}" if value is True else f"--{name}={value}"
+        for name, value in options.items()
+        if value is not None and value is not False
+    ]
     answer = ask("sbatch", "--parsable", *flags, str(script), seconds=SUBMITTING)
     if isinstance(answer, str) or answer.returncode:
         reason = answer if isinstance(answer, str) else answer.stderr
@@ -101,16 +114,21 @@ def in_container(configs: Sequence["RunConfig"], folder: Path) -> str:
     settings = configs[0].config.launch
     image = Path(settings.container).absolute()
     if not image.exists():
-        raise InputError(f"launch.container: expected an image, a file or folder that all nodes see, got '{image}', "
-                         "which does not exist: build one", docs="install.md#in-a-container")  # fmt: skip
+        raise InputError(
+            f"launch.container: expected an image, a file or folder that all nodes see, got '{image}', "
+            "which does not exist: build one",
+            docs="install.md#in-a-container",
+        )
     config_dir = plan.read(folder / plan.FILE_NAME).config_dir
     paths = {os.getcwd(), *filter(None, (config_dir, os.environ.get("TORCH_HOME")))}
     paths |= {path for config in configs for path in _paths(config.config)}
     binds = sorted({os.path.abspath(path) for path in paths if os.path.exists(path)})
     for path in binds:
         if "," in path or ":" in path:
-            raise InputError(f"launch.container: expected folders without ',' and ':', which part the folders that are "
-                             f"bound, got '{path}': rename it")  # fmt: skip
+            raise InputError(
+                f"launch.container: expected folders without ',' and ':', which part the folders that are "
+                f"bound, got '{path}': rename it"
+            )
     gpu = " --nv" if settings.gpus else ""
     bound = shlex.join(["--bind", ",".join(binds), "--pwd", os.getcwd(), str(image), "python3"])
     return f"{settings.container_command}{gpu} {bound}"

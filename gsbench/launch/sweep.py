@@ -44,10 +44,13 @@ def launch(configs: Sequence[RunConfig], config_dir: Path | None) -> Outcome:
     try:
         plan.write(planned, folder)
     except OSError as error:
-        raise InputError(f"results: expected a folder that can be written, got '{first.results}': "
-                         f"{error.strerror}") from None  # fmt: skip
-    print(f"{len(runs)} runs; their status: python -m gsbench.launch status {shlex.quote(_short(experiment))}",
-          file=sys.stderr)  # fmt: skip
+        raise InputError(
+            f"results: expected a folder that can be written, got '{first.results}': {error.strerror}"
+        ) from None
+    print(
+        f"{len(runs)} runs; their status: python -m gsbench.launch status {shlex.quote(_short(experiment))}",
+        file=sys.stderr,
+    )
     try:
         if planned.launcher == "slurm":
             slurm.launch(configs, planned, folder)
@@ -96,8 +99,11 @@ def retry(experiment: Experiment, more: Sequence[str]) -> int:
         try:
             _launch_again(experiment, group, more)
         except InputError as error:
-            print(f"gsbench.launch: {len(group)} runs of {group[0].folder / plan.FILE_NAME} cannot be launched again: "
-                  f"{printable(error)}", file=sys.stderr)  # fmt: skip
+            print(
+                f"gsbench.launch: {len(group)} runs of {group[0].folder / plan.FILE_NAME} cannot be launched again: "
+                f"{printable(error)}",
+                file=sys.stderr,
+            )
     return sum(map(len, groups.values()))
 
 
@@ -111,11 +117,15 @@ def _launch_again(experiment: Experiment, group: Sequence[PlannedRun], more: Seq
     try:
         os.chdir(planned.cwd)
     except (OSError, ValueError) as error:
-        raise InputError(f"{planned.cwd!r:.200}, the folder where its command was typed and its paths start: "
-                         f"{getattr(error, 'strerror', error)}") from None  # fmt: skip
+        raise InputError(
+            f"{planned.cwd!r:.200}, the folder where its command was typed and its paths start: "
+            f"{getattr(error, 'strerror', error)}"
+        ) from None
     config_dir = Path(planned.config_dir) if planned.config_dir else None
     with hydra_with(config_dir):
-        configs = [compose_run([*(word for word in run.overrides if not word.startswith("results=")), results, *more])
-                   for run in group]  # fmt: skip
+        configs = [
+            compose_run([*(word for word in run.overrides if not word.startswith("results=")), results, *more])
+            for run in group
+        ]
         print(f"{len(group)} runs again, launch={configs[0].config.launch.by}", file=sys.stderr)
         launch(configs, config_dir)

@@ -37,5 +37,7 @@ def decides(psnr: float) -> bool:
 def sentence(names: Sequence[str]) -> str:
     """Return a sentence that names the views whose PSNR is capped; there is at least one."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return (f"PSNR of {', '.join(names[:NAMED])}{more} is infinite or nearly so and counts as {MOST_PSNR:.0f} dB "
-            f"(docs/protocol.md#exact-views)")  # fmt: skip
+    return (
+        f"PSNR of {', '.join(names[:NAMED])}{more} is infinite or nearly so and counts as {MOST_PSNR:.0f} dB "
+        f"(docs/protocol.md#exact-views)"
+    )

@@ -138,8 +138,11 @@ class RegionScores:
 
     def of_record(self) -> dict[str, Region]:
         """Return the regions for the record of the run."""
-        return {name: Region(each.source, len(each.masks), each.share, each.digest)
-                for name, each in self.regions.items() if each.masks}  # fmt: skip
+        return {
+            name: Region(each.source, len(each.masks), each.share, each.digest)
+            for name, each in self.regions.items()
+            if each.masks
+        }
 
 
 def _large(masks: dict[str, Mask], source: str) -> Regions:
@@ -152,8 +155,9 @@ def _large(masks: dict[str, Mask], source: str) -> Regions:
 def _by_camera(views: Sequence[View]) -> list[list[View]]:
     """Group the views by equal cameras and image sizes."""
     cameras = [view.camera for view in views]
-    keys = np.array([[each.width, each.height, *each.viewmat.flatten().tolist(), *each.K.flatten().tolist()]
-                     for each in cameras])  # fmt: skip
+    keys = np.array(
+        [[each.width, each.height, *each.viewmat.flatten().tolist(), *each.K.flatten().tolist()] for each in cameras]
+    )
     groups, left = [], np.arange(len(views))
     while len(left):
         same = (np.abs(keys[left] - keys[left[0]]) <= SAME).all(1)

@@ -194,8 +194,9 @@ class GaussianModel(nn.Module, ABC):
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):
-            return show_colors(raw["sh0"], raw["shN"], means, opacities, center=query.center, degree=degree,
-                               orders=self.orders)[0]  # fmt: skip
+            return show_colors(
+                raw["sh0"], raw["shN"], means, opacities, center=query.center, degree=degree, orders=self.orders
+            )[0]
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.orders)
 
     # ---- what every model does
@@ -384,11 +385,15 @@ class GaussianModel(nn.Module, ABC):
         got = {name: list(value.shape) if isinstance(value, Tensor) else value for name, value in state.items()}
         for name in sorted(expected.keys() | got.keys()):
             if name not in expected or expected[name] != got.get(name):
-                raise InputError(f"checkpoint: not of this model: expected {name} of shape "
-                                 f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}")  # fmt: skip
+                raise InputError(
+                    f"checkpoint: not of this model: expected {name} of shape "
+                    f"{expected.get(name, 'none')}, got {got.get(name, 'none')!s:.60}"
+                )
             if state[name].dtype != present[name].dtype or state[name].layout != torch.strided:
-                raise InputError(f"checkpoint: not of this model: expected {name} of {present[name].dtype}, "
-                                 f"got {state[name].dtype}, {state[name].layout}")  # fmt: skip
+                raise InputError(
+                    f"checkpoint: not of this model: expected {name} of {present[name].dtype}, "
+                    f"got {state[name].dtype}, {state[name].layout}"
+                )
         for name, parameter in self.splats.items():
             parameter.data = torch.empty(state[f"splats.{name}"].shape, dtype=parameter.dtype, device=parameter.device)
         self.load_state_dict(state)

@@ -36,7 +36,7 @@ class BetaModel(GaussianModel):
 
     The distance r is measured by the projected covariance, so a profile ends at one standard deviation. It looks like a
     Gaussian whose standard deviations are smaller by sqrt(2 b). Sizes are softplus(x) of their parameters x.
-    """  # fmt: skip
+    """
 
     initial_opacity: ClassVar[float] = 0.5
 
@@ -149,7 +149,7 @@ class UniversalBetaModel(BetaModel):
 
     So b = 4 gives the conditional Gaussian of 7DGS, and a small exponent lets time or direction move and hide the
     Gaussian less. Gradients flow through d, unlike in the authors' code.
-    """  # fmt: skip
+    """
 
     observes: ClassVar[tuple[str, ...]] = ("time", "direction")
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")

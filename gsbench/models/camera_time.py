@@ -55,8 +55,9 @@ class CameraTime(NamedTuple):
         if isinstance(time, Tensor):
             check_tensor(time, "query: time", (center.dtype,))
             if time.dim() or time.device != center.device:
-                raise InputError(f"query: time: expected a number on {center.device}, got {list(time.shape)} on "
-                                 f"{time.device}")  # fmt: skip
+                raise InputError(
+                    f"query: time: expected a number on {center.device}, got {list(time.shape)} on {time.device}"
+                )
         elif time is not None:
             check_number(time, "query: time")
             time = center.new_full((), float(time))  # an int beyond 64 bits is a number too

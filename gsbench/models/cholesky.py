@@ -402,8 +402,10 @@ class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
         self.joint_gate = joint_gate
         if joint_gate:
             if not torch.equal(self.log_lambda["time"], self.log_lambda["direction"]):
-                raise InputError(f"joint_gate: expected lambda_d equal to lambda_t, got {options['lambda_d']} and "
-                                 f"{options['lambda_t']}: a joint gate has one lambda")  # fmt: skip
+                raise InputError(
+                    f"joint_gate: expected lambda_d equal to lambda_t, got {options['lambda_d']} and "
+                    f"{options['lambda_t']}: a joint gate has one lambda"
+                )
             del self.log_lambda["direction"]
 
     def uses_kernel(self, raw: Raw) -> bool:

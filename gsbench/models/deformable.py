@@ -35,7 +35,7 @@ class DeformableModel(Gaussians3DModel):
     No gradient flows through the position that the field reads. A scale exp(s) + ds may become negative, as in the
     authors' code: its magnitude is the size, because the covariance has its square, and 0 makes a flat Gaussian.
     Density control sees the canonical Gaussians, which alone are drawn during the warm-up.
-    """  # fmt: skip
+    """
 
     observes: ClassVar[tuple[str, ...]] = ("time",)
     warm_up = 2_250  # the authors': 3,000 of 40,000

@@ -127,8 +127,9 @@ class GatedModel(GaussianModel):
             key, shape = f"splats.{name}", (len(effect_sets.orders), *self.splats[name].shape[1:])
             packed, used = state.get(key), mask.expand(shape)
             if not isinstance(packed, Tensor) or tuple(packed.shape) != (int(used.sum()),):
-                raise InputError(f"checkpoint: expected {key} as the {int(used.sum())} entries that matter to its "
-                                 f"effect sets")  # fmt: skip
+                raise InputError(
+                    f"checkpoint: expected {key} as the {int(used.sum())} entries that matter to its effect sets"
+                )
             unpacked[key] = packed.new_full(shape, self.constant(name))
             unpacked[key][used] = packed
         return unpacked
@@ -165,12 +166,16 @@ def as_gated(model: GaussianModel) -> GatedModel:
         return model
     name = type(model).__name__
     if isinstance(model, GatedModel):
-        cure = (f"{name} inherits its methods for gates: see that they know all of its parameters, and write class "
-                f"{name}(.., gates=True)")  # fmt: skip
+        cure = (
+            f"{name} inherits its methods for gates: see that they know all of its parameters, and write class "
+            f"{name}(.., gates=True)"
+        )
     else:
         cure = f"{name} is no GatedModel: make it one"
-    raise InputError(f"effects.gate: expected a model that gates can simplify, {cure}, or use effects.gate=off",
-                     docs="adding_a_model.md")  # fmt: skip
+    raise InputError(
+        f"effects.gate: expected a model that gates can simplify, {cure}, or use effects.gate=off",
+        docs="adding_a_model.md",
+    )
 
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
@@ -191,6 +196,7 @@ def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
     orders = part("orders", (N,), torch.uint8).to(torch.int32)
     intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in stored else None
     if stored or not bool((orders <= MOST_PACKED).all()) or not 0 <= refined <= conditioned <= N:
-        raise InputError(f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders "
-                         f"that there are not")  # fmt: skip
+        raise InputError(
+            f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders that there are not"
+        )
     return EffectSets(refined, conditioned, orders, intervals)

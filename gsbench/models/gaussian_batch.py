@@ -57,6 +57,8 @@ def joined_exponents(first: Tensor | None, second: Tensor | None) -> Tensor | No
     if first is None and second is None:
         return None
     if first is None or second is None:
-        raise InputError("beta_exponents: expected every row of a slice to have one or none to have one, got some: "
-                         "let `condition` and `static` of the model agree")  # fmt: skip
+        raise InputError(
+            "beta_exponents: expected every row of a slice to have one or none to have one, got some: "
+            "let `condition` and `static` of the model agree"
+        )
     return torch.cat([first, second])

@@ -178,8 +178,17 @@ class Gaussians4DModel(JointModel, gates=True):
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):
             timed = {"times": raw["times"], "time": query.time} if waves > 1 else {}
-            return show_colors(sh0, raw["shN"], means, opacities, center=query.center, degree=degree, waves=waves,
-                               orders=self.orders, **timed)[0]  # fmt: skip
+            return show_colors(
+                sh0,
+                raw["shN"],
+                means,
+                opacities,
+                center=query.center,
+                degree=degree,
+                waves=waves,
+                orders=self.orders,
+                **timed,
+            )[0]
         coefficients = torch.cat([sh0, raw["shN"]], 1).unflatten(1, (waves, -1))
         directions = unit(means - query.center)
         return sh_time_colors(coefficients, directions, degree, query.time - raw["times"][:, 0], self.orders)

@@ -80,7 +80,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         mean = mu_p + v (t - mu_t)      opacity = sigmoid(o) exp(-1/2 ((t - mu_t) / s)^2)      cov = R S S^T R^T
 
     A velocity is the movement during the whole time range [0, 1], in world units.
-    """  # fmt: skip
+    """
 
     observes = ("time",)
     centers = ("means", "times")
@@ -141,7 +141,7 @@ class DirectModel(MovingGaussians3D, gates=True):
     The learned parameters of motion are Theta [3, 4] and Lam. L is lower triangular over direction and has one entry
     for time. Lam has one number in [0, 1] for the three columns of direction and one for time. No gradient flows
     through d.
-    """  # fmt: skip
+    """
 
     observes = ("time", "direction")
     centers = ("means", "times", "directions")
@@ -252,7 +252,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         cov     = (I + A) S S^T (I + A)^T, for all times and directions
 
     No gradient flows through d. L is lower triangular over direction and has one entry for time.
-    """  # fmt: skip
+    """
 
     observes: ClassVar[tuple[str, ...]] = ("time", "direction")
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")

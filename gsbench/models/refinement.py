@@ -74,8 +74,18 @@ class Refinement(nn.Module):
         """Return the raw parameters plus the outputs of AGR's networks at a time."""
         if by_kernel:
             gamma = encode_time(time, self.octaves)
-            return refine(values, self.weight_in, self.bias_in, self.weight_out, self.bias_out, self.units, gamma,
-                          rows=rows, intervals=intervals, time=None if intervals is None else time)  # fmt: skip
+            return refine(
+                values,
+                self.weight_in,
+                self.bias_in,
+                self.weight_out,
+                self.bias_out,
+                self.units,
+                gamma,
+                rows=rows,
+                intervals=intervals,
+                time=None if intervals is None else time,
+            )
         if rows is not None:
             resting = [x[:rows] for x in values]
             moved = self(resting, time)

@@ -74,8 +74,11 @@ def import_models(
     except Exception as error:  # whatever the code of another package raises
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = "" if "importlib" in place.filename else f"{Path(place.filename).name}, line {place.lineno}: "
-        raise InputError(f"{named_by}: expected a Python module that can be imported: {where}"
-                         f"{type(error).__name__}: {one_line(error)}", docs="adding_a_model.md") from None  # fmt: skip
+        raise InputError(
+            f"{named_by}: expected a Python module that can be imported: {where}"
+            f"{type(error).__name__}: {one_line(error)}",
+            docs="adding_a_model.md",
+        ) from None
 
 
 def build(name: str, *, module: str | None = None, **options: Any) -> GaussianModel:

@@ -22,8 +22,14 @@ def rasterize_slice(
 ) -> RasterOutput:
     """Rasterize the 3D Gaussians of a model (with colours) for one camera, as `gsbench.raster.rasterize`."""
     view = camera.viewmat[None], camera.K[None], camera.width, camera.height
-    return rasterize(*gaussians[:4], *view, background=background, backend=backend, antialias=antialias,
-                     beta_exponents=gaussians.beta_exponents)  # fmt: skip
+    return rasterize(
+        *gaussians[:4],
+        *view,
+        background=background,
+        backend=backend,
+        antialias=antialias,
+        beta_exponents=gaussians.beta_exponents,
+    )
 
 
 def render(
@@ -61,8 +67,9 @@ class GraphedFrames:
         """Prepare to render a model on a GPU; raises InputError if it does not use the CUDA backend."""
         backend = resolve(model.backend.name, model.splats["means"].device.type)
         if backend.name != "cuda":
-            raise InputError(f"CUDA graph: expected raster.backend=cuda, got '{backend.name}': only a GPU records what "
-                             f"it does")  # fmt: skip
+            raise InputError(
+                f"CUDA graph: expected raster.backend=cuda, got '{backend.name}': only a GPU records what it does"
+            )
         self.model = model
         self.background = background
         self.antialias = antialias

@@ -47,8 +47,10 @@ def simplifications_of(
     simplified = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
-    fewer = {order: raw | {"shN": raw["shN"] * model.used_entries(EffectSets(0, 0, _all(model, order)))["shN"]}
-             for order in model.lower_orders()}  # fmt: skip
+    fewer = {
+        order: raw | {"shN": raw["shN"] * model.used_entries(EffectSets(0, 0, _all(model, order)))["shN"]}
+        for order in model.lower_orders()
+    }
     rows = model.count_by_effects()
     conditioned = len(model) - rows["static"]
     refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))

@@ -85,12 +85,16 @@ def slice_gaussians(
     for name, x in (("mean", mean), ("factor", factor), ("query", query)):
         check_tensor(x, f"slice_gaussians: {name}")
         if x.dtype != mean.dtype or x.device != mean.device:
-            raise InputError(f"slice_gaussians: expected {name} as {mean.dtype} on {mean.device}, as the mean is, got "
-                             f"{x.dtype} on {x.device}")  # fmt: skip
+            raise InputError(
+                f"slice_gaussians: expected {name} as {mean.dtype} on {mean.device}, as the mean is, got "
+                f"{x.dtype} on {x.device}"
+            )
     N, n = mean.shape if mean.dim() == 2 else (0, 0)
     if n < 3 or factor.shape != (N, n, n) or query.shape not in ((N, n - 3), (n - 3,)):
-        raise InputError(f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
-                         f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}")  # fmt: skip
+        raise InputError(
+            f"slice_gaussians: expected mean [N, 3+k], factor [N, 3+k, 3+k] and query [N, k] or [k], "
+            f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}"
+        )
     check_scheme(scheme)
     if scheme == "square_root":
         return slice_reduced(mean, reduce(factor), query)

@@ -33,8 +33,9 @@ def require(size: int, what: str, instead: str) -> None:
         return
     free = available()
     if free is not None and size > free:
-        raise TooLargeError(f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: "
-                            f"{instead}")  # fmt: skip
+        raise TooLargeError(
+            f"{what} need {size / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are available: {instead}"
+        )
 
 
 def too_little_address_space() -> str | None:
@@ -42,8 +43,10 @@ def too_little_address_space() -> str | None:
     limit = _address_space_limit()
     if limit is None or limit >= LEAST_ADDRESS_SPACE:
         return None
-    return (f"this process is limited to {limit >> 20} MiB of address space (ulimit -v), and torch needs "
-            f"{LEAST_ADDRESS_SPACE >> 20} MiB to start: raise the limit")  # fmt: skip
+    return (
+        f"this process is limited to {limit >> 20} MiB of address space (ulimit -v), and torch needs "
+        f"{LEAST_ADDRESS_SPACE >> 20} MiB to start: raise the limit"
+    )
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -81,8 +81,10 @@ def rasterize(
         [0.82, 0.0, 0.0]
     """
     if not isinstance(backend, str | Backend) or not isinstance(antialias, bool):
-        raise InputError(f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
-                         f"and {antialias!r:.40}")  # fmt: skip
+        raise InputError(
+            f"backend, antialias: expected a name or a Backend, and True or False, got {backend!r:.40} "
+            f"and {antialias!r:.40}"
+        )
     if background is None:
         check_tensor(colors, "colors")
         background = colors.new_zeros(colors.shape[-1:])
@@ -93,6 +95,8 @@ def rasterize(
     if chosen.serves(means):
         return native.draw(inputs, viewport)
     if backend != "auto" and chosen in (CPU, CUDA):
-        raise InputError(f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
-                         f"{means.dtype} on {means.device}; backend 'reference' takes any")  # fmt: skip
+        raise InputError(
+            f"raster backend '{chosen.name}': expected float32 tensors on device '{chosen.name}', got "
+            f"{means.dtype} on {means.device}; backend 'reference' takes any"
+        )
     return reference.draw(inputs, viewport)

@@ -89,8 +89,14 @@ def exact_image(
         torch.empty(height, width, dtype=torch.int32),
         torch.empty(height, width, dtype=torch.uint8),
     )
-    kept = {"records": records, "colors": doubles.colors.contiguous(), "single_colors": rounded.colors.contiguous(),
-            "background": background.contiguous(), "offsets": bins.offsets, "ids": bins.ids}  # fmt: skip
+    kept = {
+        "records": records,
+        "colors": doubles.colors.contiguous(),
+        "single_colors": rounded.colors.contiguous(),
+        "background": background.contiguous(),
+        "offsets": bins.offsets,
+        "ids": bins.ids,
+    }
     kept |= {f"out.{name}": x for name, x in out._asdict().items()}
     numbers = {"D": D, "beta": rounded.beta_exponents is not None, "width": width, "height": height}
     library.call("exact_image", {name: x.data_ptr() for name, x in kept.items()} | numbers, viewmat)
@@ -120,10 +126,19 @@ def _exact_splats(
     """
     records = torch.empty(len(exact.means), RECORD, dtype=torch.float64)
     boxes = rounded._replace(**{name: torch.empty_like(getattr(rounded, name)) for name in BOXES})
-    kept = {"means": exact.means, "factors": exact.factors, "opacities": exact.opacities,
-            "shapes": exact.beta_exponents, "viewmats": viewmat, "Ks": K, "means2d": rounded.means2d,
-            "roots": rounded.roots, "depths": rounded.depths, "half_sizes": rounded.half_sizes,
-            "single_shapes": rounded.beta_exponents}  # fmt: skip
+    kept = {
+        "means": exact.means,
+        "factors": exact.factors,
+        "opacities": exact.opacities,
+        "shapes": exact.beta_exponents,
+        "viewmats": viewmat,
+        "Ks": K,
+        "means2d": rounded.means2d,
+        "roots": rounded.roots,
+        "depths": rounded.depths,
+        "half_sizes": rounded.half_sizes,
+        "single_shapes": rounded.beta_exponents,
+    }
     kept = {name: None if x is None else x.contiguous() for name, x in kept.items()}
     kept |= {"out.records": records} | {f"out.{name}": getattr(boxes, name) for name in BOXES}
     slots = {name: address(x) for name, x in kept.items()} | {"N": len(exact.means)} | viewport._asdict()

@@ -84,12 +84,14 @@ def _check_viewport(viewport: Viewport) -> None:
     """Raise InputError unless width and height are at least 1, 0 < near < far, and eps2d >= 0."""
     width, height, near, far, eps2d, _ = viewport
     if not all(type(size) is int and size >= 1 for size in (width, height)):
-        raise InputError(f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, "
-                         f"height={height!r:.40}")  # fmt: skip
+        raise InputError(
+            f"expected an image of at least 1x1 whole pixels, got width={width!r:.40}, height={height!r:.40}"
+        )
     numbers = all(isinstance(x, float | int) for x in (near, far, eps2d))
     if not numbers or not 0 < near < far or not 0 <= eps2d < math.inf:
-        raise InputError(f"expected 0 < near < far and eps2d >= 0, got near={near!r:.40}, far={far!r:.40}, "
-                         f"eps2d={eps2d!r:.40}")  # fmt: skip
+        raise InputError(
+            f"expected 0 < near < far and eps2d >= 0, got near={near!r:.40}, far={far!r:.40}, eps2d={eps2d!r:.40}"
+        )
 
 
 def check_values(inputs: RasterInputs) -> None:

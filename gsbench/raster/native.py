@@ -43,8 +43,9 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
         size = f"{C} images of {viewport.width}x{viewport.height} with {N} Gaussians"
         require(4 * (numbers + C * N * 20), size, LOWER)
     if C * N > MAX_PAIRS:
-        raise InputError(f"raster backend '{device}': expected at most {MAX_PAIRS} Gaussians times cameras, got "
-                         f"{C * N}")  # fmt: skip
+        raise InputError(
+            f"raster backend '{device}': expected at most {MAX_PAIRS} Gaussians times cameras, got {C * N}"
+        )
     flags = flag_values(inputs)
     splats = project(inputs, viewport)
     bins, flagged = bin_tiles(splats, viewport, flags)

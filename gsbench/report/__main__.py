@@ -67,11 +67,22 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     either.add_argument("--against", type=Path, metavar="DIR", help="compare with the runs in DIR; 1 if they differ")
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--latex", action="store_true", help="print the tables as LaTeX for a paper, and write nothing")
-    form.add_argument("--json", type=Path, nargs="?", const=PRINTED, metavar="FILE",
-                      help="print the numbers as JSON, and write nothing; FILE: also write them there")  # fmt: skip
+    form.add_argument(
+        "--json",
+        type=Path,
+        nargs="?",
+        const=PRINTED,
+        metavar="FILE",
+        help="print the numbers as JSON, and write nothing; FILE: also write them there",
+    )
     parser.add_argument("--figures", type=Path, metavar="DIR", help="write the page's figures there as PDF and SVG")
-    parser.add_argument("--select", nargs="+", default=[], metavar="KEY=A,B",
-                        help="only these: model=.. scene=.. column=..; nothing is written to FOLDER")  # fmt: skip
+    parser.add_argument(
+        "--select",
+        nargs="+",
+        default=[],
+        metavar="KEY=A,B",
+        help="only these: model=.. scene=.. column=..; nothing is written to FOLDER",
+    )
     options = parser.parse_args(arguments)
     if options.against and options.latex:
         parser.error("--against: expected no --latex beside it")

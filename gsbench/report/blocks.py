@@ -27,13 +27,22 @@ KINDS = {
     "all dynamic": MOVING,
     "static": ["static"],
 }
-CHANGES = {"time, given direction": ("7dgs_noagr", "6dgs"), "direction": ("6dgs", "3dgs"),
-           "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
-           "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
-           "7DGS instead of 4DGS": ("7dgs", "4dgs"), "`model=auto` instead of 7DGS": ("auto", "7dgs")}  # fmt: skip
+CHANGES = {
+    "time, given direction": ("7dgs_noagr", "6dgs"),
+    "direction": ("6dgs", "3dgs"),
+    "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
+    "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
+    "7DGS instead of 4DGS": ("7dgs", "4dgs"),
+    "`model=auto` instead of 7DGS": ("auto", "7dgs"),
+}
 EFFECTS = list(CHANGES)[:4]
-CHOICES = {"4dgs": "4DGS", "7dgs_noagr": "7DGS without AGR", "7dgs": "7DGS", "auto": "`model=auto`",
-           "auto compare=true": "`model=auto effects.compare=true`"}  # fmt: skip
+CHOICES = {
+    "4dgs": "4DGS",
+    "7dgs_noagr": "7DGS without AGR",
+    "7dgs": "7DGS",
+    "auto": "`model=auto`",
+    "auto compare=true": "`model=auto effects.compare=true`",
+}
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
 POINTS = "initial_points=100000"  # trained with as many as in the paper, before D-NeRF had 10,000
 LAMBDA_T = "lambda_t=0.05"  # trained before lambda_t started at 0.5 on D-NeRF
@@ -42,14 +51,19 @@ ABLATIONS = {
     "none": "nothing",
     "paper_order": "Cholesky factor over (position, time, direction), as in the paper",
     "row_scaled": "off-diagonals of the factor as parts of their row's diagonal",
-    "raw_off_diagonal": "off-diagonals of the factor as raw entries", "schur": "slices by a Schur complement",
-    "cholesky": "slices by a Cholesky factor", "no_time_split": "Gaussians split in space only",
+    "raw_off_diagonal": "off-diagonals of the factor as raw entries",
+    "schur": "slices by a Schur complement",
+    "cholesky": "slices by a Cholesky factor",
+    "no_time_split": "Gaussians split in space only",
     "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
-}  # fmt: skip
+}
 OF_TREX = {
-    "psnr_db": Column("PSNR, last iteration"), "psnr_best_on_test_db": Column("best on test"),
-    "CPU min": Column("CPU min", 1), "GPU min": Column("GPU min", 1), "gaussians": Column("Gaussians", 0),
-}  # fmt: skip
+    "psnr_db": Column("PSNR, last iteration"),
+    "psnr_best_on_test_db": Column("best on test"),
+    "CPU min": Column("CPU min", 1),
+    "GPU min": Column("GPU min", 1),
+    "gaussians": Column("Gaussians", 0),
+}
 QUANTITIES = [*(name for name in OF_TREX if not name.endswith("min")), "train_s", "train_cpu_s"]
 
 
@@ -139,8 +153,12 @@ def effects(published: Path) -> str:
     for quantity in ("train_s", "frame_ms", "model_mb"):
         table[quantity] = tests[tests.quantity == quantity]["mean"].loc[names]
     effect = [name.replace(" alone", "").replace(", with", " given") for name in single]
-    units = {"mean": ("PSNR, dB", 2), "train_s": ("training, s", 1), "frame_ms": ("frame, ms", 2),
-             "model_mb": ("model, MB", 2)}  # fmt: skip
+    units = {
+        "mean": ("PSNR, dB", 2),
+        "train_s": ("training, s", 1),
+        "frame_ms": ("frame, ms", 2),
+        "model_mb": ("model, MB", 2),
+    }
     columns = {name: Column(title, digits, signed=True) for name, (title, digits) in units.items()}
     return block(table.set_axis(pd.Index(effect, name="effect")), **columns)
 
@@ -151,8 +169,10 @@ def ablation(published: Path) -> str:
     keys = {variant: (model, variant) for model, variant in zip(chapter.runs.model, chapter.runs.variant, strict=True)}
     full, *ablated = [keys[f"ablation={name}"] for name in ABLATIONS]
     arrays = stats.grids(chapter)
-    tests = [stats.differences(arrays, [{full: 1.0}]).assign(significant=False),
-             stats.differences(arrays, [{part: 1.0, full: -1.0} for part in ablated])]  # fmt: skip
+    tests = [
+        stats.differences(arrays, [{full: 1.0}]).assign(significant=False),
+        stats.differences(arrays, [{part: 1.0, full: -1.0} for part in ablated]),
+    ]
     table = changes(pd.concat(tests, ignore_index=True))
     table.insert(0, "`+ablation=`", [f"`{name}`" for name in ABLATIONS])
     columns = {"mean": Column("PSNR, dB")}
@@ -204,9 +224,12 @@ def suite_choices(published: Path) -> str:
         lost[f"the best model on val after {100 * part:.0f} % of the iterations"] = chosen - best
     gap = pd.DataFrame(lost).groupby("scene").mean()
     table = pd.DataFrame({"mean": gap.mean(), "worst": gap.min(), "near": (gap >= -0.1).sum()})
-    return block(table.rename_axis("choice"), mean=Column("mean, dB", 2, signed=True),
-                 worst=Column("worst scene, dB", 2, signed=True),
-                 near=Column(f"scenes at most 0.1 dB below, of {len(gap)}", 0))  # fmt: skip
+    return block(
+        table.rename_axis("choice"),
+        mean=Column("mean, dB", 2, signed=True),
+        worst=Column("worst scene, dB", 2, signed=True),
+        near=Column(f"scenes at most 0.1 dB below, of {len(gap)}", 0),
+    )
 
 
 def _val_on_the_way(chapter: Results) -> pd.DataFrame:
@@ -239,8 +262,11 @@ def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)].set_index("scene")
-    by_column = {f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
-                 for model in models for title, quantity in quantities.items()}  # fmt: skip
+    by_column = {
+        f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
+        for model in models
+        for title, quantity in quantities.items()
+    }
     table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna()
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
@@ -289,9 +315,13 @@ def trex400(published: Path) -> str:
                 if (model, variant := f"{words}{start}{POINTS},{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
                     rows[title] = _minutes(averages.loc[(model, variant)], device)
-    others = [("7dgs_noagr", "paper", f",{AT_PAPER}"), ("7dgs_noagr", "authors", f",{AT_PAPER}"),
-              ("7dgs", "quick", f",{LAMBDA_T},{POINTS}"), ("4dgs", "quick", f",{POINTS}"),
-              ("7dgs_noagr", "quick", f",{LAMBDA_T},{POINTS}")]  # fmt: skip
+    others = [
+        ("7dgs_noagr", "paper", f",{AT_PAPER}"),
+        ("7dgs_noagr", "authors", f",{AT_PAPER}"),
+        ("7dgs", "quick", f",{LAMBDA_T},{POINTS}"),
+        ("4dgs", "quick", f",{POINTS}"),
+        ("7dgs_noagr", "quick", f",{LAMBDA_T},{POINTS}"),
+    ]
     for model, name, more in others:
         start = "λ_t from 0.05, " if LAMBDA_T in more else ""
         rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(averages.loc[(model, f"recipe={name}{more}")], "CPU")
@@ -334,8 +364,7 @@ README: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
     "dnerf100_signs": dnerf100_signs,
 }
-_OF_RESULTS = (dnerf100, table1, effects, suite_kinds, suite_choices, lengths, ablation,
-               trex400, on_demand)  # fmt: skip
+_OF_RESULTS = (dnerf100, table1, effects, suite_kinds, suite_choices, lengths, ablation, trex400, on_demand)
 RESULTS: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs_noagr", "7dgs"], LAST | BEST | OF_PAPER),
     **{write.__name__: write for write in _OF_RESULTS},

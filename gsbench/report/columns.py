@@ -74,7 +74,12 @@ PARTS = (  # of a record that differ between runs have a column for each key, su
     ("provenance.config.", "config."),  # all settings; only in runs.csv
 )
 VIEWS = {  # by column, the score in record.json
-    "psnr_db": "psnr", "psnr_channel_mean_db": "psnr_channel_mean", "ssim": "ssim", "lpips_alex": "lpips_alex",
-    "lpips_vgg": "lpips_vgg", "psnr_moving_db": "psnr_moving", "psnr_object_db": "psnr_object",
-}  # fmt: skip
+    "psnr_db": "psnr",
+    "psnr_channel_mean_db": "psnr_channel_mean",
+    "ssim": "ssim",
+    "lpips_alex": "lpips_alex",
+    "lpips_vgg": "lpips_vgg",
+    "psnr_moving_db": "psnr_moving",
+    "psnr_object_db": "psnr_object",
+}
 CURVES = {"iteration": "iteration", "train_s": "seconds", "psnr_val_db": "psnr_val"}

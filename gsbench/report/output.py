@@ -97,8 +97,11 @@ def _rewrite(folder: Path, columns: Sequence[str], reload: int) -> str:
         *_, page = write(results, folder, tables(results, columns), reload=reload)
     except (InputError, OSError) as error:
         return one_line(error)
-    counts = {"records": len(results.runs), "not ok": int((results.runs.status != "ok").sum()),
-              "left out": len(results.faults)}  # fmt: skip
+    counts = {
+        "records": len(results.runs),
+        "not ok": int((results.runs.status != "ok").sum()),
+        "left out": len(results.faults),
+    }
     return f"{', '.join(f'{n} {what}' for what, n in counts.items() if n)}: {page}"
 
 

@@ -83,16 +83,26 @@ def of_the_paper(results: Results) -> pd.DataFrame:
     runs = results.runs[results.runs.model.isin(MODELS)]
     named = [str(record.protocol.get("paper_dataset")) for record in runs.record]
     runs = runs[pd.Series(named, runs.index, dtype=object).isin(list(paper.PROTOCOLS))]
-    pools = [(str(r.protocol["paper_dataset"]), r.dataset, r.experiment, paper.relative_size(r),
-              str(r.protocol.get("resize")), int(iterations(r)) if iterations(r) > 0 else 0)
-             for r in runs.record]  # fmt: skip
+    pools = [
+        (
+            str(r.protocol["paper_dataset"]),
+            r.dataset,
+            r.experiment,
+            paper.relative_size(r),
+            str(r.protocol.get("resize")),
+            int(iterations(r)) if iterations(r) > 0 else 0,
+        )
+        for r in runs.record
+    ]
     recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
     sizes = [printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record]
     return runs.assign(
-        order=runs.model.map(MODELS.index), departs=runs.record.map(departure),
+        order=runs.model.map(MODELS.index),
+        departs=runs.record.map(departure),
         recipe=[",".join(word for word in recipe.split(",") if word != "protocol=published") for recipe in recipes],
-        pool=pd.Series(pools, runs.index, dtype=object), size=sizes,
-    )  # fmt: skip
+        pool=pd.Series(pools, runs.index, dtype=object),
+        size=sizes,
+    )
 
 
 def table1(runs: pd.DataFrame) -> pd.DataFrame:
@@ -158,8 +168,10 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
         groups.append((paper.AVERAGE, averaged_runs[averaged_runs.scene.isin(covered)]))
     tables = [stats.means(group, RECIPE, TABLE_1).assign(scene=name) for name, group in groups if len(group)]
     table = pd.concat(tables, ignore_index=True).assign(table=kind, dataset=dataset)
-    numbers = [paper.average(dataset if kind == "paper" else "", averaged[scene], model)
-               for scene, model in zip(table.scene, table.model, strict=True)]  # fmt: skip
+    numbers = [
+        paper.average(dataset if kind == "paper" else "", averaged[scene], model)
+        for scene, model in zip(table.scene, table.model, strict=True)
+    ]
     of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda x: x.psnr_db)
     difference = (table[TABLE_1] - of_paper).drop(columns=TIMES, errors="ignore")
     return table.join(of_paper.add_suffix(" paper")).join(difference.add_suffix(" difference"))
@@ -232,9 +244,10 @@ def _successor_runs(runs: pd.DataFrame) -> pd.DataFrame:
     ]
     runs = runs[pd.Series(is_comparable, runs.index, dtype=bool)]
     runs = runs.assign(
-        order=runs.model.map(SUCCESSORS.index), protocol=runs.record.map(_protocol),
+        order=runs.model.map(SUCCESSORS.index),
+        protocol=runs.record.map(_protocol),
         recipe=[without(variant, *IN_THE_PROTOCOL) for variant in runs.variant],
-    )  # fmt: skip
+    )
     return of_one_machine(_once(runs, SUCCESSOR_RECIPE)) if len(runs) else runs
 
 
@@ -346,12 +359,20 @@ def pools(runs: pd.DataFrame) -> Section:
     for (pool, differs), pooled in runs.groupby(["pool", runs.departs != ""]):
         _, dataset, experiment, _, resize, steps = pool
         settings = sorted({word for departs in pooled.departs for word in departs.split(", ")}) if differs else []
-        rows.append({
-            "data": dataset, "experiment": experiment, "size": ", ".join(sorted(set(pooled["size"]))),
-            "filter": resize.removesuffix("None"), "iterations": steps, "runs": len(pooled),
-            "failed": int((pooled.status != "ok").sum()), "machines": pooled.machine.nunique(),
-            "differs in": ", ".join(settings), "shown": any(set(pooled.index) <= table for table in shown),
-        })  # fmt: skip
+        rows.append(
+            {
+                "data": dataset,
+                "experiment": experiment,
+                "size": ", ".join(sorted(set(pooled["size"]))),
+                "filter": resize.removesuffix("None"),
+                "iterations": steps,
+                "runs": len(pooled),
+                "failed": int((pooled.status != "ok").sum()),
+                "machines": pooled.machine.nunique(),
+                "differs in": ", ".join(settings),
+                "shown": any(set(pooled.index) <= table for table in shown),
+            }
+        )
     return Section("pools", "All runs on the paper's data or stand-ins", TEXT_POOLS, pd.DataFrame(rows))
 
 

@@ -41,11 +41,22 @@ SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not 
 # its 95 % interval is no wider than ± `widest`; if one folder has a single run, the difference itself must be at most
 # `widest`. If `relative`, both are fractions of the mean of the reference.
 LIMITS = pd.DataFrame(
-    {"psnr_db": (0.01, 1.0, False), "train_s": (0.25, 0.5, True), "frame_ms": (0.25, 0.5, True),
-     "gaussians": (0.1, 0.25, True), "model_mb": (0.1, 0.25, True)}, index=["equal", "widest", "relative"],
-).T  # fmt: skip
-TITLES = {"psnr_db": "PSNR, dB", "train_s": "seconds, %", "frame_ms": "ms a frame, %", "gaussians": "Gaussians, %",
-          "model_mb": "MB, %"}  # fmt: skip
+    {
+        "psnr_db": (0.01, 1.0, False),
+        "train_s": (0.25, 0.5, True),
+        "frame_ms": (0.25, 0.5, True),
+        "gaussians": (0.1, 0.25, True),
+        "model_mb": (0.1, 0.25, True),
+    },
+    index=["equal", "widest", "relative"],
+).T
+TITLES = {
+    "psnr_db": "PSNR, dB",
+    "train_s": "seconds, %",
+    "frame_ms": "ms a frame, %",
+    "gaussians": "Gaussians, %",
+    "model_mb": "MB, %",
+}
 RULE = (
     "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
     "of one machine with one load (within 0.5). PSNR, Gaussians and MB agree where every run is bit-equal with the "
@@ -191,11 +202,16 @@ def _samples(new: pd.DataFrame, reference: pd.DataFrame, quantity: str, reason: 
     bit_equal = repeats and not reason and quantity in BITS
     counted = samples[1:] if bit_equal else samples
     return {
-        "quantity": quantity, "new": samples[0].mean(), "reference": samples[1].mean(),
-        "runs_new": len(samples[0]), "runs_reference": len(samples[1]),
+        "quantity": quantity,
+        "new": samples[0].mean(),
+        "reference": samples[1].mean(),
+        "runs_new": len(samples[0]),
+        "runs_reference": len(samples[1]),
         "squares": float(sum(((x - x.mean()) ** 2).sum() for x in counted)),
-        "freedom": sum(max(len(x) - 1, 0) for x in counted), "bit_equal": bit_equal, "reason": reason,
-    }  # fmt: skip
+        "freedom": sum(max(len(x) - 1, 0) for x in counted),
+        "bit_equal": bit_equal,
+        "reason": reason,
+    }
 
 
 def _differences(table: pd.DataFrame) -> pd.DataFrame:

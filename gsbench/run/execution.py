@@ -149,11 +149,18 @@ class Execution:
         of_other_hooks = {name: value for name, value in results.items() if name not in fields}
         exact_views = trainer.exact.union(*(view.exact for view in measured.per_view))  # the render equals the image
         return replace(
-            record, protocol=record.protocol | measured.frames, metrics=measured.metrics,
-            missing=measured.missing, per_view=measured.per_view, regions=measured.regions,
-            cost=measured.cost, curve=trainer.curve.points, **fields, parts=of_other_hooks,
+            record,
+            protocol=record.protocol | measured.frames,
+            metrics=measured.metrics,
+            missing=measured.missing,
+            per_view=measured.per_view,
+            regions=measured.regions,
+            cost=measured.cost,
+            curve=trainer.curve.points,
+            **fields,
+            parts=of_other_hooks,
             exact=sorted(exact_views),
-        )  # fmt: skip
+        )
 
     def draw(self) -> None:
         """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.
@@ -263,8 +270,10 @@ def _record_of(execution: Execution) -> Record:
         spare.clear()
         earlier, record = None, _ended_badly(execution, error)
     if earlier is not None:
-        print(f"{spec.name}: finished before, kept: {summary(earlier)}; measured {_where(spec, earlier)}; "
-              f"{spec.folder / records.FILE_NAME}")  # fmt: skip
+        print(
+            f"{spec.name}: finished before, kept: {summary(earlier)}; measured {_where(spec, earlier)}; "
+            f"{spec.folder / records.FILE_NAME}"
+        )
         return earlier
     try:
         write(record, spec.folder)
@@ -349,8 +358,10 @@ def too_long(record: Record) -> str:
     curve = Curve(record.curve)
     if record.stop is not None or record.length_choice is not None or curve.best is None or curve.fall <= FALL:
         return ""
-    return (f". PSNR on val was {curve.fall:.2f} dB higher at iteration {curve.best.iteration}: a shorter training may "
-            f"be better (docs/runs.md#how-a-run-ends)")  # fmt: skip
+    return (
+        f". PSNR on val was {curve.fall:.2f} dB higher at iteration {curve.best.iteration}: a shorter training may "
+        f"be better (docs/runs.md#how-a-run-ends)"
+    )
 
 
 def finished(spec: RunSpec, scene: Scene) -> Record | None:
@@ -407,9 +418,13 @@ def _outdated(spec: RunSpec, scene: Scene, record: Record) -> str:
 def _lacks_lpips(spec: RunSpec, scene: Scene, record: Record) -> str:
     """Return why an earlier run must be measured again for LPIPS (its weights were added); "" if its record is kept."""
     camera, weights = evaluated_views(scene, spec.config.scene.eval_split)[0].camera, lpips_weights(spec.config)
-    new = [name for name, backbone in perceptual.BACKBONES.items()
-           if (record.metrics or {}).get(f"lpips_{name}") is None and perceptual.is_here(name, weights.get(name))
-           and min(camera.width, camera.height) >= backbone.least_side]  # fmt: skip
+    new = [
+        name
+        for name, backbone in perceptual.BACKBONES.items()
+        if (record.metrics or {}).get(f"lpips_{name}") is None
+        and perceptual.is_here(name, weights.get(name))
+        and min(camera.width, camera.height) >= backbone.least_side
+    ]
     if not new:
         return ""
     what = f"it has no LPIPS ({', '.join(new)}), whose weights are here now"

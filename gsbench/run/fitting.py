@@ -111,8 +111,10 @@ def fit(
             trainer.run(lambda state: save(state, spec, trainer.scene, plain), spec.name, goes_on)
             report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
     if request.signal is not None:  # asked here, so that a signal after the last step is not lost
-        raise stop.Stopped(request.signal, f"{spec.name}: stopped at step {trainer.step}, saved in {path}: "
-                                           f"the same command continues from there")  # fmt: skip
+        raise stop.Stopped(
+            request.signal,
+            f"{spec.name}: stopped at step {trainer.step}, saved in {path}: the same command continues from there",
+        )
     _check_fitted(trainer)
 
 
@@ -122,8 +124,10 @@ def _check_fitted(trainer: Trainer) -> None:
         if not parameter.isfinite().all():
             raise DivergedError(f"step {trainer.step}: '{name}' has values that are not finite")
     if not len(trainer.model):
-        raise NoGaussianError("no Gaussian is left: the training pruned all of them; look at train.densify, "
-                              "model.min_opacity and data.initial_half_width")  # fmt: skip
+        raise NoGaussianError(
+            "no Gaussian is left: the training pruned all of them; look at train.densify, "
+            "model.min_opacity and data.initial_half_width"
+        )
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
@@ -141,8 +145,10 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
     share = share_of_points_seen(points, cameras)
     where = f"{data.initial_points} initial points in a cube of half width {data.initial_half_width:g}"
     if share < LEAST_SEEN:
-        raise InputError(f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
-                         f"{share:.1%}: set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
-                         f"at), or null for points that all cameras see")  # fmt: skip
+        raise InputError(
+            f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
+            f"{share:.1%}: set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
+            f"at), or null for points that all cameras see"
+        )
     print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
     return points

@@ -24,8 +24,10 @@ def check_override(word: str) -> None:
     if isinstance(read, HydraException):
         if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:
             raise InputError(f"{word!r:.300}: expected KEY=VALUE, such as model=7dgs or +exp=mini")
-        raise InputError(f"{key}: expected quotes around {text}, as some of its characters have another meaning for "
-                         f"Hydra: type {typed(key, text, several=kind not in _TEXTS)}")  # fmt: skip
+        raise InputError(
+            f"{key}: expected quotes around {text}, as some of its characters have another meaning for "
+            f"Hydra: type {typed(key, text, several=kind not in _TEXTS)}"
+        )
     several = isinstance(read, ChoiceSweep) or (isinstance(read, list) and kind not in _TEXTS)
     values = list(read.list) if isinstance(read, ChoiceSweep) else read if several else [read]
     texts = _parts(text) if several else [text]
@@ -33,8 +35,10 @@ def check_override(word: str) -> None:
         isinstance(value, int | float | list | dict) and str(value) != part
         for value, part in zip(values, texts, strict=False)
     ):
-        raise InputError(f"{key}: expected a text, Hydra reads {text} as {', '.join(map(str, values))}: type "
-                         f"{typed(key, text, several)}")  # fmt: skip
+        raise InputError(
+            f"{key}: expected a text, Hydra reads {text} as {', '.join(map(str, values))}: type "
+            f"{typed(key, text, several)}"
+        )
 
 
 def quoted_value(text: str) -> str:

@@ -99,12 +99,17 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
         InputError: a setting of the model was deleted, which no name could tell.
     """
     standard = _standard_choices()
-    groups = {group: choice for group, choice in choices.items()
-              if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))}  # fmt: skip
+    groups = {
+        group: choice
+        for group, choice in choices.items()
+        if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
+    }
     words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if standard.get(group) != choice]
     # The overrides that compose the experiment as it is, with this model, scene and seed, to compare with.
-    base = [f"{'' if group in standard else '+'}{group}={quoted_value(choice)}"
-            for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]]  # fmt: skip
+    base = [
+        f"{'' if group in standard else '+'}{group}={quoted_value(choice)}"
+        for group, choice in [*((name, choices[name]) for name in OWN_NAMES), *groups.items()]
+    ]
     base += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}"]
     base += [f"scene.name={quoted_value(plain['scene']['name'])}"]
     before = dict(flat(OmegaConf.to_container(hydra.compose("config", base), resolve=True)))  # type: ignore[arg-type]

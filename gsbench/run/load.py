@@ -45,9 +45,18 @@ class SceneDescription:
     def of(cls, scene: Scene) -> "SceneDescription":
         """Return the description of a loaded scene."""
         camera = scene.train[0].camera
-        return cls(scene.name, scene.fingerprint, scene.extent, list(scene.background), scene.has_time,
-                   camera.width, camera.height, list(scene.up), list(scene.placement.center),
-                   scene.placement.unit)  # fmt: skip
+        return cls(
+            scene.name,
+            scene.fingerprint,
+            scene.extent,
+            list(scene.background),
+            scene.has_time,
+            camera.width,
+            camera.height,
+            list(scene.up),
+            list(scene.placement.center),
+            scene.placement.unit,
+        )
 
     @property
     def placement(self) -> Placement:
@@ -95,9 +104,11 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
     """
     path = Path(folder) / checkpoint.FILE_NAME
     if not path.exists():
-        raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
-                         f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK",
-                         docs="runs.md#the-folder-of-a-run")  # fmt: skip
+        raise InputError(
+            f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "
+            f"run it again, or name its folder, results/EXPERIMENT/SCENE/MODEL/seedK",
+            docs="runs.md#the-folder-of-a-run",
+        )
     saved = checkpoint.read(path, device)
     config = typed_config(saved.config, path)
     config.device, config.raster.backend = device, backend
@@ -130,11 +141,15 @@ def scene_of(run: LoadedRun, data_root: str | None = None) -> Scene:
     except InputError as error:
         raise InputError(f"{error}; name the folder of the data by --data-root") from None
     if scene.fingerprint != run.scene.fingerprint:
-        raise InputError(f"{run.scene.name} in {config.data.root}: expected the data of the training, found others: "
-                         f"name the right folder by --data-root")  # fmt: skip
+        raise InputError(
+            f"{run.scene.name} in {config.data.root}: expected the data of the training, found others: "
+            f"name the right folder by --data-root"
+        )
     if scene.placement != run.scene.placement:
-        raise InputError(f"{run.folder}: expected a run trained at {scene.placement}, where this gsbench places "
-                         f"{run.scene.name}, got one trained at {run.scene.placement}: train it again")  # fmt: skip
+        raise InputError(
+            f"{run.folder}: expected a run trained at {scene.placement}, where this gsbench places "
+            f"{run.scene.name}, got one trained at {run.scene.placement}: train it again"
+        )
     return scene
 
 
@@ -145,8 +160,10 @@ def trusted_root(root: str, where: Path) -> str:
         InputError: `root` names a Python package other than gsbench's; finding its files would import untrusted code.
     """
     if root.startswith(PACKAGE) and root != EMBEDDED:
-        raise InputError(f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
-                         f"which would be imported: if you trust it, name it by --data-root")  # fmt: skip
+        raise InputError(
+            f"{where}: expected data in a folder or in {EMBEDDED}, its checkpoint names {root!r:.80}, "
+            f"which would be imported: if you trust it, name it by --data-root"
+        )
     return root
 
 
@@ -176,9 +193,12 @@ def typed_config(plain: dict[str, Any], path: Path) -> Config:
         raise InputError(f"{path}: {error}") from None
     module, config.model.module = config.model.module, None
     if module is not None and not is_registered(config.model.name):
-        raise InputError(f"{path}: expected a model that is known, got '{config.model.name}' of the module "
-                         f"{module!a:.80}, which a checkpoint cannot import: do it by --model-module, or `import` it "
-                         f"before load_run", docs="adding_a_model.md")  # fmt: skip
+        raise InputError(
+            f"{path}: expected a model that is known, got '{config.model.name}' of the module "
+            f"{module!a:.80}, which a checkpoint cannot import: do it by --model-module, or `import` it "
+            f"before load_run",
+            docs="adding_a_model.md",
+        )
     return config
 
 

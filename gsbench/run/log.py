@@ -88,10 +88,15 @@ class WeightsAndBiases:
 
         old_id = _read_id(subject)
         self.run: Any = wandb.init(
-            project="gsbench", group=subject.experiment, name=subject.name, dir=str(subject.folder),
-            id=old_id, resume="allow" if old_id else None, config=dict(subject.settings),
+            project="gsbench",
+            group=subject.experiment,
+            name=subject.name,
+            dir=str(subject.folder),
+            id=old_id,
+            resume="allow" if old_id else None,
+            config=dict(subject.settings),
             settings=wandb.Settings(init_timeout=WANDB_SECONDS, console="off"),
-        )  # fmt: skip
+        )
         _write_id(subject, self.run.id)
 
     def add(self, step: int, numbers: Numbers) -> None:
@@ -185,8 +190,11 @@ class Guarded:
             call()
         except Exception as error:
             self.tracker = None
-            print(f"gsbench: warning: log={self.name}: {type(error).__name__}: {one_line(error)}: the run goes on "
-                  f"without it", file=sys.stderr)  # fmt: skip
+            print(
+                f"gsbench: warning: log={self.name}: {type(error).__name__}: {one_line(error)}: the run goes on "
+                f"without it",
+                file=sys.stderr,
+            )
 
 
 def _read_id(subject: Subject) -> str | None:
@@ -239,10 +247,17 @@ class RunLog:
 
     def _send(self, point: Point, line: Line) -> None:
         """Send a line of curve.jsonl to the tracker."""
-        self.tracker.add(point.iteration, _finite({
-            "val/psnr": line["psnr_val"], "train/loss": line["loss"], "train/seconds": line["seconds"],
-            "train/gaussians": line["gaussians"],
-        }))  # fmt: skip
+        self.tracker.add(
+            point.iteration,
+            _finite(
+                {
+                    "val/psnr": line["psnr_val"],
+                    "train/loss": line["loss"],
+                    "train/seconds": line["seconds"],
+                    "train/gaussians": line["gaussians"],
+                }
+            ),
+        )
 
     def end(self, record: Record | None) -> None:
         """Send the results of the record and end the tracking; None if a signal has stopped the run."""

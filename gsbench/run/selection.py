@@ -81,8 +81,10 @@ class Candidates:
             trainer = self.trainer(name)
             fitting.resume(trainer, self.spec, state)
         else:
-            raise InputError(f"checkpoint: expected one of {', '.join(self.settings)}, got {name!r:.80}: "
-                             f"start over with resume=false")  # fmt: skip
+            raise InputError(
+                f"checkpoint: expected one of {', '.join(self.settings)}, got {name!r:.80}: "
+                f"start over with resume=false"
+            )
         shutil.rmtree(self.spec.folder / FOLDER, ignore_errors=True)
         return trainer
 
@@ -127,9 +129,13 @@ class Candidates:
         error = None
         try:
             fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
-            fitting.fit(trainer, run, run.plain, until=until, reporter=lambda: progress.Reporter(
-                spec.folder, spec.overrides, steps, done, seconds
-            ))  # fmt: skip
+            fitting.fit(
+                trainer,
+                run,
+                run.plain,
+                until=until,
+                reporter=lambda: progress.Reporter(spec.folder, spec.overrides, steps, done, seconds),
+            )
         except (DivergedError, fitting.NoGaussianError) as raised:
             error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
             error.__context__ = None
@@ -140,8 +146,13 @@ class Candidates:
     def _run(self, name: str) -> RunSpec:
         """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
         spec, config = self.spec, self.settings[name]
-        return replace(spec, config=config, plain=plain(spec, config), folder=spec.folder / FOLDER / name,
-                       label=f"{spec.label} ({name})")  # fmt: skip
+        return replace(
+            spec,
+            config=config,
+            plain=plain(spec, config),
+            folder=spec.folder / FOLDER / name,
+            label=f"{spec.label} ({name})",
+        )
 
 
 @dataclass(frozen=True)
@@ -184,8 +195,11 @@ def check_candidates(config: Config, scene: Scene) -> None:
     A scene without times is not checked, because model=auto compares nothing on it.
     """
     if not scene.val:
-        raise InputError(f"effects.compare=true: expected views of val to compare models on, {scene.name} has none: "
-                         f"scene.val_every=8 takes every eighth training view", docs=HOW_TO)  # fmt: skip
+        raise InputError(
+            f"effects.compare=true: expected views of val to compare models on, {scene.name} has none: "
+            f"scene.val_every=8 takes every eighth training view",
+            docs=HOW_TO,
+        )
     for name, settings in candidates(config).items():
         try:
             check_scene(build(settings), scene, settings)
@@ -226,8 +240,11 @@ def choose_model(spec: RunSpec, scene: Scene) -> ChosenModel:
         config = with_candidate(spec.config, "static" if screen.decision == "off" else "moving")
     chosen = ChosenModel(config, screen, effort)
     name = f"{config.model.name}{' with AGR' if config.agr else ''}"
-    print(f"{spec.name}: time is {screen.decision}: {screen.reason}; "
-          f"{'models are compared on val' if chosen.compares else name}", file=sys.stderr)  # fmt: skip
+    print(
+        f"{spec.name}: time is {screen.decision}: {screen.reason}; "
+        f"{'models are compared on val' if chosen.compares else name}",
+        file=sys.stderr,
+    )
     return chosen
 
 

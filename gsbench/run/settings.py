@@ -37,12 +37,16 @@ def check_compare(config: Config) -> None:
     if not config.effects.compare:
         return
     if not is_auto(config):
-        raise InputError(f"effects.compare=true: expected model=auto, whose candidates it compares, got "
-                         f"model={config.model.name}: leave effects.compare out, or use model=auto",
-                         docs=HOW_TO)  # fmt: skip
+        raise InputError(
+            f"effects.compare=true: expected model=auto, whose candidates it compares, got "
+            f"model={config.model.name}: leave effects.compare out, or use model=auto",
+            docs=HOW_TO,
+        )
     if config.scene.eval_split == "val":
-        raise InputError("effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
-                         "views by which the model is chosen would be too high; name a model instead")  # fmt: skip
+        raise InputError(
+            "effects.compare=true: expected results on test, got scene.eval_split=val: results on the "
+            "views by which the model is chosen would be too high; name a model instead"
+        )
 
 
 def check_values(config: Config) -> None:
@@ -73,15 +77,18 @@ def _check_steps(config: Config) -> None:
     """Raise InputError if learning rates are to fall after the last step."""
     step, length = config.train.cooldown_from, config.train.recipe_iterations
     if step is not None and step >= length:
-        raise InputError(f"train.cooldown_from: expected a step below train.recipe_iterations={length}, the length for "
-                         f"which steps are given, got {step}")  # fmt: skip
+        raise InputError(
+            f"train.cooldown_from: expected a step below train.recipe_iterations={length}, the length for "
+            f"which steps are given, got {step}"
+        )
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
     """Raise InputError if a learning rate is negative, or if a log-linear decay starts or ends at zero."""
     if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
-        raise InputError(f"{key}: expected start >= 0, and start > 0 with end > 0 or null, "
-                         f"got start {rate.start}, end {rate.end}")  # fmt: skip
+        raise InputError(
+            f"{key}: expected start >= 0, and start > 0 with end > 0 or null, got start {rate.start}, end {rate.end}"
+        )
 
 
 def _check_coarse(coarse: list[list[int]]) -> None:
@@ -94,9 +101,11 @@ def _check_coarse(coarse: list[list[int]]) -> None:
     fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
     rise = all(a < b for a, b in itertools.pairwise([0, *steps]))
     if not are_pairs or not fall or not rise:
-        raise InputError(f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "
-                         f"much smaller), factors falling and steps rising, such as [[4,3000],[2,15000]], "
-                         f"got {coarse}")  # fmt: skip
+        raise InputError(
+            f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "
+            f"much smaller), factors falling and steps rising, such as [[4,3000],[2,15000]], "
+            f"got {coarse}"
+        )
 
 
 def is_auto(config: Config) -> bool:

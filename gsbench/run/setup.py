@@ -98,9 +98,11 @@ def scene_folder(config: Config) -> Path:
         if folder.is_dir():
             return folder
     for root in _roots_nearby(data_root(data.root), names):
-        raise InputError(f"data.root={data.root}: expected the folder that holds {' or '.join(map(repr, names))}: "
-                         f"type {typed('data.root', str(root), several=False)}",
-                         docs="data.md#what-is-read")  # fmt: skip
+        raise InputError(
+            f"data.root={data.root}: expected the folder that holds {' or '.join(map(repr, names))}: "
+            f"type {typed('data.root', str(root), several=False)}",
+            docs="data.md#what-is-read",
+        )
     published = f"; {data.dataset} is published at: {data.published}" if data.published else ""
     raise InputError(
         f"data.root={data.root}: expected a folder {' or '.join(map(repr, names))} with a scene, such "
@@ -158,8 +160,10 @@ def trained_start(config: Config) -> TrainedGaussians | None:
         raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")
     present = hash_of(config.init.ply)
     if present != config.init.ply_sha256:
-        raise InputError(f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, got "
-                         f"{present}: another file, or one that has just changed")  # fmt: skip
+        raise InputError(
+            f"init.ply={config.init.ply}: expected the SHA-256 {config.init.ply_sha256!s:.70}, got "
+            f"{present}: another file, or one that has just changed"
+        )
     return trained
 
 
@@ -172,12 +176,16 @@ def check_start(trained: TrainedGaussians, scene: Scene) -> None:
     cameras = [view.camera.to("cpu") for view in scene.train]
     share = share_seen(trained, cameras, ENOUGH_SEEN)
     if share == 0:
-        raise InputError(f"init.ply: expected Gaussians of {scene.name}, no training camera sees one of the "
-                         f"{len(trained)}: is the file of another scene, or in other coordinates or units?",
-                         docs="viewing.md#start-from-a-ply")  # fmt: skip
+        raise InputError(
+            f"init.ply: expected Gaussians of {scene.name}, no training camera sees one of the "
+            f"{len(trained)}: is the file of another scene, or in other coordinates or units?",
+            docs="viewing.md#start-from-a-ply",
+        )
     if share < ENOUGH_SEEN:
-        print(f"{scene.name}: the training cameras see {share:.0%} of the Gaussians of init.ply: is it of this scene?",
-              file=sys.stderr)  # fmt: skip
+        print(
+            f"{scene.name}: the training cameras see {share:.0%} of the Gaussians of init.ply: is it of this scene?",
+            file=sys.stderr,
+        )
 
 
 def check_machine(config: Config) -> None:
@@ -221,8 +229,10 @@ def check_scene(model: GaussianModel, scene: Scene, config: Config) -> None:
             f"{what}: expected a scene with times, {scene.name} has none: use 3dgs or 6dgs, agr=false", docs="models.md"
         )
     if not scene.extent > 0:
-        raise InputError(f"{scene.name}: expected training cameras at different places, all are at one: sizes and "
-                         f"rates are relative to the cameras' radius, which is 0")  # fmt: skip
+        raise InputError(
+            f"{scene.name}: expected training cameras at different places, all are at one: sizes and "
+            f"rates are relative to the cameras' radius, which is 0"
+        )
     factor = max((pair[0] for pair in config.train.coarse or []), default=1)
     side = min(min(view.camera.width, view.camera.height) for view in scene.train)
     if side // factor < WINDOW:

@@ -35,8 +35,19 @@ _IMAGE = struct.Struct("<I4d3dI")  # id, quaternion (w first), translation, id o
 _POINT = struct.Struct("<Q3d3BdQ")  # id, position, colour, error, length of the track
 _KEYPOINT = 24  # bytes of a keypoint of an image
 _TRACK = 8  # bytes of an element of a track: the number of the image and that of the keypoint
-_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-           "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
+_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
 _PARAMETERS = {  # of the models that are read: f or fx fy, the principal point, the distortion
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -108,12 +119,16 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
     """Return the images of a model in the order of time, the SHA-256 of times.csv by name, if it exists, and notes."""
     posed_images = read_images(posed)
     if len(posed_images) < HELD_OUT:
-        raise InputError(f"{posed.path}: expected at least {HELD_OUT} images, as one in {HELD_OUT} is a test view, "
-                         f"got {len(posed_images)}", docs="data.md#your-own-capture")  # fmt: skip
+        raise InputError(
+            f"{posed.path}: expected at least {HELD_OUT} images, as one in {HELD_OUT} is a test view, "
+            f"got {len(posed_images)}",
+            docs="data.md#your-own-capture",
+        )
     for image in posed_images:
         if image.camera not in lenses:
-            raise InputError(f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number "
-                             f"{image.camera}")  # fmt: skip
+            raise InputError(
+                f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number {image.camera}"
+            )
     names, viewmats = [image.name for image in posed_images], np.stack([image.viewmat for image in posed_images])
     places = times.places_of(viewmats, [lenses[image.camera].key for image in posed_images])
     timed, digests = times.of_images(root, times.NamedImages(names, viewmats, places, posed.path))
@@ -157,8 +172,10 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
     rest = ", ".join(
         f"{folder.relative_to(sparse.parent)} has {counts[folder]}" for folder in models if folder != largest
     )
-    return largest, [f"several COLMAP models: {largest.relative_to(sparse.parent)} with the most images, "
-                     f"{counts[largest]}, is read; {rest}"]  # fmt: skip
+    return largest, [
+        f"several COLMAP models: {largest.relative_to(sparse.parent)} with the most images, "
+        f"{counts[largest]}, is read; {rest}"
+    ]
 
 
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
@@ -223,9 +240,11 @@ def _lens(model: str, width: int, height: int, values: tuple[float, ...], where:
 def _check_model(model: str, where: str) -> str:
     """Return the name of a lens model; raise InputError if it is not read."""
     if model not in _PARAMETERS:
-        raise InputError(f"{where}: expected a camera {', '.join(_PARAMETERS)}, got {model[:40]!a}: undo its "
-                         "distortion by `colmap image_undistorter`, which writes PINHOLE",
-                         docs="data.md#your-own-capture")  # fmt: skip
+        raise InputError(
+            f"{where}: expected a camera {', '.join(_PARAMETERS)}, got {model[:40]!a}: undo its "
+            "distortion by `colmap image_undistorter`, which writes PINHOLE",
+            docs="data.md#your-own-capture",
+        )
     return model
 
 
@@ -277,10 +296,12 @@ def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
             row = words[9], tuple(float(word) for word in words[1:8]), int(words[8])
         line_number, line = next(lines, (line_number + 1, ""))
         if not _are_keypoints(line.split()):
-            raise InputError(f"{file.path}: line {line_number}: expected the keypoints (x y id ..) of image "
-                             f"{row[0][:40]!a} or an empty line, got {line[:60]!a}: write an empty line after each "
-                             "image",
-                             docs="data.md#your-own-capture")  # fmt: skip
+            raise InputError(
+                f"{file.path}: line {line_number}: expected the keypoints (x y id ..) of image "
+                f"{row[0][:40]!a} or an empty line, got {line[:60]!a}: write an empty line after each "
+                "image",
+                docs="data.md#your-own-capture",
+            )
         yield row
 
 
@@ -356,11 +377,13 @@ class _Reader:
         """Advance by `size` bytes."""
         self._at += size
         if self._at > len(self._data):
-            raise InputError(f"{self._path}: truncated, its records need more than its {len(self._data)} bytes: "
-                             "copy it again")  # fmt: skip
+            raise InputError(
+                f"{self._path}: truncated, its records need more than its {len(self._data)} bytes: copy it again"
+            )
 
     def finish(self) -> None:
         """Raise InputError unless all bytes were read."""
         if self._at != len(self._data):
-            raise InputError(f"{self._path}: expected {self._at} bytes for its records, got {len(self._data)}: "
-                             "copy it again")  # fmt: skip
+            raise InputError(
+                f"{self._path}: expected {self._at} bytes for its records, got {len(self._data)}: copy it again"
+            )

@@ -28,8 +28,9 @@ def find_inside(
         raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is not printable: rename it")
     path = Path(os.path.normpath(root / name))
     if _DRIVE.match(name) or (os.path.isabs(name) and not path.is_relative_to(root)):
-        raise InputError(f"{where}: expected a path inside {root}, got {name!r}, which is absolute: write it relative "
-                         "to that folder")  # fmt: skip
+        raise InputError(
+            f"{where}: expected a path inside {root}, got {name!r}, which is absolute: write it relative to that folder"
+        )
     if not path.is_relative_to(root):
         raise InputError(
             f"{where}: expected a path inside {root}, got {name!r}, which leaves it: move the file into the folder, or "

@@ -109,12 +109,33 @@ def ply_of(trained: TrainedGaussians) -> bytes:
             raise InputError(f"PLY: expected finite {name}, some are not: has the training diverged?")
     rest = torch.zeros(N, K - 1, 3)
     rest[:, : trained.rest.shape[1]] = trained.rest
-    columns = [trained.means, torch.zeros(N, 3), trained.dc, rest.mT.flatten(1), trained.logits[:, None],
-             trained.log_scales, trained.quats]  # fmt: skip
-    names = [*_COLUMNS["means"], "nx", "ny", "nz", *_COLUMNS["dc"], *(f"f_rest_{i}" for i in range(3 * (K - 1))),
-             *_COLUMNS["logits"], *_COLUMNS["log_scales"], *_COLUMNS["quats"]]  # fmt: skip
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {N}",
-              *(f"property float {name}" for name in names), "end_header\n"]  # fmt: skip
+    columns = [
+        trained.means,
+        torch.zeros(N, 3),
+        trained.dc,
+        rest.mT.flatten(1),
+        trained.logits[:, None],
+        trained.log_scales,
+        trained.quats,
+    ]
+    names = [
+        *_COLUMNS["means"],
+        "nx",
+        "ny",
+        "nz",
+        *_COLUMNS["dc"],
+        *(f"f_rest_{i}" for i in range(3 * (K - 1))),
+        *_COLUMNS["logits"],
+        *_COLUMNS["log_scales"],
+        *_COLUMNS["quats"],
+    ]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {N}",
+        *(f"property float {name}" for name in names),
+        "end_header\n",
+    ]
     return "\n".join(header).encode() + torch.cat(columns, 1).numpy().astype("<f4").tobytes()
 
 
@@ -155,8 +176,11 @@ def _with_finite_logits(vertices: NDArray[np.void], path: Path) -> NDArray[np.vo
     if infinite.any():
         vertices = vertices.copy()  # of a file, which is read only
         vertices["opacity"][infinite] = np.copysign(_LARGEST_LOGIT, vertices["opacity"][infinite])
-        print(f"{path}: {int(infinite.sum())} of {len(vertices)} opacities are exactly 0 or 1, taken for "
-              f"{1 - ALPHA_MAX:.3f} or {ALPHA_MAX:.3f}", file=sys.stderr)  # fmt: skip
+        print(
+            f"{path}: {int(infinite.sum())} of {len(vertices)} opacities are exactly 0 or 1, taken for "
+            f"{1 - ALPHA_MAX:.3f} or {ALPHA_MAX:.3f}",
+            file=sys.stderr,
+        )
     return vertices
 
 
@@ -176,8 +200,11 @@ def _fuse(
     lower = (scales - wider).sum(1)  # ln of the factor of the opacity, at most 0
     odds = torch.logaddexp(torch.zeros_like(logits), logits + (-torch.expm1(lower)).log())
     read["log_scales"], read["logits"] = wider.float(), (logits + lower - odds).float()
-    print(f"{path}: {FILTER} of Mip-Splatting is now a part of scales and opacities; its filter of images is "
-          f"raster.antialias=true", file=sys.stderr)  # fmt: skip
+    print(
+        f"{path}: {FILTER} of Mip-Splatting is now a part of scales and opacities; its filter of images is "
+        f"raster.antialias=true",
+        file=sys.stderr,
+    )
 
 
 def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:  # [N, len(names)] float32
@@ -191,20 +218,32 @@ def _check_columns(names: Sequence[str], path: Path) -> list[str]:
         raise compressed(path, "SuperSplat's columns packed_*")
     for method, pattern in _METHODS.items():
         if others := [name for name in names if re.fullmatch(pattern, name)]:
-            raise refused(path, f"expected Gaussians of 3DGS, the columns {_shortened(others):.200} are of {method} "
-                                 f"and change the look: give a PLY of 3D Gaussians, for instance those of one time, "
-                                 f"or remove the columns")  # fmt: skip
+            raise refused(
+                path,
+                f"expected Gaussians of 3DGS, the columns {_shortened(others):.200} are of {method} "
+                f"and change the look: give a PLY of 3D Gaussians, for instance those of one time, "
+                f"or remove the columns",
+            )
     missing = [name for name in needed if name not in names]
     if missing == ["scale_2"]:
-        raise refused(path, "expected scale_0..2, found two scales, of surfels (2DGS): add a column scale_2 of -16, "
-                             "which makes them flat Gaussians")  # fmt: skip
+        raise refused(
+            path,
+            "expected scale_0..2, found two scales, of surfels (2DGS): add a column scale_2 of -16, "
+            "which makes them flat Gaussians",
+        )
     if missing:
-        raise refused(path, f"expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and f_rest_*, "
-                             f"found no '{missing[0]}': is it a cloud of points?")  # fmt: skip
+        raise refused(
+            path,
+            f"expected trained Gaussians, x y z f_dc_0..2 opacity scale_0..2 rot_0..3 and f_rest_*, "
+            f"found no '{missing[0]}': is it a cloud of points?",
+        )
     others = [name for name in names if name not in (*needed, FILTER) and not name.startswith("f_rest_")]
     if unknown := [name for name in others if not _HARMLESS.fullmatch(name)]:
-        raise refused(path, f"expected the columns of 3DGS, found {_shortened(unknown):.200} too, which gsbench does "
-                             f"not know: remove them if they do not change the look")  # fmt: skip
+        raise refused(
+            path,
+            f"expected the columns of 3DGS, found {_shortened(unknown):.200} too, which gsbench does "
+            f"not know: remove them if they do not change the look",
+        )
     return others
 
 

@@ -125,8 +125,9 @@ def reduced_size(size: Size, downscale: int, where: str) -> Size:
     """Return the width and height of an image that is reduced `downscale` times, each rounded, halves up."""
     width, height = ((2 * side + downscale) // (2 * downscale) for side in size)
     if not width or not height:
-        raise InputError(f"{where}: expected a downscale that leaves pixels, got downscale={downscale} for "
-                         f"{size[0]}x{size[1]}")  # fmt: skip
+        raise InputError(
+            f"{where}: expected a downscale that leaves pixels, got downscale={downscale} for {size[0]}x{size[1]}"
+        )
     return width, height
 
 

@@ -115,14 +115,18 @@ def place_and_size(
 
 def gaussians_to_standard(trained: TrainedGaussians, placement: Placement) -> TrainedGaussians:
     """Convert trained Gaussians from the user's coordinates to those of the training."""
-    return replace(trained, means=placement.to_standard(trained.means),
-                   log_scales=trained.log_scales - math.log(placement.unit))  # fmt: skip
+    return replace(
+        trained, means=placement.to_standard(trained.means), log_scales=trained.log_scales - math.log(placement.unit)
+    )
 
 
 def gaussians_to_user(trained: TrainedGaussians, placement: Placement) -> TrainedGaussians:
     """Convert trained Gaussians from the coordinates of the training to the user's."""
-    return replace(trained, means=placement.to_user(trained.means).float(),
-                   log_scales=trained.log_scales + math.log(placement.unit))  # fmt: skip
+    return replace(
+        trained,
+        means=placement.to_user(trained.means).float(),
+        log_scales=trained.log_scales + math.log(placement.unit),
+    )
 
 
 def _placement(middle: NDArray[np.float64], size: float) -> Placement:
@@ -147,12 +151,16 @@ def _notes(placement: Placement, is_near: Tensor) -> list[str]:
     """Return sentences on a scene that is moved or rescaled, and on cameras that lie far away; `is_near`: [C] bool."""
     notes = []
     if not placement.is_identity:
-        notes.append(f"trained in units of {placement.unit:g} around {_text(placement.center)}, where the cameras "
-                     f"look; PLY files and positions stay in your coordinates")  # fmt: skip
+        notes.append(
+            f"trained in units of {placement.unit:g} around {_text(placement.center)}, where the cameras "
+            f"look; PLY files and positions stay in your coordinates"
+        )
     if not is_near.all():
-        notes.append(f"{int((~is_near).sum())} of {len(is_near)} training cameras lie far from the others, over "
-                     f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the size "
-                     f"of the scene")  # fmt: skip
+        notes.append(
+            f"{int((~is_near).sum())} of {len(is_near)} training cameras lie far from the others, over "
+            f"{_FAR_CAMERA:g} times their distance: are their poses right? They do not count for the size "
+            f"of the scene"
+        )
     return notes
 
 
@@ -162,8 +170,10 @@ def _notes_of_points(points: Points, share: float, *, is_far_away: bool) -> list
     if share < _ENOUGH_SEEN:
         notes.append(f"the training cameras see {share:.1%} of the points: {_COORDINATES}")
     if is_far_away:
-        notes.append(f"half of the points lie over {_FAR_POINTS:g} times as far away as the cameras from what these "
-                     f"look at: {_COORDINATES}")  # fmt: skip
+        notes.append(
+            f"half of the points lie over {_FAR_POINTS:g} times as far away as the cameras from what these "
+            f"look at: {_COORDINATES}"
+        )
     if far := int(far_outside(points.means).sum()):
         notes.append(f"{far} of {len(points.means)} points lie far outside, and do not count for its size")
     return notes
@@ -187,9 +197,12 @@ def _seen_points(
         visible.append(inside.numpy())
         depths.append((inside @ camera.viewmat[2, :3] + camera.viewmat[2, 3]).numpy())
     if not is_any.any():
-        raise InputError(f"{name}: expected initial points that a training camera sees, they see none of the "
-                         f"{len(points.means)}: are points and poses of one capture, and in the same coordinates and "
-                         f"units?", docs="data.md#where-a-scene-lies")  # fmt: skip
+        raise InputError(
+            f"{name}: expected initial points that a training camera sees, they see none of the "
+            f"{len(points.means)}: are points and poses of one capture, and in the same coordinates and "
+            f"units?",
+            docs="data.md#where-a-scene-lies",
+        )
     return (np.concatenate(visible), np.concatenate(depths)), float(is_any.double().mean())
 
 

@@ -32,9 +32,14 @@ _ASCII_VALUE = 100  # bytes of memory that a value needs while it is parsed
 _HEADER_LIMIT = 65536  # bytes; a 3DGS header of 62 properties takes 1,600
 _HEADER_END = re.compile(rb"\nend_header[ \t]*\r?\n")
 _COMPRESSED = {  # by the first bytes, or by the suffix
-    b"NGSP": "SPZ", b"\x1f\x8b": "gzip, as SPZ", b"PK\x03\x04": "ZIP, as SOG",
-    ".spz": "SPZ", ".sog": "SOG", ".splat": "SPLAT", ".ksplat": "KSPLAT",
-}  # fmt: skip
+    b"NGSP": "SPZ",
+    b"\x1f\x8b": "gzip, as SPZ",
+    b"PK\x03\x04": "ZIP, as SOG",
+    ".spz": "SPZ",
+    ".sog": "SOG",
+    ".splat": "SPLAT",
+    ".ksplat": "KSPLAT",
+}
 _PICKLE, _HEAD = b"data.pkl", 256  # name of the first file in a checkpoint of PyTorch, and where it stands
 
 
@@ -74,8 +79,10 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     start = end.end() + sum(element.size for element in before)
     available = max(len(data) - start, 0)
     if vertices.size > available:
-        raise InputError(f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
-                         f"{available}: truncated")  # fmt: skip
+        raise InputError(
+            f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
+            f"{available}: truncated"
+        )
     return np.frombuffer(data, vertices.dtype, vertices.rows, start)
 
 
@@ -94,8 +101,9 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _El
             case [["element", name, count], *rest] if re.fullmatch("[0-9]{1,18}", count):
                 fields, rest = _read_properties(name, rest, _ENCODINGS[encoding], path)
             case _:
-                raise InputError(f"{path}: expected 'element vertex <count>', or another element first, got "
-                                 f"{rest[:1]!r:.80}")  # fmt: skip
+                raise InputError(
+                    f"{path}: expected 'element vertex <count>', or another element first, got {rest[:1]!r:.80}"
+                )
         element = _Element(int(count), np.dtype(list(fields.items())))
         if name == "vertex":
             if not element.values:
@@ -117,8 +125,10 @@ def _read_properties(
             case ["property", kind, name] if kind in _TYPES and name not in fields:
                 fields[name] = order + _TYPES[kind]
             case _:
-                raise InputError(f"{path}: element {element:.80}: expected distinct scalar properties, as far as the "
-                                 f"vertices, got {line!r:.80}")  # fmt: skip
+                raise InputError(
+                    f"{path}: element {element:.80}: expected distinct scalar properties, as far as the "
+                    f"vertices, got {line!r:.80}"
+                )
     return fields, []
 
 
@@ -152,8 +162,10 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> ND
 def _check_readable(path: Path, data: bytes) -> None:
     """Raise InputError if the bytes of a file that is no PLY, or its suffix, are of a compressed format."""
     if data.startswith(b"PK\x03\x04") and _PICKLE in data[:_HEAD]:
-        raise refused(path, "expected a PLY of 3DGS, this file is a checkpoint of PyTorch: export a PLY with the "
-                             "program that wrote it")  # fmt: skip
+        raise refused(
+            path,
+            "expected a PLY of 3DGS, this file is a checkpoint of PyTorch: export a PLY with the program that wrote it",
+        )
     for mark, form in _COMPRESSED.items():
         if data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark:
             raise compressed(path, form)
@@ -168,8 +180,10 @@ def columns(vertices: NDArray[np.void], names: Sequence[str], path: Path, larges
     bad = ~(np.abs(table) <= largest)
     if bad.any():
         named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
-        raise InputError(f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
-                         f"vertices have others: remove them")  # fmt: skip
+        raise InputError(
+            f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
+            f"vertices have others: remove them"
+        )
     return table
 
 

@@ -67,8 +67,10 @@ def frustum_points(
         if len(drawn) >= count:
             colors = 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255
             return Points(drawn[:count].contiguous(), colors)
-    raise InputError(f"initial points: expected training cameras that see something in common, {len(drawn)} of "
-                     f"{ROUNDS * count} random points are seen by all: set data.initial_half_width")  # fmt: skip
+    raise InputError(
+        f"initial points: expected training cameras that see something in common, {len(drawn)} of "
+        f"{ROUNDS * count} random points are seen by all: set data.initial_half_width"
+    )
 
 
 def is_seen(points: Tensor, camera: Camera) -> Tensor:  # [P, 3] in the dtype of the camera -> [P] bool

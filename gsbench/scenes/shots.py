@@ -85,8 +85,10 @@ class Lens:
                 return cv2.remap(pixels, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
         except cv2.error:
             pass
-        raise InputError(f"{where}: OpenCV cannot undo the distortion k1 k2 p1 p2 = {self.distortion}: undo it by "
-                         "`colmap image_undistorter`")  # fmt: skip
+        raise InputError(
+            f"{where}: OpenCV cannot undo the distortion k1 k2 p1 p2 = {self.distortion}: undo it by "
+            "`colmap image_undistorter`"
+        )
 
 
 @dataclass(frozen=True)
@@ -136,8 +138,10 @@ def read(
         decoded = decode(shot, data)
         lens = _lens_of_image((decoded.shape[1], decoded.shape[0]), size, shot)
         if decoded.shape[2] == 4 and any(lens.distortion):
-            raise InputError(f"{shot.where}: expected an image without alpha, as its camera has distortion: undo it by "
-                             "`colmap image_undistorter`")  # fmt: skip
+            raise InputError(
+                f"{shot.where}: expected an image without alpha, as its camera has distortion: undo it by "
+                "`colmap image_undistorter`"
+            )
         pixels = lens.undistort(decoded, shot.where)
         is_kept = in_8_bits and pixels.dtype == np.uint8
         image = torch.from_numpy(pixels) if is_kept else images.composite(pixels, rendition, reduced)
@@ -154,8 +158,10 @@ def read(
         views, digests, turned = zip(*pool.map(read_one, shots), strict=True)
     notes = _notes(shots, size, reduced, downscale)
     if any(turned):
-        notes.append(f"{sum(turned)} of {len(shots)} images have an EXIF orientation, which is not applied: if the "
-                     f"program that wrote the poses applied it, turn the pixels and remove the tag")  # fmt: skip
+        notes.append(
+            f"{sum(turned)} of {len(shots)} images have an EXIF orientation, which is not applied: if the "
+            f"program that wrote the poses applied it, turn the pixels and remove the tag"
+        )
     return Shots(list(views), list(digests), notes)
 
 
@@ -164,12 +170,17 @@ def _lens_of_image(size: Size, expected: Size, shot: Shot) -> Lens:
     lens = shot.lens.resized(*size)
     if lens is None:
         stated, actual = f"{shot.lens.width}x{shot.lens.height}", f"{size[0]}x{size[1]}"
-        raise InputError(f"{shot.where}: expected {stated} as its camera, or both sides resized by one ratio, "
-                         f"got {actual}: use the images that its camera is of, not turned, and scene.downscale",
-                         docs="data.md#cameras-and-images")  # fmt: skip
+        raise InputError(
+            f"{shot.where}: expected {stated} as its camera, or both sides resized by one ratio, "
+            f"got {actual}: use the images that its camera is of, not turned, and scene.downscale",
+            docs="data.md#cameras-and-images",
+        )
     if size != expected:
-        raise InputError(f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
-                         f"{size[0]}x{size[1]}: use images of one size", docs="data.md#what-is-read")  # fmt: skip
+        raise InputError(
+            f"{shot.where}: expected {expected[0]}x{expected[1]} as the first image, got "
+            f"{size[0]}x{size[1]}: use images of one size",
+            docs="data.md#what-is-read",
+        )
     return lens
 
 
@@ -179,11 +190,15 @@ def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> 
     cameras = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
     if cameras:
         stated = f"{cameras[0][0]}x{cameras[0][1]}"
-        notes.append(f"images of {size[0]}x{size[1]} are resized from those of their camera, {stated}, "
-                     "whose intrinsics are scaled with them")  # fmt: skip
+        notes.append(
+            f"images of {size[0]}x{size[1]} are resized from those of their camera, {stated}, "
+            "whose intrinsics are scaled with them"
+        )
     if (reduced[0] * downscale, reduced[1] * downscale) != size:
-        notes.append(f"images of {size[0]}x{size[1]} are reduced to {reduced[0]}x{reduced[1]}, as {downscale} does not "
-                     "divide their size")  # fmt: skip
+        notes.append(
+            f"images of {size[0]}x{size[1]} are reduced to {reduced[0]}x{reduced[1]}, as {downscale} does not "
+            "divide their size"
+        )
     return notes
 
 

@@ -63,8 +63,10 @@ def load(
     text = read_file(source, str(source), _MAX_TEXT)
     rows = _read_rows(text.decode("utf-8", "replace"), source)
     if len(rows) <= TEST_CAMERA:
-        raise InputError(f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
-                         f"got {len(rows)}")  # fmt: skip
+        raise InputError(
+            f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
+            f"got {len(rows)}"
+        )
     listed = _list_images(root, frames, len(rows))
     replaced = _replacements(repair, listed)
     views, digests = _read_views(listed, replaced, rows, rendition)
@@ -104,8 +106,10 @@ def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
         }
         for name in ("sk", *DISTORTION):
             if row.get(name, 0.0) != 0:
-                raise InputError(f"{where}: {name}: expected 0, a pinhole camera, got {row[name]}: take the release's "
-                                 f"*_undist_* images with their parameters, or undistort by cv2.undistort")  # fmt: skip
+                raise InputError(
+                    f"{where}: {name}: expected 0, a pinhole camera, got {row[name]}: take the release's "
+                    f"*_undist_* images with their parameters, or undistort by cv2.undistort"
+                )
         if row["f"] <= 0 or row["ar"] <= 0:
             raise InputError(f"{where}: expected positive f and ar, got {row['f']} and {row['ar']}")
         if abs(math.hypot(row["qw"], row["qx"], row["qy"], row["qz"]) - 1) > _UNIT:
@@ -143,8 +147,10 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
     for frame in numbers:
         for camera in range(cameras):
             if (frame, camera) not in by_number:
-                raise InputError(f"{root}: expected an image *_undist_{frame:05d}_{camera:02d}.png of every camera in "
-                                 f"{CAMERAS}, it is missing: copy it, or choose other scene.frames")  # fmt: skip
+                raise InputError(
+                    f"{root}: expected an image *_undist_{frame:05d}_{camera:02d}.png of every camera in "
+                    f"{CAMERAS}, it is missing: copy it, or choose other scene.frames"
+                )
     return [_Image(by_number[frame, camera], frame, camera) for frame in numbers for camera in range(cameras)]
 
 
@@ -163,11 +169,15 @@ def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, 
         if (frame, camera) not in by_number:
             raise InputError(f"data.repair: expected an image that is loaded, got {name!a:.80}: leave it out")
         if camera == TEST_CAMERA:
-            raise InputError(f"data.repair: expected a training image, {name} is a test image, and a test needs the "
-                             "true one: choose other scene.frames")  # fmt: skip
+            raise InputError(
+                f"data.repair: expected a training image, {name} is a test image, and a test needs the "
+                "true one: choose other scene.frames"
+            )
         if (frame - 1, camera) not in by_number:
-            raise InputError(f"data.repair: {name}: expected the image of its camera in frame {frame - 1}, it is not "
-                             "loaded: choose other scene.frames")  # fmt: skip
+            raise InputError(
+                f"data.repair: {name}: expected the image of its camera in frame {frame - 1}, it is not "
+                "loaded: choose other scene.frames"
+            )
         replaced[by_number[frame, camera]] = by_number[frame - 1, camera]
     return replaced
 
@@ -187,10 +197,16 @@ def _read_views(
     cameras = [_camera(row, size) for row in rows]
     by_path = {image.path: image for image in listed}
     listed_shots = [
-        Shot(image.path, None, image.path.stem, str(image.path), (image.frame - first) / max(1, last - first),
-             *cameras[image.camera])
+        Shot(
+            image.path,
+            None,
+            image.path.stem,
+            str(image.path),
+            (image.frame - first) / max(1, last - first),
+            *cameras[image.camera],
+        )
         for image in listed
-    ]  # fmt: skip
+    ]
 
     def decode(shot: Shot, data: bytes) -> images.Pixels:
         image = by_path[shot.path]

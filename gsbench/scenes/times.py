@@ -192,8 +192,10 @@ def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of
     used = [name if name in table else next(iter(loose.get(_loose(name), [""]))) for name in images.names]
     missing = next((name for name, row in zip(images.names, used, strict=True) if not row), None)
     if missing is not None:
-        raise InputError(f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
-                         docs="data.md#times")  # fmt: skip
+        raise InputError(
+            f"{path}: expected a time of each image of the model, got none of {missing[:80]!a}: add it",
+            docs="data.md#times",
+        )
     values = [table[name] for name in used]
     spare = len(table) - len(set(used))
     rest = f"; {spare} rows of other images are left out" if spare else ""
@@ -225,9 +227,11 @@ def of_fields(
     for file, times in values.items():
         is_small = 0 <= min(times) < max(times) <= 1
         if is_small and max(times) - min(times) < _FEW * (last - first):
-            raise InputError(f"{file}: time: expected the unit of the other files, got {min(times):.10g} to "
-                             f"{max(times):.10g}, and over all files {first:.10g} to {last:.10g}: scale all to [0, 1]",
-                             docs="data.md#times")  # fmt: skip
+            raise InputError(
+                f"{file}: time: expected the unit of the other files, got {min(times):.10g} to "
+                f"{max(times):.10g}, and over all files {first:.10g} to {last:.10g}: scale all to [0, 1]",
+                docs="data.md#times",
+            )
     scaled = iter(_scaled([Fraction(value) for value in all_times]))
     note = f"times: the field 'time', {first:.10g} to {last:.10g}, scaled to [0, 1] over all splits"
     return {file: [next(scaled) for _ in times] for file, times in values.items()}, [note]
@@ -244,8 +248,11 @@ def check_distinct(
     for name, time, place in zip(images.names, times, images.places, strict=True):
         other = name if time is None else first.setdefault((place, time), name)
         if other != name:
-            raise InputError(f"{source}: images {other[:80]!a} and {name[:80]!a}: expected different times, as their "
-                             f"pose and intrinsics are equal, got the same: {cure}", docs="data.md#times")  # fmt: skip
+            raise InputError(
+                f"{source}: images {other[:80]!a} and {name[:80]!a}: expected different times, as their "
+                f"pose and intrinsics are equal, got the same: {cure}",
+                docs="data.md#times",
+            )
 
 
 def _columns(images: NamedImages) -> list[_Column]:
@@ -255,15 +262,24 @@ def _columns(images: NamedImages) -> list[_Column]:
     least = min(len(row) for row in numbers)
     if not least and any(numbers):
         name = next(name for name, row in zip(names, numbers, strict=True) if not row)
-        raise InputError(f"{source}: image {name[:80]!a}: expected a number in its name, as others have: rename it, or "
-                         f"write {TABLE}", docs="data.md#times")  # fmt: skip
-    columns = [_Column(tuple(row[at] for row in numbers), len(numbers[0]) + at + 1, len(numbers[0]))
-               for at in range(-least, 0)]  # fmt: skip
+        raise InputError(
+            f"{source}: image {name[:80]!a}: expected a number in its name, as others have: rename it, or "
+            f"write {TABLE}",
+            docs="data.md#times",
+        )
+    columns = [
+        _Column(tuple(row[at] for row in numbers), len(numbers[0]) + at + 1, len(numbers[0])) for at in range(-least, 0)
+    ]
     if len({len(row) for row in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
-        few, many = (next(name for name, row in zip(names, numbers, strict=True) if len(row) == count)
-                     for count in (least, max(map(len, numbers))))  # fmt: skip
-        raise InputError(f"{source}: images {few[:60]!a} and {many[:60]!a}: expected names of one form, the first has "
-                         f"fewer numbers: rename them, or write {TABLE}", docs="data.md#times")  # fmt: skip
+        few, many = (
+            next(name for name, row in zip(names, numbers, strict=True) if len(row) == count)
+            for count in (least, max(map(len, numbers)))
+        )
+        raise InputError(
+            f"{source}: images {few[:60]!a} and {many[:60]!a}: expected names of one form, the first has "
+            f"fewer numbers: rename them, or write {TABLE}",
+            docs="data.md#times",
+        )
     return columns
 
 
@@ -286,8 +302,11 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
         for start, end in _spans(name, moment, pattern):
             label = name[label_start:start].rpartition("/")[2]
             is_moment = moment is not None and (start, end) == moment.span()
-            value = (_seconds(moment, source) if is_moment and moment else
-                     _exact(name[start:end], f"{source}: image {name[start:end][:40]}"))  # fmt: skip
+            value = (
+                _seconds(moment, source)
+                if is_moment and moment
+                else _exact(name[start:end], f"{source}: image {name[start:end][:40]}")
+            )
             of_name.append(_Number(value, label, is_moment))
             label_start = end
         by_name.append(of_name)
@@ -318,8 +337,10 @@ def _seconds(moment: re.Match[str], source: Path) -> Fraction:
         year, month, day = (int(fields.get(key) or 1) for key in "YmD")
         days = date(year, month, day).toordinal()
     except ValueError:
-        raise InputError(f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
-                         docs="data.md#times") from None  # fmt: skip
+        raise InputError(
+            f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
+            docs="data.md#times",
+        ) from None
     hour = int(fields["H"])
     if half := fields.get("half"):
         hour = hour % 12 + 12 * (half in "Pp")
@@ -357,9 +378,11 @@ def _time_among(changing: list[_Column], images: NamedImages) -> _Column | None:
     if len(candidates) == 1:
         return candidates[0]
     first_values = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
-    raise InputError(f"{images.source}: image {images.names[0][:80]!a}: expected one number that is the time, "
-                     f"got {first_values}, which all change from image to image: write {TABLE}",
-                     docs="data.md#times")  # fmt: skip
+    raise InputError(
+        f"{images.source}: image {images.names[0][:80]!a}: expected one number that is the time, "
+        f"got {first_values}, which all change from image to image: write {TABLE}",
+        docs="data.md#times",
+    )
 
 
 def _changes_at_a_place(column: _Column, places: Sequence[Hashable]) -> bool:

@@ -68,13 +68,17 @@ class Intrinsics:
             width, height = (round(side or 0) for side in self.size)
         for key, stated, actual in zip("wh", self.size, (width, height), strict=True):
             if stated is not None and stated != actual:
-                raise InputError(f"{self.where}: {key}: expected the images' own {actual}, got {stated}: scale all "
-                                 "intrinsics with it, or write both w and h")  # fmt: skip
+                raise InputError(
+                    f"{self.where}: {key}: expected the images' own {actual}, got {stated}: scale all "
+                    "intrinsics with it, or write both w and h"
+                )
         fx, fy = (self._focal(axis, side) for axis, side in enumerate((width, height)))
         fx, fy = fx or fy or 0.0, fy or fx or 0.0
         if self.y_of_file and abs(fx - fy) > _AGREE * fx:
-            raise InputError(f"{self.where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
-                             f"differs ({fy:.6g}, not {fx:.6g}): write it in the frame")  # fmt: skip
+            raise InputError(
+                f"{self.where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
+                f"differs ({fy:.6g}, not {fx:.6g}): write it in the frame"
+            )
         cx, cy = (side / 2 if at is None else at for at, side in zip(self.principal, (width, height), strict=True))
         return Lens(width, height, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (0.0, 0.0, 0.0, 0.0))
 
@@ -84,8 +88,10 @@ class Intrinsics:
         of_angle = None if angle is None else 0.5 * side / math.tan(0.5 * angle)
         if focal is not None and of_angle is not None and abs(of_angle - focal) > _AGREE * focal:
             keys = _AXES[axis]
-            raise InputError(f"{self.where}: {keys[0]}: expected {of_angle:.6g} as {keys[1]} says for {side} pixels, "
-                             f"got {focal:.6g}: leave out the wrong one, or write w and h of its images")  # fmt: skip
+            raise InputError(
+                f"{self.where}: {keys[0]}: expected {of_angle:.6g} as {keys[1]} says for {side} pixels, "
+                f"got {focal:.6g}: leave out the wrong one, or write w and h of its images"
+            )
         return of_angle if focal is None else focal
 
 
@@ -137,8 +143,9 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
         splits["val"] = _read_split(root, "transforms_val.json", finder)
     timed, notes = _times(list(splits.values()))
     size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)
-    listed = [shot for split, part in zip(splits.values(), timed, strict=True)
-              for shot in _shots_of(split.frames, part, size)]  # fmt: skip
+    listed = [
+        shot for split, part in zip(splits.values(), timed, strict=True) for shot in _shots_of(split.frames, part, size)
+    ]
     loaded = shots.read(listed, rendition)
     in_order = iter(loaded.views)
     views = {name: list(islice(in_order, len(split.frames))) for name, split in splits.items()}
@@ -235,10 +242,17 @@ def _read_split(
 def _shots_of(frames: Sequence[Frame], timed: Sequence[float | None], size: Size) -> list[Shot]:
     """Return what is needed to read the images of frames; `size` is the width and height of the first image."""
     return [
-        Shot(frame.path, frame.mask, files.without_suffix(frame.name), frame.where, time, frame.viewmat,
-             frame.intrinsics.lens(size))
+        Shot(
+            frame.path,
+            frame.mask,
+            files.without_suffix(frame.name),
+            frame.where,
+            time,
+            frame.viewmat,
+            frame.intrinsics.lens(size),
+        )
         for frame, time in zip(frames, timed, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _named_images(split: Split) -> times.NamedImages:
@@ -322,15 +336,19 @@ def _check_all_or_none(splits: Sequence[Split]) -> None:
 def _shared_views(views: dict[str, list[View]], loaded: Shots) -> list[str]:
     """Return sentences on images that two splits share, with the same pose and time."""
     digests = dict(zip(map(id, loaded.views), loaded.digests, strict=True))
-    keys_of = {split: [(digests[id(view)], view.camera.viewmat.numpy().tobytes(), view.time) for view in listed]
-               for split, listed in views.items()}  # fmt: skip
+    keys_of = {
+        split: [(digests[id(view)], view.camera.viewmat.numpy().tobytes(), view.time) for view in listed]
+        for split, listed in views.items()
+    }
     notes = []
     for part, other in (("test", "train"), ("test", "val"), ("val", "train")):
         if part in keys_of and other in keys_of:
             shared = set(keys_of[other])
             if count := sum(key in shared for key in keys_of[part]):
-                notes.append(f"{count} of {len(keys_of[part])} views of {part} are views of {other} too (image, pose "
-                             f"and time are equal): PSNR on {part} is not that of unseen views")  # fmt: skip
+                notes.append(
+                    f"{count} of {len(keys_of[part])} views of {part} are views of {other} too (image, pose "
+                    f"and time are equal): PSNR on {part} is not that of unseen views"
+                )
     return notes
 
 
@@ -341,8 +359,10 @@ def _split_views(
     lists: list[Any] = [split.content.get(key) for key in _SPLITS]
     if lists == [None, None, None]:
         if len(views) < HELD_OUT:
-            raise InputError(f"{split.source}: frames: expected at least {HELD_OUT}, as one in {HELD_OUT} is a test "
-                             f"view, got {len(views)}: list train_filenames and test_filenames")  # fmt: skip
+            raise InputError(
+                f"{split.source}: frames: expected at least {HELD_OUT}, as one in {HELD_OUT} is a test "
+                f"view, got {len(views)}: list train_filenames and test_filenames"
+            )
         train, test = hold_out(sorted(views, key=lambda view: (view.time or 0.0, view.name)), HELD_OUT)
         return train, [], test, f"split: every {HELD_OUT}th view in the order of time is a test view"
     by_path = {frame.path: view for frame, view in zip(split.frames, views, strict=True)}
@@ -357,8 +377,10 @@ def _split_views(
         by_split.append(of_split)
     train, val, test = by_split
     if not train or not test:
-        raise InputError(f"{split.source}: expected images in train_filenames and test_filenames, got {len(train)} and "
-                         f"{len(test)}: list them, or leave out all three lists")  # fmt: skip
+        raise InputError(
+            f"{split.source}: expected images in train_filenames and test_filenames, got {len(train)} and "
+            f"{len(test)}: list them, or leave out all three lists"
+        )
     return train, val, test, f"split: as the file lists, {len(train)}, {len(val)} and {len(test)} of {len(views)} views"
 
 
@@ -374,12 +396,16 @@ def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], sourc
         key: frame[key] for key in of_frame
     }
     if not any(key in merged for axis in _AXES for key in axis):
-        raise InputError(f"{where}: expected intrinsics as 'camera_angle_x' or 'fl_x' here or for the whole file, "
-                         "found neither")  # fmt: skip
+        raise InputError(
+            f"{where}: expected intrinsics as 'camera_angle_x' or 'fl_x' here or for the whole file, found neither"
+        )
     where = where if of_frame else source
     _check_pinhole(merged, where)
-    values = {key: _number(merged[key], f"{where}: {key}") for key in ("cx", "cy", "w", "h", *_AXES[0], *_AXES[1])
-              if key in merged}  # fmt: skip
+    values = {
+        key: _number(merged[key], f"{where}: {key}")
+        for key in ("cx", "cy", "w", "h", *_AXES[0], *_AXES[1])
+        if key in merged
+    }
     for key in ("fl_x", "fl_y", "w", "h"):
         if key in values and values[key] < _SMALLEST:
             raise InputError(f"{where}: {key}: expected a positive number of pixels, got {values[key]}")
@@ -402,8 +428,9 @@ def _check_pinhole(values: Mapping[str, Any], where: str) -> None:
     for key in _MODEL_KEYS:
         model = values.get(key, _MODELS[0])
         if not isinstance(model, str) or model.upper() not in _MODELS:
-            raise InputError(f"{where}: {key}: expected a pinhole camera ({', '.join(_MODELS)}), got {_brief(model)}: "
-                             f"{_UNDISTORT}")  # fmt: skip
+            raise InputError(
+                f"{where}: {key}: expected a pinhole camera ({', '.join(_MODELS)}), got {_brief(model)}: {_UNDISTORT}"
+            )
     for key in _FLAGS:
         if values.get(key, False) not in (False, 0):
             raise InputError(f"{where}: {key}: expected a pinhole camera, got {_brief(values[key])}: {_UNDISTORT}")

@@ -94,8 +94,9 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
         note = f"No photographs, so {VIEWS} views of an orbit: {error}"
         shots = orbit_shots(run.model, run.scene.extent, run.scene.width, run.scene.height, run.scene.has_time)
     title = "/".join(folder.absolute().parts[-3:])
-    return Subject(title, run.model, shots, run.scene.background, run.config.raster.antialias,
-                   folder / "exactness.png", note)  # fmt: skip
+    return Subject(
+        title, run.model, shots, run.scene.background, run.config.raster.antialias, folder / "exactness.png", note
+    )
 
 
 def _of_ply(path: Path, out: Path) -> Subject:
@@ -114,10 +115,14 @@ def _of_ply(path: Path, out: Path) -> Subject:
 def orbit_shots(model: GaussianModel, distance: float, width: int, height: int, has_time: bool) -> list[Shot]:
     """Return views on a circle around a model, without photographs; times run from 0 to 1."""
     return [
-        Shot(f"orbit {i}", around(model, distance, width, height, 2 * math.pi * i / VIEWS),
-             i / (VIEWS - 1) if has_time else None, None)
+        Shot(
+            f"orbit {i}",
+            around(model, distance, width, height, 2 * math.pi * i / VIEWS),
+            i / (VIEWS - 1) if has_time else None,
+            None,
+        )
         for i in range(VIEWS)
-    ]  # fmt: skip
+    ]
 
 
 if __name__ == "__main__":

@@ -191,12 +191,16 @@ def check_exactness(model: GaussianModel) -> None:
     """Raise InputError if the images of a model have no bound on the error of float32: they need the CPU kernels."""
     means = model.splats["means"]
     if means.device.type != "cpu":
-        raise InputError(f"expected a model on the CPU, whose kernels have a float64 twin, got one on "
-                         f"{means.device}: start the viewer with --device cpu")  # fmt: skip
+        raise InputError(
+            f"expected a model on the CPU, whose kernels have a float64 twin, got one on "
+            f"{means.device}: start the viewer with --device cpu"
+        )
     if not model.backend.serves(means):
-        raise InputError("expected the CPU kernels, which have a float64 twin, but they are not built in this "
-                         "installation: reinstall with a C++20 compiler",
-                         docs="install.md#without-a-compiler")  # fmt: skip
+        raise InputError(
+            "expected the CPU kernels, which have a float64 twin, but they are not built in this "
+            "installation: reinstall with a C++20 compiler",
+            docs="install.md#without-a-compiler",
+        )
 
 
 def float64_model(model: GaussianModel) -> GaussianModel:
@@ -237,8 +241,16 @@ def float64_image(
     antialias: bool,
 ) -> ExactImage:
     """Render 3D Gaussians in float64, and bound the error of their image in float32; see `exact_image`."""
-    return exact_image(gaussians, single, camera.viewmat, camera.K, camera.width, camera.height,
-                       background=background, antialias=antialias)  # fmt: skip
+    return exact_image(
+        gaussians,
+        single,
+        camera.viewmat,
+        camera.K,
+        camera.width,
+        camera.height,
+        background=background,
+        antialias=antialias,
+    )
 
 
 # ---- which Gaussians, and why

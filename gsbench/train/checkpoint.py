@@ -111,8 +111,10 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
     except InputError:
         raise
     except (MemoryError, torch.OutOfMemoryError):
-        raise TooLargeError(f"{path}: expected a checkpoint that fits into memory, its {len(payload)} bytes do not: "
-                            f"use a machine with more") from None  # fmt: skip
+        raise TooLargeError(
+            f"{path}: expected a checkpoint that fits into memory, its {len(payload)} bytes do not: "
+            f"use a machine with more"
+        ) from None
     except Exception as error:  # a pickle whose bytes are hostile can make its reader raise anything
         raise _fault(path, one_line(error)[:200]) from None
     for name, value in vars(content).items():
@@ -136,8 +138,10 @@ def check_plain(value: object, most: int) -> None:
         if value.requires_grad:
             raise InputError("checkpoint: expected tensors of values, got one that requires a gradient")
         if value.numel() * value.element_size() > most:
-            raise InputError(f"checkpoint: expected tensors of at most {most} bytes, as many as the file has, "
-                             f"got one of shape {list(value.shape)!s:.80}")  # fmt: skip
+            raise InputError(
+                f"checkpoint: expected tensors of at most {most} bytes, as many as the file has, "
+                f"got one of shape {list(value.shape)!s:.80}"
+            )
     elif isinstance(value, dict):
         for key, inner in value.items():
             if not isinstance(key, str | int):
@@ -167,8 +171,10 @@ def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.device.type == "meta":
         raise InputError(f"checkpoint: expected '{name}' as a tensor, got {type(value).__name__}")
     if value.dtype != dtype or tuple(value.shape) != tuple(shape):
-        raise InputError(f"checkpoint: expected '{name}' as {dtype} of shape {list(shape)}, "
-                         f"got {value.dtype} of shape {list(value.shape)}")  # fmt: skip
+        raise InputError(
+            f"checkpoint: expected '{name}' as {dtype} of shape {list(shape)}, "
+            f"got {value.dtype} of shape {list(value.shape)}"
+        )
     return value.contiguous()
 
 

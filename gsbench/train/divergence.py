@@ -65,8 +65,9 @@ class FiniteCheck:
         if not bad:
             return
         if which < len(self._names):
-            raise DivergedError(f"step {step:.0f}: the gradient of '{self._names[int(which)]}' is not finite "
-                                f"(loss {self.loss})")  # fmt: skip
+            raise DivergedError(
+                f"step {step:.0f}: the gradient of '{self._names[int(which)]}' is not finite (loss {self.loss})"
+            )
         raise DivergedError(f"step {step:.0f}: the loss is {self.loss}")
 
 

@@ -94,8 +94,10 @@ class Optimizer:
 
     def rates_at(self, step: int, factors: Mapping[str, float] = NO_FACTORS) -> dict[str, float]:
         """Return the learning rate of each group at a step, multiplied by the factors of some groups."""
-        return {name: rate_at(rate, step, self.train, self.extent) * factors.get(name, 1.0)
-                for name, rate in self.rates.items()}  # fmt: skip
+        return {
+            name: rate_at(rate, step, self.train, self.extent) * factors.get(name, 1.0)
+            for name, rate in self.rates.items()
+        }
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
         """Return Adam's step count and moments of a parameter; create them with zeros if they do not exist."""
@@ -208,9 +210,16 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
 
 
 def adam_reference(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, drawn: Tensor, rate: float, betas: list[float],
-    eps: float, step: Tensor,
-) -> None:  # fmt: skip
+    parameter: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    drawn: Tensor,
+    rate: float,
+    betas: list[float],
+    eps: float,
+    step: Tensor,
+) -> None:
     """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel `adam` does the same."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]

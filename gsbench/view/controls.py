@@ -121,8 +121,17 @@ class Controls:
             self.agr = watch(gui.add_checkbox("AGR", True, disabled=not has_agr))
             hold = gui.add_checkbox("freeze time", False, disabled=not self._has_time, hint="slices stay those of now")
             freeze = gui.add_checkbox("freeze direction", False, hint="slices stay those seen from here")
-            self.degree = watch(gui.add_slider("harmonics", 0, max(degree, 1), 1, degree, disabled=degree == 0,
-                                               hint="degree of the colours; 0: the same from everywhere"))  # fmt: skip
+            self.degree = watch(
+                gui.add_slider(
+                    "harmonics",
+                    0,
+                    max(degree, 1),
+                    1,
+                    degree,
+                    disabled=degree == 0,
+                    hint="degree of the colours; 0: the same from everywhere",
+                )
+            )
 
         def hold_time() -> None:
             self._held = self.now if hold.value else None
@@ -144,8 +153,9 @@ class Controls:
         second = watch(
             gui.add_dropdown("second model", names, initial_value=names[1 if several else 0], visible=several)
         )
-        others = watch(gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS,
-                                        visible=several))  # fmt: skip
+        others = watch(
+            gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS, visible=several)
+        )
         self.wipe = watch(gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False))
         self.background = watch(gui.add_rgb("background", self._trained_background, hint="of the colours 'image'"))
         self.legend = gui.add_html("")
@@ -160,10 +170,15 @@ class Controls:
     def _add_views(self, scene: Scene | str) -> None:
         """Add controls that show the training views; they are disabled if the data set is not available."""
         gui, why = self.client.gui, scene if isinstance(scene, str) else None
-        cameras = gui.add_checkbox("training cameras", False, disabled=why is not None,
-                                   hint=why or "click on one to stand there; not side by side")  # fmt: skip
-        self.compare = gui.add_checkbox(NEAREST, False, disabled=why is not None,
-                                        hint=why or "its image, the model's, and the error")  # fmt: skip
+        cameras = gui.add_checkbox(
+            "training cameras",
+            False,
+            disabled=why is not None,
+            hint=why or "click on one to stand there; not side by side",
+        )
+        self.compare = gui.add_checkbox(
+            NEAREST, False, disabled=why is not None, hint=why or "its image, the model's, and the error"
+        )
         if isinstance(scene, str):
             return
         frusta: list[viser.CameraFrustumHandle] = []

@@ -94,8 +94,10 @@ def legend(
     notes: Mapping[str, Float32Error | str],  # by model: the bound on the error of float32, or why it is not shown
 ) -> str:
     """Return the legend of the colours in HTML; "" if Gaussians have their usual colours."""
-    renderers = {meaning: {image.renderer.name: image.renderer for image in shown if image.colours == meaning}
-                 for meaning in (CLASS, COST, FLOAT32)}  # fmt: skip
+    renderers = {
+        meaning: {image.renderer.name: image.renderer for image in shown if image.colours == meaning}
+        for meaning in (CLASS, COST, FLOAT32)
+    }
     classes = [Row("Gaussians", list(renderers[CLASS]), is_bold=True)] if renderers[CLASS] else []
     for name, words in EFFECT_SETS.items():
         counts = [renderer.counts[name] for renderer in renderers[CLASS].values()]

@@ -143,8 +143,10 @@ def check_file(option: str, path: Path, *suffixes: str) -> None:
     """Raise InputError unless the file of an option ends in one of the suffixes and can be written into its folder."""
     check_parent(path)
     if path.suffix.lower() not in suffixes:
-        raise InputError(f"{option}: expected a file name that ends in {' or '.join(suffixes)}, got {str(path)!a:.200}",
-                         docs="viewing.md#export")  # fmt: skip
+        raise InputError(
+            f"{option}: expected a file name that ends in {' or '.join(suffixes)}, got {str(path)!a:.200}",
+            docs="viewing.md#export",
+        )
 
 
 def check_parent(path: Path) -> None:

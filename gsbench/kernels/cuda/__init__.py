@@ -36,6 +36,8 @@ def _has_device() -> bool:
 def cuda() -> ModuleType:
     """Return the compiled extension with the CUDA kernels; raises InputError if it is not built."""
     if _cuda is None:
-        raise InputError("the CUDA kernels are not built in this installation: reinstall where nvcc is on the PATH "
-                         "(pip install . -C cmake.define.CUDA=on)")  # fmt: skip
+        raise InputError(
+            "the CUDA kernels are not built in this installation: reinstall where nvcc is on the PATH "
+            "(pip install . -C cmake.define.CUDA=on)"
+        )
     return _cuda

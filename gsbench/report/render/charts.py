@@ -51,8 +51,17 @@ def spec(
         chart = chart.transform_filter("datum.scene == scene")
     if "series" in table:
         chart = chart.add_params(alt.param("hidden", value=[])).transform_filter("indexof(hidden, datum.series) < 0")
-    axis = {"labelColor": MUTED, "titleColor": MUTED, "domainColor": LINE, "gridColor": LINE, "tickColor": LINE,
-            "titleFontWeight": "normal", "labelFontSize": 12, "titleFontSize": 12, "labelLimit": 220}  # fmt: skip
+    axis = {
+        "labelColor": MUTED,
+        "titleColor": MUTED,
+        "domainColor": LINE,
+        "gridColor": LINE,
+        "tickColor": LINE,
+        "titleFontWeight": "normal",
+        "labelFontSize": 12,
+        "titleFontSize": 12,
+        "labelLimit": 220,
+    }
     shown = {"labelColor": INK, "titleColor": INK, "labelFontSize": 12} if legend else {"disable": True}
     chart = chart.configure(background="transparent", font=FONT, axis=axis, legend=shown, view={"stroke": None})
     fit = alt.AutoSizeParams(type="fit-x", contains="padding")
@@ -166,8 +175,12 @@ def bars(table: pd.DataFrame, look: Look, label: str, parts: list[str], title: s
 
 
 DRAWINGS: dict[str, Callable[..., Any]] = {
-    "frontier": frontier, "curves": curves, "profile": profile, "intervals": intervals, "bars": bars,
-}  # fmt: skip
+    "frontier": frontier,
+    "curves": curves,
+    "profile": profile,
+    "intervals": intervals,
+    "bars": bars,
+}
 
 
 def part_colours(parts: list[str], colours: str) -> list[str]:
@@ -205,6 +218,7 @@ def _scale(values: pd.Series) -> alt.Scale:
 def _tip(**titles: str) -> list[alt.Tooltip]:
     """Return the lines of a tooltip: columns with their titles, numbers with at most four digits."""
     texts = ("series", "model", "variant", "seeds", "event", "name", "pair", "label", "part", "significant")
-    kinds = {name: {"type": "nominal"} if name in texts else {"type": "quantitative", "format": ",.4~g"}
-             for name in titles}  # fmt: skip
+    kinds = {
+        name: {"type": "nominal"} if name in texts else {"type": "quantitative", "format": ",.4~g"} for name in titles
+    }
     return [alt.Tooltip(name, title=title, **kinds[name]) for name, title in titles.items()]

@@ -121,8 +121,10 @@ def table(section: Section) -> dict[str, Any]:
     turned = len(columns) > TURNED > len(shown)
     if columns and not turned:  # a group is named in its first row
         texts = [text for text, _ in columns[0]]
-        columns[0] = [(text, "repeated" if text == above else kind)
-                      for (text, kind), above in zip(columns[0], [None, *texts], strict=False)]  # fmt: skip
+        columns[0] = [
+            (text, "repeated" if text == above else kind)
+            for (text, kind), above in zip(columns[0], [None, *texts], strict=False)
+        ]
     rows = columns if turned else list(zip(*columns, strict=True))
     return {"rows": rows, "turned": turned, "more": len(section.table) - len(shown)}
 

@@ -29,9 +29,11 @@ OF_STAGES = (
 )  # fmt: skip
 SETS = ("model-3", "model-4", "model-2", "model-1", "model-0", "line")  # effect sets, like models with these effects
 DEGREES = ("stage-3", "stage-2", "stage-1", "stage-0")  # a higher degree of harmonics has more contrast
-THEMES = PAGE | {f"model-{i}": pair for i, pair in enumerate(OF_MODELS)} | {
-    f"stage-{i}": pair for i, pair in enumerate(OF_STAGES)
-}  # fmt: skip
+THEMES = (
+    PAGE
+    | {f"model-{i}": pair for i, pair in enumerate(OF_MODELS)}
+    | {f"stage-{i}": pair for i, pair in enumerate(OF_STAGES)}
+)
 # SVG paths in a square from -1 to 1, for the legend of a page and for charts.
 MARKERS = (
     "M0,-1L1,.8L-1,.8Z",

@@ -14,10 +14,18 @@ WIDEST = 44  # characters of a cell in a terminal
 ARROWS = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
 STYLES = {0: "{}", 1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"}
 TEX = {
-    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
-    ">": r"\textgreater{}", "|": r"\textbar{}", "±": r"$\pm$", "×": r"$\times$", "−": "$-$", EMPTY: "--",
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "−": "$-$",
+    EMPTY: "--",
     **{c: f"\\{c}" for c in "&%$#_{}"},
-}  # fmt: skip
+}
 
 
 def terminal(sections: Sequence[Section], width: int = 120) -> str:

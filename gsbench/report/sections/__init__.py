@@ -13,8 +13,21 @@ from gsbench.report import stats
 from gsbench.report.frame import Results
 from gsbench.report.section import SECTIONS, Registered, Section
 
-ORDER = ["budgets", "frontier", "experiment", "pairs", "effects", "quality", "curves", "lengths", "on_demand", "stages",
-         "gallery", "protocol", "runs"]  # others come before the last two  # fmt: skip
+ORDER = [
+    "budgets",
+    "frontier",
+    "experiment",
+    "pairs",
+    "effects",
+    "quality",
+    "curves",
+    "lengths",
+    "on_demand",
+    "stages",
+    "gallery",
+    "protocol",
+    "runs",
+]  # others come before the last two
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")

@@ -10,8 +10,12 @@ from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Asked, Column, Figure, Section, section
 
 COSTS = {"train_s": "training s", "frame_ms": "ms a frame", "model_mb": "MB"}
-BUDGETS = {"10 s of training": ("train_s", 10.0), "1 min of training": ("train_s", 60.0),
-           "10 min of training": ("train_s", 600.0), "60 frames a second": ("frame_ms", 1000 / 60)}  # fmt: skip
+BUDGETS = {
+    "10 s of training": ("train_s", 10.0),
+    "1 min of training": ("train_s", 60.0),
+    "10 min of training": ("train_s", 600.0),
+    "60 frames a second": ("frame_ms", 1000 / 60),
+}
 MOST_SINGLE = 300  # single runs that a figure draws
 BUSY = 0.5  # load by other work from which a run counts as measured beside it
 
@@ -54,10 +58,18 @@ def asked(chapter: Results) -> Asked:
 @section(asked)
 def budgets(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table of the best model within each budget."""
-    counts = pd.DataFrame({
-        "better than": tests.significant & (tests["mean"] > 0), "undecided": ~tests.significant & tests.p_holm.notna(),
-        "worse than": tests.significant & (tests["mean"] < 0), "untested": tests.p_holm.isna(),
-    }).groupby(tests.name).sum()  # fmt: skip
+    counts = (
+        pd.DataFrame(
+            {
+                "better than": tests.significant & (tests["mean"] > 0),
+                "undecided": ~tests.significant & tests.p_holm.notna(),
+                "worse than": tests.significant & (tests["mean"] < 0),
+                "untested": tests.p_holm.isna(),
+            }
+        )
+        .groupby(tests.name)
+        .sum()
+    )
     best = {budget: table.head(1).reset_index(drop=True) for budget, table in contests(chapter).items()}
     table = pd.concat([first.reindex([0]).assign(budget=budget) for budget, first in best.items()], ignore_index=True)
     table = table.join(counts, on="budget").fillna(dict.fromkeys(counts, 0))

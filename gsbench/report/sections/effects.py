@@ -22,8 +22,11 @@ def asked(chapter: Results) -> Asked:
     """
     cells, nested = models(chapter)
     sums = stats.factorial(cells, FACTORS)
-    within = [(f"{name}, nested", weights) for name, weights in stats.factorial(nested, FACTORS)
-              if any(model in NESTED for model, _ in weights)]  # fmt: skip
+    within = [
+        (f"{name}, nested", weights)
+        for name, weights in stats.factorial(nested, FACTORS)
+        if any(model in NESTED for model, _ in weights)
+    ]
     return [(quantity, name, weights) for quantity in UNITS for name, weights in sums + within]
 
 

@@ -9,8 +9,18 @@ from gsbench.report import paper, stats
 from gsbench.report.frame import Results, covered, title_of
 from gsbench.report.section import COLUMNS, Column, Section, number, section
 
-SHOWN = ("psnr_db", "psnr_moving_db", "psnr_object_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians",
-         "lpips_vgg", "psnr_best_on_test_db")  # fmt: skip
+SHOWN = (
+    "psnr_db",
+    "psnr_moving_db",
+    "psnr_object_db",
+    "ssim",
+    "lpips_alex",
+    "train_min",
+    "fps",
+    "gaussians",
+    "lpips_vgg",
+    "psnr_best_on_test_db",
+)
 WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
 IF_MEASURED = ("psnr_moving_db", "psnr_object_db", "lpips_vgg", "psnr_best_on_test_db")
 TEXT = (
@@ -81,8 +91,10 @@ def _notes(chapter: Results) -> Iterator[str]:
     for run in chapter.runs[chapter.runs.status != "ok"].itertuples():
         yield printable(f"{run.scene}, {run.label} seed {run.seed} {run.status}: {run.reason}")
     ok = chapter.finished.runs
-    lacks = pd.DataFrame([(metric, why, run.scene) for run in ok.itertuples() for metric, why in run.missing.items()],
-                         columns=["metric", "why", "scene"])  # fmt: skip
+    lacks = pd.DataFrame(
+        [(metric, why, run.scene) for run in ok.itertuples() for metric, why in run.missing.items()],
+        columns=["metric", "why", "scene"],
+    )
     for (metric, why), rows in lacks.groupby(["metric", "why"]):
         column = COLUMNS.get(metric) or COLUMNS.get(f"{metric}_db")
         scenes = "" if set(rows.scene) == set(ok.scene) else f" ({', '.join(sorted(set(rows.scene)))})"

@@ -145,8 +145,9 @@ def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quali
     names = [printable(view.name)[:60] for view in _spaced(record, shared)]
     shown = []
     for i in range(min(shared, most)):
-        render, error = ({model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()}
-                         for kind in (0, 2))  # fmt: skip
+        render, error = (
+            {model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()} for kind in (0, 2)
+        )
         scores = {model: _score(record_of_model, len(rows), i) for model, (record_of_model, rows) in models.items()}
         truth, (height, width) = _encode(strip[i][1], side, quality), strip[i][1].shape[:2]
         name = names[i] if i < len(names) else f"view {i + 1}"
@@ -165,8 +166,11 @@ def _score(record: Record, rows: int, i: int) -> str:
     if i >= len(views) or views[i].psnr is None:
         return ""
     regions = {"moving": views[i].psnr_moving, "object": views[i].psnr_object}
-    texts = [f"{name} {EMPTY if psnr is None else number(psnr, 2)}"
-             for name, psnr in regions.items() if name in record.regions]  # fmt: skip
+    texts = [
+        f"{name} {EMPTY if psnr is None else number(psnr, 2)}"
+        for name, psnr in regions.items()
+        if name in record.regions
+    ]
     return ", ".join([f"PSNR {number(views[i].psnr or 0.0, 2)} dB", *texts])
 
 

@@ -23,14 +23,21 @@ DEGREES = [f"degree {i}" for i in range(4)]  # of spherical harmonics
 MOST_BARS = 24
 MOST_NOTES = 12
 SHOWN = {
-    "p": Column("largest p", 3), "free": Column("% free of the camera", 0), "screen_s": Column("screen s", 1),
-    "before": Column("Gaussians before", 0), REMOVED: Column("removed", 0),
+    "p": Column("largest p", 3),
+    "free": Column("% free of the camera", 0),
+    "screen_s": Column("screen s", 1),
+    "before": Column("Gaussians before", 0),
+    REMOVED: Column("removed", 0),
     "asleep": Column("% of AGR left out of a frame", 0),
-    **{name: Column(title, 0) for name, title in SETS.items()}, **{name: Column(name, 0) for name in DEGREES},
-    "predicted": Column("predicted dB", 3, signed=True), "dB": Column("PSNR dB", 3, signed=True),
-    "ms_before": Column("ms before", 2), "ms": Column("ms", 2, signed=True),
-    "mb_before": Column("MB before"), "mb": COLUMNS["model_mb"],
-}  # fmt: skip
+    **{name: Column(title, 0) for name, title in SETS.items()},
+    **{name: Column(name, 0) for name in DEGREES},
+    "predicted": Column("predicted dB", 3, signed=True),
+    "dB": Column("PSNR dB", 3, signed=True),
+    "ms_before": Column("ms before", 2),
+    "ms": Column("ms", 2, signed=True),
+    "mb_before": Column("MB before"),
+    "mb": COLUMNS["model_mb"],
+}
 TEXTS = ["decision", "why", "compared", "split", "checked_on"]  # of a run, beside SHOWN
 LOSSES = ["predicted", "evaluated", "checked"]  # dB: predicted, on the evaluated views, and on those of the check
 
@@ -45,10 +52,14 @@ def on_demand(chapter: Results, tests: pd.DataFrame) -> Section | None:
     table = _means(runs)
     names = table.model if table.variant.nunique() == 1 else names_of(table)
     drawn = table.assign(label=table.scene + ", " + names)[table.gated > 0].head(MOST_BARS)
-    figures = () if drawn.empty else (
-        _figure("Gaussians before the gates, by effect set, %", drawn, [*SETS, REMOVED], "effect set"),
-        _figure("Gaussians left, by degree of harmonics, %", drawn, DEGREES, "degree"),
-    )  # fmt: skip
+    figures = (
+        ()
+        if drawn.empty
+        else (
+            _figure("Gaussians before the gates, by effect set, %", drawn, [*SETS, REMOVED], "effect set"),
+            _figure("Gaussians left, by degree of harmonics, %", drawn, DEGREES, "degree"),
+        )
+    )
     text = (
         "Each Gaussian keeps the effects that it needs (docs/effects.md). Numbers are means over seeds; changes of "
         "PSNR and ms are those of the gate after training. A gate during training changes the training too: compare "
@@ -77,11 +88,16 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
     numbers["dB"] = numbers.evaluated.where(is_evaluated, numbers.checked)
     numbers["measured on"] = numbers.split.where(is_evaluated, numbers.checked_on).where(numbers.ends)
     groups = numbers.groupby(key)
-    table = pd.DataFrame({
-        "seeds": groups.size(), "screen": groups.decision.agg(_counted), "why": groups.why.first(),
-        "compared": groups.compared.first(), "gated": groups.before.count(),
-        "measured on": groups["measured on"].first(),
-    })  # fmt: skip
+    table = pd.DataFrame(
+        {
+            "seeds": groups.size(),
+            "screen": groups.decision.agg(_counted),
+            "why": groups.why.first(),
+            "compared": groups.compared.first(),
+            "gated": groups.before.count(),
+            "measured on": groups["measured on"].first(),
+        }
+    )
     table = table.join(groups[list(SHOWN)].mean()).assign(p=groups.p.max())
     for name in ("dB", "ms"):
         half = groups[name].agg(lambda values: over_seeds(values.dropna()).half if values.notna().any() else math.nan)

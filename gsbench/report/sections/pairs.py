@@ -32,8 +32,17 @@ def pairs(chapter: Results, tests: pd.DataFrame) -> Section | None:
         low, high = sorted((test["low"], test["high"])) if test["mean"] >= 0 else sorted((-test["low"], -test["high"]))
         name = " − ".join(f"{m}" if v == main else f"{m} ({v or 'default'})" for m, v in (better, other))
         ahead = 100 * stats.improvement(arrays, better, other)
-        rows.append({"pair": name, "dB": abs(test["mean"]), "low": low, "high": high, "ahead": ahead,
-                     "p_holm": test["p_holm"], "significant": verdict(test)})  # fmt: skip
+        rows.append(
+            {
+                "pair": name,
+                "dB": abs(test["mean"]),
+                "low": low,
+                "high": high,
+                "ahead": ahead,
+                "p_holm": test["p_holm"],
+                "significant": verdict(test),
+            }
+        )
     table = pd.DataFrame(rows).sort_values("dB", ascending=False, kind="stable").reset_index(drop=True)
     text = (
         "The runs of two models are paired by scene, seed and view. Significant: p is below 5 % after Holm's "

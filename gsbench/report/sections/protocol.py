@@ -15,11 +15,23 @@ WARNING = "WARNING"
 SILENT = {"resize": "area", "repaired": "none", "val_every": "none"}  # what a record means that lacks it
 OF_ALL = {"machine": "machine", "commit": "git_commit", "versions": "versions"}  # the same for all scenes
 # The scenes on which gsbench's own settings were chosen; what holds on them may not hold on others.
-TUNED = frozenset((
-    "bouncingballs", "cloud", "moving-matte", "static-glossy", "static-matte", "suzanne",  # conf/exp/tuning.yaml
-    "lego", "static-lego", "trex",
-    "scene1_close_proximity", "scene4_occlusion", "scene7_deformation", "scene10_texture",
-))  # fmt: skip
+TUNED = frozenset(
+    (
+        "bouncingballs",
+        "cloud",
+        "moving-matte",
+        "static-glossy",
+        "static-matte",
+        "suzanne",  # conf/exp/tuning.yaml
+        "lego",
+        "static-lego",
+        "trex",
+        "scene1_close_proximity",
+        "scene4_occlusion",
+        "scene7_deformation",
+        "scene10_texture",
+    )
+)
 TEXT = (
     "PSNR is over all pixels and channels of a view, after the final iteration, averaged over views; SSIM is that of "
     "scikit-image (Gaussian window, data_range 1). FPS is 1000 / the median milliseconds of a frame, with slicing and "
@@ -114,9 +126,12 @@ def runs(chapter: Results, tests: pd.DataFrame) -> Section:
     """Make the table of every run, with why it failed and the command that repeats it."""
     all_runs = chapter.runs
     table = all_runs[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
-    table = table.assign(load=all_runs.load.where(all_runs.machine == all_runs.timed_on),
-                         commit=[_short("commit", value or "not recorded") for value in all_runs.git_commit],
-                         command=all_runs.record.map(command), reason=all_runs.reason)  # fmt: skip
+    table = table.assign(
+        load=all_runs.load.where(all_runs.machine == all_runs.timed_on),
+        commit=[_short("commit", value or "not recorded") for value in all_runs.git_commit],
+        command=all_runs.record.map(command),
+        reason=all_runs.reason,
+    )
     text = "A time is empty if the run was on another machine than most."
     table.insert(0, "run", [record.path.as_posix() for record in all_runs.record])
     table = table.sort_values("status", key=lambda status: status == "ok", kind="stable")

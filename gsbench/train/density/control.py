@@ -85,8 +85,11 @@ class DensityControl:
         if not self._is_full:
             self._is_full = True
             which = "default of " if self.config.train.densify.max_gaussians is None else ""
-            tqdm.write(f"step {step + 1}: {most} Gaussians are the most ({which}train.densify.max_gaussians): "
-                       f"{refused} of smaller gradients are not cloned or split", file=sys.stderr)  # fmt: skip
+            tqdm.write(
+                f"step {step + 1}: {most} Gaussians are the most ({which}train.densify.max_gaussians): "
+                f"{refused} of smaller gradients are not cloned or split",
+                file=sys.stderr,
+            )
 
 
 def gaussian_limit(

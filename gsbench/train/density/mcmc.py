@@ -104,7 +104,7 @@ def relocated(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         (o', c), each [M] in float64: the new opacities, and the factors of the standard deviations.
-    """  # fmt: skip
+    """
     o, n = opacities.double(), copies.double()
     new = 1 - (1 - o) ** (1 / n)
     k = torch.arange(1, int(copies.max()) + 1, dtype=torch.float64, device=o.device)

@@ -157,18 +157,23 @@ def check_excludes(key: str, config: Config, excluded: dict[str, str]) -> None:
         value = attrgetter(other)(config)
         if value is not None and value is not False:
             unset = "false" if value is True else "null"
-            raise InputError(f"{key}: expected {other}={unset}, {reason}, got {str(value).lower()}: leave one of the "
-                             f"two out")  # fmt: skip
+            raise InputError(
+                f"{key}: expected {other}={unset}, {reason}, got {str(value).lower()}: leave one of the two out"
+            )
 
 
 def check_choice_on_val(key: str, what: str, scene: Scene, config: Config) -> None:
     """Raise InputError if a `what`, such as an iteration, cannot be chosen on val as `train.key` asks."""
     if not scene.val:
-        raise InputError(f"train.{key}: expected views of val to choose the {what}, {scene.name} has none: "
-                         f"scene.val_every=8 takes every eighth training view")  # fmt: skip
+        raise InputError(
+            f"train.{key}: expected views of val to choose the {what}, {scene.name} has none: "
+            f"scene.val_every=8 takes every eighth training view"
+        )
     if config.scene.eval_split == "val":
-        raise InputError(f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
-                         f"by which the {what} is chosen would be too high; leave train.{key} out")  # fmt: skip
+        raise InputError(
+            f"train.{key}: expected results on test, got scene.eval_split=val: results on the views "
+            f"by which the {what} is chosen would be too high; leave train.{key} out"
+        )
 
 
 def hook_types(elsewhere: Sequence[str] = ELSEWHERE) -> list[type[Hook]]:

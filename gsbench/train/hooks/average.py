@@ -53,8 +53,10 @@ class Average(Hook):
     def check(cls, config: Config) -> None:
         step, length = cast(AverageKey, config.train).average_from, config.train.recipe_iterations
         if step is not None and step >= length:
-            raise InputError(f"train.average_from: expected a step below train.recipe_iterations={length}, the length "
-                             f"for which steps are given, got {step}")  # fmt: skip
+            raise InputError(
+                f"train.average_from: expected a step below train.recipe_iterations={length}, the length "
+                f"for which steps are given, got {step}"
+            )
 
     def after_step(self, step: int) -> None:
         """Add the parameters to the means; only every tenth step is used."""
@@ -78,15 +80,19 @@ class Average(Hook):
             averaged = training.psnr(training.scene.val)
             if rank(averaged) > rank(psnr):  # NaN is below all numbers
                 self.kept = finished - self.first
-                training.report(f"step {finished}: PSNR on val is {averaged - psnr:.2f} dB higher with parameters "
-                                f"averaged over the last {self.kept} iterations: the training ends with "
-                                f"these")  # fmt: skip
+                training.report(
+                    f"step {finished}: PSNR on val is {averaged - psnr:.2f} dB higher with parameters "
+                    f"averaged over the last {self.kept} iterations: the training ends with "
+                    f"these"
+                )
                 psnr = averaged
             else:
                 self._swap()
                 if rank(averaged) == rank(psnr):
-                    training.report(f"step {finished}: PSNR on val is {psnr:.2f} dB with the last and with averaged "
-                                    f"parameters: it cannot decide, and the last are kept")  # fmt: skip
+                    training.report(
+                        f"step {finished}: PSNR on val is {psnr:.2f} dB with the last and with averaged "
+                        f"parameters: it cannot decide, and the last are kept"
+                    )
         self._forget()  # the final checkpoint need not hold the means
         return psnr
 

@@ -48,8 +48,10 @@ class Choices(Hook):
             return
         least = 1 << (lengths - 1)
         if iterations < least:
-            raise InputError(f"train.lengths={lengths}: expected at least {least} iterations to "
-                             f"halve {lengths - 1} times, got train.iterations={iterations}")  # fmt: skip
+            raise InputError(
+                f"train.lengths={lengths}: expected at least {least} iterations to "
+                f"halve {lengths - 1} times, got train.iterations={iterations}"
+            )
         check_excludes("train.lengths", config, {"effects.compare": "which compares models of one length"})
 
     @classmethod
@@ -84,8 +86,9 @@ def _parsed(state: object) -> ChosenOnVal:
     kinds = {"length": LengthChoice, "comparison": ModelComparison}
     if not isinstance(state, dict) or state.keys() != kinds.keys():
         raise InputError("checkpoint: expected the choices on val, got none: start over with resume=false")
-    return ChosenOnVal(**{name: state[name] and parse(kind, state[name], f"checkpoint: {name}")
-                          for name, kind in kinds.items()})  # fmt: skip
+    return ChosenOnVal(
+        **{name: state[name] and parse(kind, state[name], f"checkpoint: {name}") for name, kind in kinds.items()}
+    )
 
 
 def lengths_of(config: Config) -> int | None:

@@ -50,11 +50,15 @@ class EarlyStop(Hook):
     @classmethod
     def check(cls, config: Config) -> None:
         if _patience(config) is not None:
-            check_excludes("train.patience", config, {
-                "effects.compare": "as a candidate of model=auto must not end before they are compared",
-                "train.lengths": "which chooses among whole trainings",
-                "train.average_from": "whose average ends a training (+recipe=long)",
-            })  # fmt: skip
+            check_excludes(
+                "train.patience",
+                config,
+                {
+                    "effects.compare": "as a candidate of model=auto must not end before they are compared",
+                    "train.lengths": "which chooses among whole trainings",
+                    "train.average_from": "whose average ends a training (+recipe=long)",
+                },
+            )
 
     @classmethod
     def check_scene(cls, scene: Scene, config: Config) -> None:
@@ -85,14 +89,18 @@ class EarlyStop(Hook):
         self.stop = stop
         equal = training.curve.equal_to(stop.kept)
         if len(equal) > 1:
-            training.report(f"step {stop.iteration}: PSNR on val is equal at {len(equal)} steps, {equal[0].iteration} "
-                            f"to {equal[-1].iteration}: it cannot decide, and the last of them is kept")  # fmt: skip
+            training.report(
+                f"step {stop.iteration}: PSNR on val is equal at {len(equal)} steps, {equal[0].iteration} "
+                f"to {equal[-1].iteration}: it cannot decide, and the last of them is kept"
+            )
         if self._kept is not None:
             best_state, self._kept = self._kept, None
             now = training.state_dict()
             training.load_state_dict(now | best_state | {"hooks": now["hooks"] | best_state["hooks"]})
-            training.report(f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends "
-                            f"with the Gaussians of that step")  # fmt: skip
+            training.report(
+                f"step {stop.iteration}: PSNR on val is highest at step {stop.kept}: the training ends "
+                f"with the Gaussians of that step"
+            )
 
     def state_dict(self) -> dict[str, Any]:
         stop = None if self.stop is None else asdict(self.stop)

@@ -78,8 +78,10 @@ class Penalties(Hook):
         for name in _weighted(config):
             for needed in set(PENALTIES[name].needs) - set(model.observes):
                 key = f"train.penalties.{name}"
-                raise InputError(f"{key}: expected a model that observes {needed}, {type(model).__name__} does not: "
-                                 f"set {key}.weight=0")  # fmt: skip
+                raise InputError(
+                    f"{key}: expected a model that observes {needed}, {type(model).__name__} does not: "
+                    f"set {key}.weight=0"
+                )
 
     def loss_terms(self, step: int, views: Sequence[View]) -> Sequence[LossTerm]:
         terms: list[LossTerm] = []
