@@ -81,6 +81,7 @@ def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, 
     from nbclient import NotebookClient
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # a command that a test ran may have set it: no figure appears then
     monkeypatch.delenv("PYTEST_CURRENT_TEST")  # with it, ipykernel leaves out what child processes print
     monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")  # what jupyter_core is to become, without its warning
     notebook = nbformat.read(NOTEBOOKS[name], as_version=4)
