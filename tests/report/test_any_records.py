@@ -94,7 +94,7 @@ def test_the_report_of_any_records(runs, tmp_path_factory, capsys):
 
 
 @pytest.mark.slow
-@settings(SETTINGS, max_examples=400)
+@settings(SETTINGS, max_examples=150)
 @given(runs=records())
 def test_the_report_of_many_records(runs, tmp_path_factory, capsys):
     """Catches what twelve sets of records leave out."""
