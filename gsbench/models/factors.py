@@ -107,16 +107,10 @@ def rotation(quaternions: Tensor) -> Tensor:
     """Compute the rotation matrices of quaternions wxyz, which need not be normalised, [N, 4] -> [N, 3, 3]."""
     w, x, y, z = F.normalize(quaternions, dim=-1).unbind(-1)
     rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 

@@ -267,7 +267,7 @@ def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str
         for model in models
         for title, quantity in quantities.items()
     }
-    table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS["D-NeRF"].scenes, paper.AVERAGE]).dropna()
+    table = pd.DataFrame(by_column).reindex([*paper.PROTOCOLS[DNERF].scenes, paper.AVERAGE]).dropna()
     mean = f"mean of {rows.scenes[paper.AVERAGE].max():.0f}"
     table = table.astype(float).rename(index={paper.AVERAGE: mean}).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
