@@ -16,7 +16,7 @@ from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_universal
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import SHRINK, GaussianModel, Raw
-from gsbench.models.camera_time import CameraTime, unit
+from gsbench.models.camera_time import CameraTime, initial_times, unit
 from gsbench.models.gaussian_batch import Conditioned, reach
 from gsbench.models.portable_math import exp, log, log1p, sqrt
 from gsbench.models.registry import register
@@ -57,7 +57,7 @@ class BetaModel(GaussianModel):
             "skew": torch.zeros(N, 3),
             "betas": torch.tensor([0.0, view, view, view] + [0.0] * time).repeat(N, 1),
         }
-        return raw | {"times": torch.rand(N, 1, generator=generator)} if time else raw
+        return raw | {"times": initial_times(points, generator, margin=0)} if time else raw
 
     def spatial_scales(self) -> Tensor:
         """Return the sizes S of the Gaussians that look like the profiles, [N, 3]; gradients reach S, not b."""

@@ -1,4 +1,4 @@
-"""Define `CameraTime`: the camera centre and the time for which a model returns 3D Gaussians."""
+"""Define `CameraTime`, the camera centre and the time for which a model returns 3D Gaussians, and draw mean times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.tensors import check_number, check_tensor
-from gsbench.scenes.scene import Camera
+from gsbench.scenes.scene import Camera, Points
 
 TIME_MARGIN = 1e-6  # least distance from 0 and 1 of a time that is stored as its logit
 
@@ -69,6 +69,13 @@ def unit(vectors: Tensor) -> Tensor:
     square = vectors.square().sum(-1, keepdim=True)
     defined = square > 1e-20
     return torch.where(defined, vectors * torch.where(defined, square, 1.0).rsqrt(), 0.0)
+
+
+def initial_times(points: Points, generator: torch.Generator, margin: float = 0.1) -> Tensor:
+    """Return the first mean times of Gaussians, [N, 1]: those of the points, else uniform in [-margin, 1 + margin]."""
+    if points.times is not None:
+        return points.times[:, None]
+    return torch.rand(len(points.means), 1, generator=generator) * (1 + 2 * margin) - margin
 
 
 def times_inside(times: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
 from gsbench.models.base import SHRINK, Raw
-from gsbench.models.camera_time import CameraTime, times_inside, unit
+from gsbench.models.camera_time import CameraTime, initial_times, times_inside, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, CholeskyLayout, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, JointModel
@@ -87,7 +87,7 @@ class CholeskyModel(JointModel):
         if "direction" in self.observes:
             raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
-            times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+            times = initial_times(points, generator)
             raw["times"] = times_inside(times).logit() if self.bounded_times else times
         return raw
 

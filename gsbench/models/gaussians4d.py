@@ -13,7 +13,7 @@ from gsbench.kernels.headers import LOG_SIZE_MAX, MAX_WAVES, TIME_OPACITY_FACTOR
 from gsbench.kernels.slices import slice_rotated
 from gsbench.models.appearance import ColorOrder, coefficients_within, order_of, sh_time_colors
 from gsbench.models.base import SHRINK, Raw
-from gsbench.models.camera_time import CameraTime, unit
+from gsbench.models.camera_time import CameraTime, initial_times, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN, JointModel
@@ -69,7 +69,7 @@ class Gaussians4DModel(JointModel, gates=True):
         scales = torch.cat([log(distances)[:, None].repeat(1, 3), duration.expand(N, 1)], -1)
         quats = torch.zeros(N, 4)
         quats[:, 0] = 1
-        times = torch.rand(N, 1, generator=generator) * 1.2 - 0.1
+        times = initial_times(points, generator)
         return {"times": times, "scales": scales, "left_quats": quats, "right_quats": quats.clone()}
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:

@@ -20,7 +20,7 @@ from gsbench.kernels.slices import slice_direct, slice_direct_beta, slice_free_t
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
-from gsbench.models.camera_time import CameraTime, times_inside, unit
+from gsbench.models.camera_time import CameraTime, initial_times, times_inside, unit
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import sizes
 from gsbench.models.gated import OPACITY_MARGIN
@@ -103,7 +103,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         """Return spheres at rest with mean times uniform in [-0.1, 1.1]."""
         N = len(distances)
         return super().initial_geometry(points, distances, generator) | {
-            "times": torch.rand(N, 1, generator=generator) * 1.2 - 0.1,
+            "times": initial_times(points, generator),
             "durations": torch.full((N, 1), math.log(self.duration)),
             "velocities": torch.zeros(N, 3),
         }
@@ -170,7 +170,7 @@ class DirectModel(MovingGaussians3D, gates=True):
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres with random mean directions, and mean times uniform in [-0.1, 1.1], clipped to [0, 1]."""
         N = len(distances)
-        times = times_inside(torch.rand(N, 1, generator=generator) * 1.2 - 0.1)
+        times = times_inside(initial_times(points, generator))
         view, time = math.log(self.view_precision), math.log(TIME_PRECISION)
         return super().initial_geometry(points, distances, generator) | {
             "times": times.logit(),

@@ -56,7 +56,7 @@ def standard_scene(
     lines = _notes(placement, is_near)
     if points is not None:
         away = float((points.means.double() - torch.from_numpy(middle)).norm(dim=1).median())
-        points = Points(placement.to_standard(points.means), points.colors.float())
+        points = Points(placement.to_standard(points.means), points.colors.float(), points.times)
         lines += _notes_of_points(points, share, is_far_away=away > _FAR_POINTS * size > 0)
     return Scene(
         name=name,

@@ -91,7 +91,8 @@ def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
 def read_ply(path: Path) -> Points:
     """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
-    Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1].
+    Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1]. A
+    property `time` in [0, 1] gives the points times: the union of the clouds of several frames has one.
     """
     vertices = read_vertices(path)
     means = columns(vertices, ("x", "y", "z"), path, _LARGEST)
@@ -107,7 +108,10 @@ def read_ply(path: Path) -> Points:
         raise InputError(f"{path}: expected colours as red green blue, or as f_dc_0..2, found {names!r:.120}: add them")
     else:
         colors = (0.5 + SH_C0 * columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path, _LARGEST)).clip(0, 1)
-    return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)))
+    times = torch.from_numpy(columns(vertices, ("time",), path, 1.0)[:, 0]).float() if "time" in names else None
+    if times is not None and times.min() < 0:
+        raise InputError(f"{path}: time: expected numbers from 0 to 1, some are negative")
+    return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)), times)
 
 
 def nearest_distances(means: Tensor, k: int = 3) -> Tensor:  # [P, 3] -> [P] in the dtype and on the device of `means`

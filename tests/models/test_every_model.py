@@ -168,6 +168,18 @@ def test_start(variant: str) -> None:
     torch.testing.assert_close(sliced.colors.data[drawn], points.colors[drawn])
 
 
+@REGISTERED
+def test_gaussians_start_at_the_times_of_their_points(name: str) -> None:
+    """Catches a model that draws the mean times that points bring, or that takes them for logits."""
+    model, times = build(name, **needed(name)), torch.linspace(0, 1, N)
+    means = torch.rand(N, 3, generator=seeded(0))
+    model.initialise(Points(means, means, times), EXTENT, seeded(0))
+    if "times" in model.splats:
+        begun = model.splats["times"].data[:, 0]
+        is_logit = getattr(model, "bounded_times", False) or name == "dgs"
+        torch.testing.assert_close(torch.sigmoid(begun) if is_logit else begun, times, rtol=0, atol=2e-6)
+
+
 # ---- a slice
 
 

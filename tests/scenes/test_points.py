@@ -69,6 +69,16 @@ def test_ply_of_3dgs(tmp_path: Path) -> None:
     torch.testing.assert_close(colors[1], torch.tensor([0.5 + 0.28209479177387814, 1.0, 0.5]))
 
 
+def test_ply_of_several_frames(tmp_path: Path) -> None:
+    """Catches times that are read as positions, in another type, or where a cloud has none."""
+    vertices = np.zeros(3, [*VERTEX, ("time", "f4")])
+    vertices["time"] = 0.0, 0.25, 1.0
+    times = read_ply(save(tmp_path, ply(vertices))).times
+    assert times is not None
+    torch.testing.assert_close(times, torch.tensor([0.0, 0.25, 1.0]))
+    assert read_ply(save(tmp_path, GOOD)).times is None
+
+
 GOOD = ply(np.ones(3, VERTEX))
 GOOD_ASCII = ply(np.ones(3, VERTEX), "ascii")
 BAD_PLY = {
@@ -90,6 +100,11 @@ BAD_PLY = {
     "not a number, ascii": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 one"), "expected numbers"),
     "colour 256, ascii": (GOOD_ASCII.replace(b"1 1 1\n", b"1 1 256\n"), "blue"),
     "position not finite": (GOOD_ASCII.replace(b"1.0 1.0", b"1.0 nan"), "y: expected finite numbers, 3 of 3"),
+    "time after the end": (ply(np.full(1, 2, [*VERTEX, ("time", "f4")])), "time: expected finite numbers"),
+    "time before the start": (
+        GOOD_ASCII.replace(b"uchar red", b"float time\nproperty uchar red").replace(b"1 1 1\n", b"-0.5 1 1 1\n"),
+        "time: expected numbers from 0 to 1",
+    ),
     "float colour of 255": (ply(np.full(1, 255, [(n, "f4") for n, _ in VERTEX])), "red green blue"),
 }
 

@@ -58,6 +58,17 @@ def test_cameras_times_and_splits(root: Path) -> None:
     torch.testing.assert_close(half.camera.K[:2], torch.tensor([[5.0, 0, 1.75], [0, 7.5, 1.25]]))
 
 
+def test_points_keep_their_times(root: Path) -> None:
+    """Catches times that are lost where a scene comes to its standard place."""
+    properties = [f"property {kind}" for kind in ("float x", "float y", "float z", "uchar red", "uchar green",
+                                                  "uchar blue", "float time")]  # fmt: skip
+    header = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header"]
+    (root / "points3d.ply").write_text("\n".join([*header, "0 0 50 1 2 3 0.25", "1 1 50 1 2 3 1", ""]))
+    points = scenes.load(root).points
+    assert points.times.tolist() == [0.25, 1.0]
+    assert points.means.dtype == points.times.dtype == torch.float32
+
+
 def test_frames_can_be_chosen(root: Path) -> None:
     """Catches frames counted from 0, and a last one that is left out."""
     scene = scenes.load(root, frames=(101, 102))
