@@ -93,7 +93,10 @@ class DensifyConfig:
     """Set the density control. All steps but `every` scale with `train.iterations`."""
 
     kind: str = key(
-        "gradient", "rule: 3DGS, 3DGS-MCMC, FastGS", choices=("gradient", "mcmc", "multiview"), absent="gradient"
+        "gradient",
+        "rule: 3DGS, 3DGS-MCMC, FastGS, FreeTimeGS",
+        choices=("gradient", "mcmc", "multiview", "relocation"),
+        absent="gradient",
     )
     start: int = key(500, "first step", low=0)
     stop: int = key(15_000, "last step", low=0)

@@ -1,4 +1,5 @@
-"""Add and remove Gaussians by the rules of 3DGS (gradient.py), 3DGS-MCMC (mcmc.py) and FastGS (multiview.py).
+"""Add, remove and move Gaussians by the rules of 3DGS, 3DGS-MCMC, FastGS and FreeTimeGS.
 
-control.py calls the rule of a training when gsbench/schedule.py says so.
+They are in gradient.py, mcmc.py, multiview.py and relocation.py. control.py calls the rule of a training when
+gsbench/schedule.py says so.
 """

@@ -13,6 +13,7 @@ from gsbench.train.density.blend_weights import blend_weights, heaviest
 from gsbench.train.density.gradient import GradientDensification
 from gsbench.train.density.mcmc import MCMCDensification
 from gsbench.train.density.multiview import ErrorScore, MultiviewDensification
+from gsbench.train.density.relocation import RelocationDensification
 from gsbench.train.density.rule import DensificationRule
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
@@ -33,6 +34,7 @@ RULES: dict[str, type[DensificationRule]] = {  # by train.densify.kind
     "gradient": GradientDensification,
     "mcmc": MCMCDensification,
     "multiview": MultiviewDensification,
+    "relocation": RelocationDensification,
 }
 
 

@@ -10,7 +10,46 @@ from gsbench.train.density.rule import DensificationRule, Score
 from gsbench.train.rows import Rows
 
 
-class GradientDensification(DensificationRule):
+class GradientRule(DensificationRule):
+    """The base class of rules that use the mean gradient of each 2D mean, in units of half the image (NDC)."""
+
+    def __init__(
+        self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
+    ) -> None:
+        super().__init__(rows, config, min_opacity, views, score)
+        self.forget()
+
+    def forget(self) -> None:
+        """Set the accumulated gradients of the 2D means, and the counts of views, to zero."""
+        like = self.model.splats["opacities"].detach()
+        self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
+        self.times_visible = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
+
+    @torch.no_grad()
+    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
+        """Add the norms of the gradients of the 2D means in one view, in units of half the image."""
+        x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
+        self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
+        self.times_visible += drawn.sum(0)
+
+    def mean_gradient(self) -> Tensor:
+        """Return the mean of these norms over the views that saw each Gaussian, [N]."""
+        return self.gradient / self.times_visible.clamp(min=1)
+
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        self.forget()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"gradient": self.gradient, "times_visible": self.times_visible}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        opacities = self.model.splats["opacities"]
+        self.gradient, self.times_visible = (
+            tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "times_visible")
+        )
+
+
+class GradientDensification(GradientRule):
     """The adaptive density control of 3DGS (section 5.2), with the splits in time of 7DGS (section 4.4).
 
     By default, in a run of 30,000 iterations:
@@ -30,21 +69,11 @@ class GradientDensification(DensificationRule):
         super().__init__(rows, config, min_opacity, views, score)
         self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
-        self.forget()
-
-    def forget(self) -> None:
-        """Set the accumulated gradients of the 2D means, and the counts of views, to zero."""
-        like = self.model.splats["opacities"].detach()
-        self.gradient = torch.zeros_like(like)  # [N] sum over views of |gradient of the 2D mean|
-        self.times_visible = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
     def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
-        """Add the norms of the gradients of the 2D means in one view, in units of half the image (NDC)."""
-        x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
-        self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
-        self.times_visible += drawn.sum(0)
-        # [N] views since the Gaussian was last visible
+        """Add the gradients of one view, and count the views since each Gaussian was last visible."""
+        super().accumulate(drawn, g_means2d, width, height, views)
         self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     @torch.no_grad()
@@ -97,7 +126,7 @@ class GradientDensification(DensificationRule):
 
         Those with the largest gradients are chosen.
         """
-        gradient = self.gradient / self.times_visible.clamp(min=1)
+        gradient = self.mean_gradient()
         wanted = gradient > self.config.grad_threshold
         if allowed is not None:
             wanted &= allowed
@@ -114,15 +143,12 @@ class GradientDensification(DensificationRule):
         self.rows.forget("opacities")
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        super().reindex(rows, fresh)
         self.unseen = self.unseen[rows]
-        self.forget()
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {"gradient": self.gradient, "times_visible": self.times_visible, "unseen": self.unseen}
+        return super().state_dict() | {"unseen": self.unseen}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        opacities = self.model.splats["opacities"]
-        self.gradient, self.times_visible = (
-            tensor(state, name, opacities.shape, opacities.dtype) for name in ("gradient", "times_visible")
-        )
-        self.unseen = tensor(state, "unseen", opacities.shape, torch.int32)
+        super().load_state_dict(state)
+        self.unseen = tensor(state, "unseen", self.model.splats["opacities"].shape, torch.int32)

@@ -6,7 +6,9 @@ Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 24
 import torch
 from torch import Tensor
 
+from gsbench.models import GaussianModel
 from gsbench.train.density.rule import DensificationRule
+from gsbench.train.rows import Rows
 
 GROWTH = 0.05  # share of Gaussians that a round adds, until there are `max_gaussians`
 MOST_COPIES = 51  # equal Gaussians that one Gaussian becomes in a round, at most
@@ -32,38 +34,15 @@ class MCMCDensification(DensificationRule):
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
         """Relocate dead Gaussians, then add Gaussians up to `most`; return 0, because none is refused."""
         N = len(self.model)
-        opacities = self._opacities()
+        opacities = opacities_of(self.model)
         dead = opacities <= self.min_opacity
         if dead.all():
             return 0
-        self._copy(drawn(opacities.masked_fill(dead, 0), int(dead.sum()), generator), dead.nonzero()[:, 0])
+        copy_drawn(self.rows, opacities.masked_fill(dead, 0), dead.nonzero()[:, 0], generator, self.min_opacity)
         added = max(0, min(most, int(N * (1 + GROWTH))) - N)
-        self._copy(drawn(self._opacities(), added, generator), torch.arange(N, N + added, device=dead.device))
+        places = torch.arange(N, N + added, device=dead.device)
+        copy_drawn(self.rows, opacities_of(self.model), places, generator, self.min_opacity)
         return 0
-
-    def _opacities(self) -> Tensor:
-        return torch.sigmoid(self.model.splats["opacities"].detach())
-
-    def _copy(self, sources: Tensor, places: Tensor) -> None:
-        """Copy Gaussians to other rows, and change all copies such that together they look like the source.
-
-        Args:
-            sources: the row of the source of each copy, [M]; a row may occur several times.
-            places: the rows of the copies, [M]: existing rows are replaced, others appended.
-        """
-        if not len(sources):
-            return
-        N, model = len(self.model), self.model
-        rows = torch.arange(max(N, int(places.max()) + 1), device=sources.device)
-        rows[places] = sources
-        chosen, copies = sources.unique(return_counts=True)
-        opacities, shrink = relocated(self._opacities()[chosen], (copies + 1).clamp(max=MOST_COPIES))
-        opacities = opacities.clamp(self.min_opacity, LARGEST_OPACITY)
-        model.splats["opacities"].data[chosen] = torch.logit(opacities).to(model.splats["opacities"].dtype)
-        model.shrink_rows(chosen, shrink)
-        fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
-        fresh[places] = fresh[chosen] = True
-        self.rows.select(rows, fresh)
 
     @property
     def adds_noise(self) -> bool:  # type: ignore[override]
@@ -73,12 +52,43 @@ class MCMCDensification(DensificationRule):
     @torch.no_grad()
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move the means of transparent Gaussians by noise."""
-        opacities = self._opacities()
+        opacities = opacities_of(self.model)
         noise = torch.randn(len(opacities), 3, 1, generator=generator).to(opacities)
         rows = (opacities < STILL_FROM).nonzero()[:, 0]
         spread = self.model.spread(rows)
         weight = torch.sigmoid(-100 * (opacities[rows] - 0.005)) * (self.config.noise * rate)
         self.model.splats["means"].data[rows] += weight[:, None] * (spread @ (spread.mT @ noise[rows]))[..., 0]
+
+
+def opacities_of(model: GaussianModel) -> Tensor:
+    """Return the opacities of all Gaussians, before they fade with time or direction, [N]."""
+    return torch.sigmoid(model.splats["opacities"].detach())
+
+
+def copy_drawn(rows: Rows, weights: Tensor, places: Tensor, generator: torch.Generator, least_opacity: float) -> None:
+    """Copy Gaussians to other rows, and change all copies such that together they look like the source.
+
+    Args:
+        rows: the Gaussians of the training.
+        weights: to which the probability of each Gaussian to be a source is proportional, [N].
+        places: the rows of the copies, [M]: existing rows are replaced, others appended.
+        generator: draws the sources, with replacement.
+        least_opacity: to which lower opacities of copies are raised.
+    """
+    sources = drawn(weights, len(places), generator)
+    if not len(sources):
+        return
+    model = rows.model
+    order = torch.arange(max(len(model), int(places.max()) + 1), device=sources.device)
+    order[places] = sources
+    chosen, copies = sources.unique(return_counts=True)
+    opacities, shrink = relocated(opacities_of(model)[chosen], (copies + 1).clamp(max=MOST_COPIES))
+    opacities = opacities.clamp(least_opacity, LARGEST_OPACITY)
+    model.splats["opacities"].data[chosen] = torch.logit(opacities).to(model.splats["opacities"].dtype)
+    model.shrink_rows(chosen, shrink)
+    fresh = torch.zeros(len(order), dtype=torch.bool, device=order.device)
+    fresh[places] = fresh[chosen] = True
+    rows.select(order, fresh)
 
 
 def drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
