@@ -77,7 +77,7 @@ frontier: setup  ## train seven models at five lengths and two capacities, and A
 	$(BIN)/python -m gsbench.report $(RESULTS)/frontier || status=$$?; \
 	exit $$status
 
-tables: setup  ## write Tables 1 and 2 of the paper, and one of its successors, from whatever is in results/, and say what is missing
+tables: setup  ## write Tables 1 and 2 of the paper, and one of its successors and rivals, from whatever is in results/, and say what is missing
 	$(BIN)/python -m gsbench.report --tables $(RESULTS)
 
 # Two processes, for CI has two cores; a file's tests stay together, since they share trainings. In the order

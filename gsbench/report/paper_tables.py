@@ -21,7 +21,7 @@ from gsbench.report.render import text
 from gsbench.report.section import Column, Section
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
-SUCCESSORS = ("dgs", "ubs", "dbs", "freetime", "7dgs", "7dgs_noagr", "4dgs")
+SUCCESSORS = ("dgs", "ubs", "dbs", "freetime", "deformable", "7dgs", "7dgs_noagr", "4dgs")  # and rivals
 SUCCESSOR_SCENES = {name: list(paper.PROTOCOLS[name].scenes) for name in ("D-NeRF", "7DGS-PBR")}
 TABLE_1 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians"]
 TABLE_2 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex"]
@@ -69,7 +69,14 @@ SOURCES = {
     "They test every 500 iterations and keep the best: treat as best on test",
     "ubs": "the authors of UBS (ICLR 2026): iteration 30,000, and the mean of the channels' PSNR, which is never lower",
     "ubs_others": "in the table of UBS' authors, which does not say the iteration: treat as best on test",
+    "4dgaussians": "the authors of 4DGaussians (CVPR 2024): white background, 800x800, last iteration, lego on test",
+    "deformable": "the authors of Deformable-3DGS (CVPR 2024): black background, 800x800, lego on val. Their code "
+    "tests every 1,000 iterations and prints the best: treat as best on test",
+    "ldg": "later code of Deformable-3DGS' authors (Lightweight-Deformable-GS): black background, 400x400; it does not "
+    "say the iteration: treat as best on test",
+    "scgs": "in the table of SC-GS' authors (CVPR 2024): black background, 400x400, best on test",
 }
+AT_THE_END = ("ubs", "4dgaussians")  # sources whose PSNR is of the last iteration
 COMPUTED = "the mean is computed here from the published scenes"
 
 
@@ -212,7 +219,7 @@ def _quoted(dataset: str) -> pd.DataFrame:
 
 
 def successors(results: Results) -> pd.DataFrame:
-    """Return the published and the measured numbers of 7DGS' successors, by scene and as means over scenes.
+    """Return the published and the measured numbers of 7DGS' successors and rivals, by scene and as means over scenes.
 
     A measured row has finished all scenes of its mean. Trials, which are measured on val where the data set has a test
     split, are left out.
@@ -285,7 +292,7 @@ def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict
             }
             note = f"; {COMPUTED}"
         row = {"row": "published", "method": of["method"], "recipe": "", "experiment": "", "scenes": of["scenes"]}
-        key = "psnr_db" if of["source"] == "ubs" else "psnr_best_on_test_db"
+        key = "psnr_db" if of["source"] in AT_THE_END else "psnr_best_on_test_db"
         yield row | {"protocol": SOURCES[of["source"]] + note, key: of["psnr_db"], "gaussians": of["gaussians"]}
 
 
@@ -401,7 +408,7 @@ def _sections_of_successors(results: Results) -> Iterator[Section]:
         lines["protocol"] = [f"published ({sources.index(p) + 1})" if p in sources else p for p in lines.protocol]
         notes = tuple(f"({i}) {source}" for i, source in enumerate(sources, 1))
         columns = {"scenes": Column("scenes", 0), "seeds": Column("seeds", 0)}
-        table, title = lines.drop(columns="row"), f"Successors of 7DGS, {dataset}"
+        table, title = lines.drop(columns="row"), f"Successors and rivals of 7DGS, {dataset}"
         yield Section(f"successors-{dataset}", title, TEXT_SUCCESSORS, table, columns, notes=notes)
 
 
