@@ -24,6 +24,7 @@ class _Layout:
     expected: str  # the files of the layout and where such data is published, for the error message
     reader: str  # module.function of this package: (root, rendition) -> Scene; imported late
     reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
+    options: tuple[str, ...] = ()  # of `load` that only some layouts have
 
 
 _LAYOUTS = (
@@ -39,6 +40,13 @@ _LAYOUTS = (
         "authors of Sabater et al. 2017)",
         "technicolor.load",
         ("sparse",),
+        ("frames", "repair"),
+    ),
+    _Layout(
+        "train_meta.json",
+        "train_meta.json and test_meta.json beside the images they name, in ims (Panoptic Sports: the Data link of "
+        "github.com/JonathonLuiten/Dynamic3DGaussians)",
+        "panoptic.load",
     ),
     _Layout(
         "sparse",
@@ -58,7 +66,7 @@ def load(
     frames: Sequence[int] | None = None,
     repair: Sequence[str] | None = None,
 ) -> Scene:
-    """Load a scene from a folder in the layout of Blender (NeRF-synthetic, D-NeRF), Technicolor, COLMAP or nerfstudio.
+    """Load a scene from a folder in the layout of Blender (D-NeRF), Technicolor, Panoptic Sports, COLMAP or nerfstudio.
 
     What was decided where the files leave a choice, such as which number of the names is the time, is printed and is
     in `Scene.notes`.
@@ -120,7 +128,7 @@ def load(
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
     """Check and return the numbers of the first and the last frame; raise InputError for a layout without frames."""
-    if layout.marker != "cameras_parameters.txt":
+    if "frames" not in layout.options:
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
         raise InputError(f"frames: expected the numbers of the first and the last frame, got {frames!r:.80}")
@@ -131,7 +139,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
     """Check and return the names of images to replace; raise InputError for a layout without frames."""
-    if layout.marker != "cameras_parameters.txt":
+    if "repair" not in layout.options:
         raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")

@@ -56,7 +56,6 @@ _PARAMETERS = {  # of the models that are read: f or fx fy, the principal point,
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
 _LARGEST = 1e9  # the largest number in a model
-_SMALLEST = 1e-6  # pixels; smaller focal lengths become zero in single precision
 _UNIT = 1e-3  # tolerance of the length of quaternions
 
 
@@ -230,7 +229,7 @@ def _lens(model: str, width: int, height: int, values: tuple[float, ...], where:
         raise InputError(f"{where}: expected {model} with {' '.join(names)}, got {values}")
     parameters = dict(zip(names, values, strict=True))
     fx, fy = (parameters.get(name, parameters.get("f", 0.0)) for name in ("fx", "fy"))
-    if not (min(fx, fy) > _SMALLEST and min(width, height) > 0):
+    if not (min(fx, fy) > shots.SMALLEST and min(width, height) > 0):
         raise InputError(f"{where}: expected positive focal lengths and sizes, got {fx} {fy} for {width}x{height}")
     K = np.array([[fx, 0, parameters["cx"]], [0, fy, parameters["cy"]], [0, 0, 1]])
     k1, k2, p1, p2 = (parameters.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))

@@ -22,6 +22,8 @@ from gsbench.scenes.scene import Camera, View
 _HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres are at +0.5 here, and at integers in OpenCV
 _LEAST_RATIO = 1.1  # below it, an image whose sides are not exactly in one ratio to the camera's may have been cropped
 _OUTSIDE = 2.0  # pixels that OpenCV's rectangle without blank pixels may exceed the image, as it samples the border
+SMALLEST = 1e-6  # pixels; smaller focal lengths become zero in single precision
+_RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 MASKS = "masks"  # the folder with the object number of each pixel, in PNG files
 
 
@@ -111,6 +113,24 @@ class Shots:
     views: list[View]
     digests: list[str]
     notes: list[str]
+
+
+def check_rigid(
+    pose: NDArray[np.float64],  # [4, 4]
+    where: str,
+    what: str,  # such as camera-to-world
+) -> None:
+    """Raise InputError unless a pose is a rotation and a translation."""
+    if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=_RIGID_TOLERANCE):
+        raise InputError(f"{where}: expected the last row 0 0 0 1, got {pose[3].tolist()}")
+    rotation = pose[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    determinant = np.linalg.det(rotation)
+    if error > _RIGID_TOLERANCE or determinant < 0:
+        raise InputError(
+            f"{where}: expected a rigid {what} matrix (R^T R = I to {_RIGID_TOLERANCE}, det R = +1), got an "
+            f"error of {error:.2g} and a determinant of {determinant:.6g}: take out scale, shear and mirroring"
+        )
 
 
 def size_of(path: Path, where: str) -> Size:

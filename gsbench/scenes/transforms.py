@@ -32,11 +32,9 @@ NERFSTUDIO = "transforms.json"
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 # The transform by which nerfstudio made the poses from COLMAP's is part of the poses, and of the points.
 _NERFSTUDIO_KEYS = frozenset((*_SPLITS, "ply_file_path", "applied_transform", "applied_scale"))
-_RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 _FRAME_KEYS = {"file_path", "transform_matrix", "time", "rotation"}  # NeRF-synthetic's rotation is not part of the pose
 _MOST_KEYS = 8  # named in a sentence
 _OWN_TIMES = "give them their own times"
-_SMALLEST = 1e-6  # pixels; smaller lengths become zero in single precision
 _LARGEST = 1e30  # largest number in a file; its square in double and its sums in single precision are finite
 _AGREE = 1e-3  # relative tolerance between two statements of one focal length
 _AXES = (("fl_x", "camera_angle_x"), ("fl_y", "camera_angle_y"))
@@ -291,16 +289,8 @@ def _viewmat(
     if len(rows) != 4 or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
     c2w: NDArray[np.float64] = np.array([[_number(value, where) for value in row] for row in rows])
-    if not np.allclose(c2w[3], [0, 0, 0, 1], rtol=0, atol=_RIGID_TOLERANCE):
-        raise InputError(f"{where}: expected the last row 0 0 0 1, got {c2w[3].tolist()}")
+    shots.check_rigid(c2w, where, "camera-to-world")
     rotation = c2w[:3, :3]
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    determinant = np.linalg.det(rotation)
-    if error > _RIGID_TOLERANCE or determinant < 0:
-        raise InputError(
-            f"{where}: expected a rigid camera-to-world matrix (R^T R = I to {_RIGID_TOLERANCE}, det R = +1), got an "
-            f"error of {error:.2g} and a determinant of {determinant:.6g}: take out scale, shear and mirroring"
-        )
     turned = rotation * [1, -1, -1]
     viewmat = np.eye(4)
     viewmat[:3, :3] = turned.T
@@ -407,7 +397,7 @@ def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], sourc
         if key in merged
     }
     for key in ("fl_x", "fl_y", "w", "h"):
-        if key in values and values[key] < _SMALLEST:
+        if key in values and values[key] < shots.SMALLEST:
             raise InputError(f"{where}: {key}: expected a positive number of pixels, got {values[key]}")
     for _, key in _AXES:
         if key in values and not 1e-6 < values[key] < math.pi:
