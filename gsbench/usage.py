@@ -27,8 +27,8 @@ MORE = """\
 Often used: agr=true|false  seed=0  train.iterations=30000  scene.downscale=2  device=cpu  data.root=PATH
 raster.backend=auto|reference|cpu|cuda. Keys of a group, with their ranges: python -m gsbench --help train
 
-Also: python -m gsbench doctor, and python -m gsbench.COMMAND --help of report, view, export, fetch, launch, gates,
-stability
+Also: python -m gsbench doctor, and python -m gsbench.COMMAND --help of report, score, view, export, fetch, launch,
+gates, stability
 """
 DESCRIBED = {  # config groups, and how they are chosen
     "exp": "Experiments, +exp=NAME",

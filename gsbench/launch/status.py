@@ -273,7 +273,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 class _Cost(msgspec.Struct):
-    train_s: float
+    train_s: float | None
 
 
 class _Outcome(msgspec.Struct):

@@ -48,6 +48,8 @@ METRICS = (
     "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )
 
+MEASURED = ("train_s", "render_ms", "fps", "num_gaussians", "bytes", "peak_memory")  # costs of what gsbench trains
+
 
 @dataclass(frozen=True)
 class Effects:
@@ -95,17 +97,31 @@ class Region:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of a run: training seconds, memory, frame times and the size of the model."""
+    """The cost of a run: training seconds, memory, frame times and the size of the model.
 
-    train_s: float  # wall-clock seconds of all training steps: gsbench.train.loop.Trainer.run says what does not count
+    Of images that were rendered elsewhere only what the user states is known; other fields that may be None are None.
+    """
+
+    # wall-clock seconds of all training steps: gsbench.train.loop.Trainer.run says what does not count
+    train_s: float | None
     stage_s: dict[str, float]  # the same seconds by stage of training; "other": between the stages
-    render_ms: RenderTimes
-    fps: float  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
-    num_gaussians: int
-    bytes: int  # size of the model's parameters
-    peak_memory: int  # bytes: gsbench.measure.speed.peak_memory
+    render_ms: RenderTimes | None
+    fps: float | None  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
+    num_gaussians: int | None
+    bytes: int | None  # size of the model's parameters
+    peak_memory: int | None  # bytes: gsbench.measure.speed.peak_memory
     train_cpu_s: float | None = None  # CPU-seconds of all threads during `train_s`; None: not measured
     load: float | None = None  # mean load average of the machine during `train_s`, including this run
+
+
+@dataclass(frozen=True)
+class Renders:
+    """The images of another program, which `gsbench.score` measured, and how they were matched to the views."""
+
+    kind: str  # of the files, such as "8-bit PNG"; of a video "video, which is lossy"
+    matched: Literal["names", "order"]
+    resized_from: str | None  # their size, such as "800x800", if they were reduced to that of the views
+    digest: str  # SHA-256 of the files
 
 
 @dataclass(frozen=True)
@@ -232,7 +248,7 @@ class Record:
     scene: str
     dataset: str
     seed: Annotated[int, msgspec.Meta(ge=0)]
-    effects: Effects
+    effects: Effects | None  # None: not known of images that were rendered elsewhere
     # plain JSON: name, background, downscale, eval_split, quantise, paper_dataset, ...
     protocol: Annotated[dict[str, Any], SHOWN]
     provenance: Provenance
@@ -250,7 +266,9 @@ class Record:
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not
     length_choice: LengthChoice | None = None  # None: one training, without `train.lengths`
     exact: list[str] = field(default_factory=list)  # views: gsbench.measure.exact_views
-    parts: dict[str, Any] = field(default_factory=dict)  # what training hooks add: gsbench.train.hooks.Hook.results
+    # what training hooks (gsbench.train.hooks.Hook.results) and gsbench.score add
+    parts: dict[str, Any] = field(default_factory=dict)
+    rendered_elsewhere: Renders | None = None  # None: gsbench trained and rendered the model
 
     @property
     def path(self) -> Path:
@@ -339,6 +357,11 @@ def check(record: Record, file: str) -> None:
     for what, value in (("metrics", record.metrics), ("cost", record.cost)):
         if ok and value is None:
             raise InputError(f"{file}: {what}: expected values in a run that is ok, got null")
+    if record.rendered_elsewhere is None:
+        costs = {f"cost.{name}": getattr(record.cost, name) for name in MEASURED} if record.cost else {}
+        for what, value in {"effects": record.effects, **costs}.items():
+            if value is None:
+                raise InputError(f"{file}: {what}: expected a value in a run of gsbench's, got null")
     metrics = record.metrics or {}
     for name in metrics:
         if name not in METRICS:

@@ -55,6 +55,15 @@ RUNS = (
     RunColumn("effect_time", "effects.time", bool, "Gaussians depend on time"),
     RunColumn("effect_direction", "effects.direction", bool, "Gaussians depend on the view direction"),
     RunColumn("effect_refinement", "effects.refinement", bool, "Gaussians depend on AGR, a neural network"),
+    RunColumn("rendered_elsewhere", "", bool, "another program rendered the images (`gsbench.score`)"),
+    RunColumn("ssim_padded", "parts.score.ssim_padded", float, "of gsbench.score: SSIM of 3DGS, zero-padded Gaussian"),
+    RunColumn("ssim_uniform", "parts.score.ssim_uniform", float, "SSIM with a uniform window of 7, scikit-image's"),
+    RunColumn("ssim_uniform_range2", "parts.score.ssim_uniform_range2", float, "the same with data_range 2"),
+    RunColumn("dssim1", "parts.score.dssim1", float, "(1 - ssim_padded) / 2"),
+    RunColumn("dssim2", "parts.score.dssim2", float, "(1 - ssim_uniform_range2) / 2"),
+    RunColumn(
+        "psnr_color_corrected_db", "parts.score.psnr_color_corrected", float, "PSNR after an affine map of colours"
+    ),
     RunColumn("on_demand", "", bool, "the time screen or a gate ran (`effects.gate`, `model=auto`)"),
     RunColumn("gate", "", str, 'when that was, such as "gate=end"; "" where it is the model\'s default'),
     RunColumn("config", "provenance.config", dict, "all settings, a nested dict"),

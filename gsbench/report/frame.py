@@ -113,7 +113,10 @@ def row(r: Record) -> dict[str, Any]:
     """Return a record as a row of `runs`."""
     values = {column.name: value_at(r, column.place) for column in RUNS if column.place}
     values |= {c.name: values[c.name] / c.unit for c in RUNS if c.unit != 1 and values[c.name] is not None}
-    values |= {"psnr_val_db": psnr_val(r), "train_min": r.cost.train_s / 60 if r.cost else math.nan}
+    values |= {"psnr_val_db": psnr_val(r), "train_min": _number(values["train_s"]) / 60}
+    if values["frame_ms"] is None and values["fps"]:  # stated of a method that gsbench did not render
+        values["frame_ms"] = 1000 / values["fps"]
+    values |= {"rendered_elsewhere": r.rendered_elsewhere is not None}
     values |= {"iterations": iterations(r), "machine": r.provenance.machine}
     values |= {"on_demand": r.on_demand is not None, "gate": gating(r)}
     values |= {"versions": ", ".join(f"{name} {version}" for name, version in sorted(r.provenance.versions.items()))}
@@ -177,16 +180,19 @@ def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """Add what a run is called.
 
-    `main`: models are compared with these settings, which most models share. `compared`: the same but for ablations and
-    the removal of effects. `series`: the curve of a figure. `label`: the row of a table.
+    `main`: models are compared with these settings, which most models share, and with images that were rendered
+    elsewhere. `compared`: the same but for ablations and the removal of effects. `series`: the curve of a
+    figure. `label`: the row of a table.
     """
-    shared = runs[runs.status == "ok"][["model", "variant"]].drop_duplicates().variant.value_counts()
+    counted = runs[(runs.status == "ok") & ~runs.rendered_elsewhere]
+    shared = counted[["model", "variant"]].drop_duplicates().variant.value_counts()
     main = min(shared.index, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
     gated = (runs.gate != "") & (runs.gate.nunique() > 1)
     series = runs.model.where(~gated, runs.model + ", " + runs.gate)
     label = names_of(runs) if runs.variant.nunique() > 1 else runs.model
-    compared = runs.variant.map(common) == common(main)
-    return runs.assign(main=runs.variant == main, compared=compared, series=series, label=label)
+    compared = (runs.variant.map(common) == common(main)) | runs.rendered_elsewhere
+    is_main = (runs.variant == main) | runs.rendered_elsewhere
+    return runs.assign(main=is_main, compared=compared, series=series, label=label)
 
 
 def names_of(runs: pd.DataFrame) -> pd.Series:

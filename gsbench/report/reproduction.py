@@ -31,7 +31,8 @@ from gsbench.report.section import Column, Section
 ROW = ["experiment", "dataset", "scene", "model", "variant"]  # what two runs that are compared have in common
 SIDES = ["new", "reference"]  # the two folders: that of the report, and that of --against
 AGREES, DIFFERS, UNDECIDED = "agrees", "differs", "undecided"
-MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale", "resize")  # settings of an evaluation
+# Settings of an evaluation.
+MEASURING = ("eval_split", "quantise", "resolution", "background", "downscale", "resize", "images", "reduced")
 TIMES = ["train_s", "frame_ms"]
 SIZES = ["runs_new", "runs_reference"]  # of the two samples of a quantity
 BITS = ["psnr_db", "gaussians", "model_mb"]  # equal if the trained Gaussians are bit-equal

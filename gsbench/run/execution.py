@@ -178,7 +178,6 @@ class Execution:
         """Return a record without measurements, to check it before step 0, and for a run that failed for a `reason`."""
         config, scene, spec = self.chosen.config, self.scene, self.spec
         observes = models.find(config.model.name, config.model.module).observes
-        camera = scene.train[0].camera if scene else None
         on_gpu = config.device.startswith("cuda") and self.model is not None
         return Record(
             status=status,
@@ -190,16 +189,8 @@ class Execution:
             seed=config.seed,
             effects=Effects("time" in observes, "direction" in observes, config.agr),
             protocol={
-                "name": config.protocol.name,
-                "background": config.data.background,
-                "downscale": config.scene.downscale,
-                "resolution": f"{camera.width}x{camera.height}" if camera else "not loaded",
-                "eval_split": config.scene.eval_split,
-                "quantise": config.protocol.quantise,
+                **measuring.protocol_of(config, scene),
                 "backend": self.model.backend.name if self.model else config.raster.backend,
-                "paper_dataset": config.data.paper_dataset,
-                **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
-                **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
             },
             provenance=provenance(
                 config=spec.plain,
@@ -344,13 +335,14 @@ def summary(record: Record) -> str:
     """Return a record in one line: PSNR, size and speed, exact views, a fall of PSNR on val; or why the run failed."""
     if record.metrics is None or record.cost is None:
         return f"{record.status}: {record.reason}"
-    psnr, choice = record.metrics["psnr"], record.length_choice
-    length = f"{choice.kept} iterations kept, " if choice else ""
+    psnr, choice, cost = record.metrics["psnr"], record.length_choice, record.cost
+    facts = [f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB"]
+    facts += [] if cost.num_gaussians is None else [f"{cost.num_gaussians} Gaussians"]
+    facts += [f"{choice.kept} iterations kept"] if choice else []
+    facts += [] if cost.train_s is None else [f"trained in {cost.train_s:.0f} s"]
+    facts += [] if cost.fps is None else [f"{cost.fps:.0f} FPS"]
     exact_views = f". {printable(sentence(record.exact))}" if record.exact else ""
-    return (
-        f"PSNR {'-' if psnr is None else format(psnr, '.2f')} dB, {record.cost.num_gaussians} Gaussians, {length}"
-        f"trained in {record.cost.train_s:.0f} s, {record.cost.fps:.0f} FPS{exact_views}{too_long(record)}"
-    )
+    return f"{', '.join(facts)}{exact_views}{too_long(record)}"
 
 
 def too_long(record: Record) -> str:

@@ -1,8 +1,12 @@
-"""Measure a trained model: image quality, frame time, and the cost of its training."""
+"""Measure a trained model: image quality, frame time, and the cost of its training.
+
+`measure_images` measures the images of any program: those of a trained model, and those that gsbench.score reads.
+"""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy.typing as npt
 from torch import Tensor
@@ -11,13 +15,13 @@ from gsbench.config import Config
 from gsbench.errors import one_line
 from gsbench.gates import picture
 from gsbench.measure.images import Pixels, strip
-from gsbench.measure.quality import Quality, evaluate, evenly
+from gsbench.measure.quality import evaluate, evenly
 from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.render import GraphedFrames
 from gsbench.run.settings import lpips_weights
-from gsbench.scenes import View
+from gsbench.scenes import Scene, View
 from gsbench.stability.float32_error import psnr_float32
 from gsbench.train.hooks.best import Best
 from gsbench.train.loop import Trainer
@@ -38,17 +42,56 @@ class Measured:
     images: dict[str, Pixels]  # images by file name
 
 
-def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Measured:
-    """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
-    views = trainer.views
+@dataclass(frozen=True)
+class MeasuredImages:
+    """The measurements of the images of evaluated views alone, and a few of these images beside the ground truth."""
+
+    metrics: dict[str, float | None]
+    missing: dict[str, str]  # why a metric has no value
+    per_view: list[ViewScore]
+    regions: dict[str, Region]
+    shown: Pairs
+
+
+def measure_images(
+    views: Sequence[View],
+    renders: Iterable[Tensor],  # [H, W, 3] of each view
+    background: tuple[float, float, float],
+    config: Config,
+) -> MeasuredImages:
+    """Measure the renders of the evaluated views, of which one at a time is in memory, by the protocol of a config."""
     shown: Pairs = []
     regions = RegionScores(views, config.protocol.quantise)
     quality = evaluate(
-        regions.measured(_rendered(trainer, config.protocol.pictures, shown)),
-        background=trainer.scene.background,
+        regions.measured(_beside_truth(views, renders, config.protocol.pictures, shown)),
+        background=background,
         quantised=config.protocol.quantise,
         weights=lpips_weights(config),
     )
+    metrics, missing = quality.metrics | regions.metrics(), quality.missing | regions.missing()
+    return MeasuredImages(metrics, missing, regions.with_scores(quality.per_view), regions.of_record(), shown)
+
+
+def protocol_of(config: Config, scene: Scene | None) -> dict[str, Any]:
+    """Return the protocol of a measurement for its record; `scene` is None if it could not be loaded."""
+    camera = scene.train[0].camera if scene else None
+    return {
+        "name": config.protocol.name,
+        "background": config.data.background,
+        "downscale": config.scene.downscale,
+        "resolution": f"{camera.width}x{camera.height}" if camera else "not loaded",
+        "eval_split": config.scene.eval_split,
+        "quantise": config.protocol.quantise,
+        "paper_dataset": config.data.paper_dataset,
+        **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
+        **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
+    }
+
+
+def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Measured:
+    """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
+    views = trainer.views
+    measured = measure_images(views, map(trainer.render, views), trainer.scene.background, config)
     frame, note = frames(trainer, views[0])
     times = time_renders(
         lambda i: frame(views[i % len(views)]),
@@ -66,29 +109,29 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Meas
         train_cpu_s=trainer.effort.cpu_s,
         load=trainer.effort.load,
     )
-    metrics, missing = with_best(quality, trainer, config)
-    metrics |= regions.metrics()
-    missing |= regions.missing()
+    metrics, missing = with_best(measured, trainer, config)
     metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
     renderer = trainer.renderer
     metrics["psnr_float32"], why = psnr_float32(trainer.model, trainer.views, renderer.background, renderer.antialias)
     if why:
         missing["psnr_float32"] = why
-    images = {"pictures.png": strip(shown)} if shown else {}
-    if shown and with_effect_sets:
+    images = {"pictures.png": strip(measured.shown)} if measured.shown else {}
+    if measured.shown and with_effect_sets:
         first = views[0]
         images["effect_sets.png"] = picture.draw(
             trainer.model, first.camera, first.time, renderer.background, renderer.antialias
         )
-    return Measured(metrics, missing, regions.with_scores(quality.per_view), regions.of_record(), cost, note, images)
+    return Measured(metrics, missing, measured.per_view, measured.regions, cost, note, images)
 
 
-def _rendered(trainer: Trainer, pictures: int, shown: Pairs) -> Iterator[tuple[str, Tensor, Tensor]]:
+def _beside_truth(
+    views: Sequence[View], renders: Iterable[Tensor], pictures: int, shown: Pairs
+) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Yield (name, render, ground truth) of each evaluated view, and append a few of these image pairs to `shown`."""
-    views = trainer.views
     chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
-    for i, view in enumerate(views):  # one view at a time, because fifty views of 2048 x 1088 take 3 GB
-        render, truth = trainer.render(view), view.image
+    # one view at a time, because fifty views of 2048 x 1088 take 3 GB
+    for i, (view, render) in enumerate(zip(views, renders, strict=True)):
+        truth = view.image
         if i in chosen:
             shown.append((render.cpu().numpy(), truth.cpu().numpy()))
         yield view.name, render, truth
@@ -111,12 +154,14 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
     return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
 
 
-def with_best(quality: Quality, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
+def with_best(
+    measured: MeasuredImages, trainer: Trainer, config: Config
+) -> tuple[dict[str, float | None], dict[str, str]]:
     """Return the metrics of the last iteration, with the PSNR at the iteration that was best on val added.
 
     With `protocol.best_on_test`, the highest PSNR on the evaluated split during training is added too.
     """
-    metrics, missing = dict(quality.metrics), dict(quality.missing)
+    metrics, missing = dict(measured.metrics), dict(measured.missing)
     best = trainer.hook(Best).scores
     metrics["psnr_best_on_val"] = best.eval_at_best_val
     if config.scene.eval_split == "val":

@@ -206,7 +206,7 @@ def alpha_of(pixels: Pixels, size: Size) -> Tensor | None:  # [H, W, 3|4] as sto
 
 
 def composite(
-    pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
+    pixels: Pixels | NDArray[np.float32],  # [H, W, 3|4] RGB or RGBA, straight alpha; floats are in [0, 1]
     rendition: Rendition,
     size: Size,  # after the reduction
 ) -> Tensor:  # [h, w, 3] float32 in [0, 1]
@@ -221,7 +221,7 @@ def composite(
         unreduced = Image.fromarray(_composite_8_bits(pixels, background))
         reduced = unreduced.resize(size, Image.Resampling.BICUBIC)
         return torch.from_numpy(np.array(reduced)).float() / 255
-    values = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    values = pixels.astype(np.float32) / np.float32(_white(pixels))
     image: NDArray[Any] = values[..., :3]
     if pixels.shape[2] == 4:
         alpha = values[..., 3:]
@@ -231,12 +231,17 @@ def composite(
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
 
 
+def _white(pixels: NDArray[Any]) -> float:
+    """Return the value of white in an image: 1 for floats."""
+    return np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
+
+
 def _composite_8_bits(
-    pixels: Pixels,  # [H, W, 3|4] RGB or RGBA, straight alpha
+    pixels: Pixels | NDArray[np.float32],  # [H, W, 3|4] RGB or RGBA, straight alpha
     background: Color,
 ) -> NDArray[np.uint8]:  # [H, W, 3]
     """Composite an image in double precision and truncate it to 8 bits; one channel at a time, to save memory."""
-    most = np.iinfo(pixels.dtype).max
+    most = _white(pixels)
     alpha = pixels[..., 3] / most if pixels.shape[2] == 4 else np.float64(1)
     composited = np.empty((*pixels.shape[:2], 3), np.uint8)
     for channel, color in enumerate(background):

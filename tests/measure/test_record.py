@@ -141,6 +141,11 @@ def test_a_run_that_failed_needs_neither_metrics_nor_cost(tmp_path):
         ({"version": 2}, "version"),
         ({"seed": "0"}, "seed"),
         ({"effects": {"time": True}}, "effects: object missing required field direction"),
+        ({"effects": None}, "effects: expected a value in a run of gsbench's"),
+        (
+            {"cost": dataclasses.replace(make().cost, train_s=None)},
+            "cost.train_s: expected a value in a run of gsbench's",
+        ),
     ],
 )
 def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
@@ -158,7 +163,7 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
         (["scnee"], "x", ["Did you mean 'scene'"]),
         (["cost", "render_ms", "p50"], "2", ["cost.render_ms.p50", "expected float, got str"]),
         (["cost", "render_ms", "p50"], True, ["cost.render_ms.p50"]),
-        (["cost", "num_gaussians"], 1.0, ["cost.num_gaussians", "expected int, got float"]),
+        (["cost", "num_gaussians"], 1.0, ["cost.num_gaussians", "expected int | null, got float"]),
         (["seed"], 2**63, ["seed"]),
         (["seed"], True, ["seed", "expected int, got bool"]),
         (["effects", "time"], 1, ["effects.time", "expected bool, got int"]),

@@ -17,6 +17,7 @@ from gsbench.measure.record import (
     Provenance,
     Record,
     Region,
+    Renders,
     TimeScreen,
     ViewScore,
 )
@@ -76,6 +77,18 @@ def make(model: str = "7dgs", scene: str = "suzanne", seed: int = 0, psnr: float
     if scene == "suzanne":
         run = but(run, protocol={"paper_dataset": "7DGS-PBR"}, provenance={"data_hash": "5e" * 32})
     return dataclasses.replace(run, **changes)
+
+
+def elsewhere(record: Record, model: str, **costs: float | None) -> Record:
+    """The same views as another program rendered them: of its cost only what is stated is known."""
+    return dataclasses.replace(
+        record, model=model, variant="", effects=None, overrides=[], curve=[], on_demand=None, parts={},
+        cost=Cost(**{"train_s": None, "fps": None, "num_gaussians": None, "bytes": None} | costs,
+                  stage_s={}, render_ms=None, peak_memory=None),
+        protocol={key: value for key, value in record.protocol.items() if key != "backend"} | {"images": "8-bit PNG"},
+        provenance=dataclasses.replace(record.provenance, config={"seed": record.seed}),
+        rendered_elsewhere=Renders("8-bit PNG", "order", "800x800", "5e" * 32),
+    )  # fmt: skip
 
 
 def lost(record: Record, reason: str = "out of memory", status: str = "failed") -> Record:

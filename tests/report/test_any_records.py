@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from parsed_page import Page
-from records import EFFECTS, but, gates, lost, make, write_all
+from records import EFFECTS, but, elsewhere, gates, lost, make, write_all
 
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Effects, LengthChoice, OnDemand, Record, Stop, TimeScreen, ViewScore
@@ -68,7 +68,9 @@ def records(draw: st.DrawFn) -> list[Record]:
     psnr, seconds = st.sampled_from(some(PSNR, 2)), some(SECONDS, 2)  # equal runs and missing numbers are common
     dataset = draw(st.sampled_from(("D-NeRF", "mini")))
     names = (sorted(ANY_EFFECTS), ("trex", "lego", "suzanne"), (0, 1, 2), LENGTHS)
-    return [run(*name) for name in itertools.product(*(some(of, 2) for of in names))]
+    runs = [run(*name) for name in itertools.product(*(some(of, 2) for of in names))]
+    rendered = [r for r in runs[: draw(st.sampled_from((0, 1)))] if r.status == "ok"]
+    return [*runs, *(elsewhere(r, "other", fps=draw(st.sampled_from((None, 30.0)))) for r in rendered)]
 
 
 def check(runs: list[Record], root, capsys) -> None:

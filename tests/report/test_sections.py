@@ -10,6 +10,7 @@ from records import (
     EFFECTS,
     but,
     chapter,
+    elsewhere,
     every_row,
     frontier,
     lost,
@@ -347,3 +348,27 @@ def test_the_papers_rows_stand_below_their_models():
     assert rows.model[places].tolist() == ["paper, other data"] * 2
     assert rows.model[places - 1].tolist() == ["4dgs", "7dgs"]
     assert not rows["psnr_db rank"][places].fillna(0).any()
+
+
+# ---- renders of other programs
+
+
+def test_renders_of_another_program_are_compared_and_choose_nothing():
+    """Catches renders without PSNR on val that make all models be chosen on test, that stand for a combination of
+    effects or have stages, a warning of what no other program has, and a cell that is zero where nothing is known."""
+    trained = [r for name in ("3dgs", "4dgs") for r in runs_of(name, "iterations=9", DB[name], 10.0, seeds=(0, 1))]
+    trained = [but(r, effects=EFFECTS[r.model], cost={"stage_s": {"raster": 10.0}}) for r in trained]
+    others = [elsewhere(r, "other", train_s=5.0, fps=50.0) for r in trained[:2]]
+    before, shown = sections(*trained), sections(*trained, *others)
+    row = shown["experiment"].table.set_index("model").loc["other"]
+    assert (row.psnr_db, row.train_min, row.fps) == (pytest.approx(20.0075), 5 / 60, 50.0)
+    assert math.isnan(row.gaussians)
+    assert any("other: rendered elsewhere; 8-bit PNG, matched to" in note for note in shown["experiment"].notes)
+    assert set(shown["pairs"].table.pair) == {"4dgs − 3dgs", "4dgs − other", "3dgs − other"}
+    assert shown["budgets"].table.psnr_db.equals(before["budgets"].table.psnr_db)
+    assert shown["effects"].table["computed from"].tolist() == before["effects"].table["computed from"].tolist()
+    assert shown["stages"].table.model.tolist() == ["3dgs", "4dgs"]
+    assert shown["frontier"].table.set_index("model").frame_ms["other"] == 20.0
+    protocol = shown["protocol"].table
+    assert set(protocol.setting[protocol.note == "WARNING"]) == {"images"}
+    assert set(protocol.value[protocol.setting == "iterations"]) == {"1,000", "rendered elsewhere"}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from records import HOSTILE, but, frontier, gates, lost, make
+from records import HOSTILE, but, elsewhere, frontier, gates, lost, make
 
 from gsbench.errors import InputError
 from gsbench.measure import record as files
@@ -31,7 +31,8 @@ def hard() -> list[Record]:
         dataset=HOSTILE, overrides=list(TEXTS), metrics={"psnr_train": None, "lpips_vgg": None},
         provenance={"config": config, "data_notes": ["\x1b[31m"], "git_commit": "12e4567"},
     )  # fmt: skip
-    return [make(), odd, lost(make(seed=1), "=out"), *frontier(("3dgs",), ("suzanne",), 2, views=3)]
+    rendered = but(elsewhere(make(), "other", bytes=12_345_678), parts={"score": {"dssim1": 1 / 3}})
+    return [make(), rendered, odd, lost(make(seed=1), "=out"), *frontier(("3dgs",), ("suzanne",), 2, views=3)]
 
 
 def test_a_study_gives_back_its_records(tmp_path):

@@ -38,9 +38,10 @@ def basis(chapter: Results) -> list[str]:
 def contests(chapter: Results) -> dict[str, pd.DataFrame]:
     """Return for each budget the best configuration of each model within it, the best first, chosen on val.
 
-    Where a run has no PSNR on val, all are chosen on the evaluated views.
+    Where a run has no PSNR on val, all are chosen on the evaluated views. Images that were rendered elsewhere, which
+    have none, are left out.
     """
-    table = points(chapter, basis(chapter))
+    table = points(chapter.of(~chapter.runs.rendered_elsewhere), basis(chapter))
     chosen_by = "psnr_db" if table.psnr_val_db.isna().any() else "psnr_val_db"
     ordered = table.sort_values(chosen_by, ascending=False, kind="stable")
     return {name: ordered[ordered[cost] <= most].drop_duplicates("series") for name, (cost, most) in BUDGETS.items()}

@@ -175,8 +175,9 @@ def _steps(record: Record) -> list[tuple[int, str]]:
     train = parse(TrainConfig, record.provenance.config["train"], "config")
     if record.length_choice:
         train = replace(train, iterations=record.length_choice.kept)
-    schedule = Schedule(train, sh_degree=0, agr=record.effects.refinement)
+    agr = record.effects is not None and record.effects.refinement
+    schedule = Schedule(train, sh_degree=0, agr=agr)
     steps = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
-    if record.effects.refinement:
+    if agr:
         steps.append((schedule.scaled(train.refine_from), "A"))
     return [(step, letter) for step, letter in steps if step <= train.iterations]

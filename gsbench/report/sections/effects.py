@@ -33,9 +33,10 @@ def asked(chapter: Results) -> Asked:
 def models(chapter: Results) -> tuple[dict[tuple[bool, ...], stats.Key], dict[tuple[bool, ...], stats.Key]]:
     """Return the model of each combination of effects; in the second dict, 7DGS without direction replaces 4DGS.
 
-    Models whose Gaussians lack some effects are left out.
+    Models whose Gaussians lack some effects are left out, and images that were rendered elsewhere.
     """
     runs = chapter.finished.runs
+    runs = runs[~runs.rendered_elsewhere]
     ungated = runs[runs.main & ~runs.groupby(["model", "variant"]).on_demand.transform("any")]
     rank = {name: i for i, name in enumerate(PUBLISHED)}
     first = ungated.drop_duplicates(["model", "variant"]).sort_values("model")

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import pandas as pd
 
 from gsbench.errors import printable
+from gsbench.measure.record import Renders
 from gsbench.report import paper, stats
 from gsbench.report.frame import Results, covered, title_of
 from gsbench.report.section import COLUMNS, Column, Section, number, section
@@ -87,7 +88,7 @@ def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> 
 
 
 def _notes(chapter: Results) -> Iterator[str]:
-    """Yield why runs failed and metrics are missing, and how many pixels PSNR of moving pixels and objects is over."""
+    """Yield why runs failed and metrics are missing, what was rendered elsewhere, and the pixels of regions."""
     for run in chapter.runs[chapter.runs.status != "ok"].itertuples():
         yield printable(f"{run.scene}, {run.label} seed {run.seed} {run.status}: {run.reason}")
     ok = chapter.finished.runs
@@ -99,6 +100,8 @@ def _notes(chapter: Results) -> Iterator[str]:
         column = COLUMNS.get(metric) or COLUMNS.get(f"{metric}_db")
         scenes = "" if set(rows.scene) == set(ok.scene) else f" ({', '.join(sorted(set(rows.scene)))})"
         yield printable(f"{column.title if column else metric}: {why}{scenes}")
+    for (scene, label), runs in ok[ok.rendered_elsewhere].groupby(["scene", "label"]):
+        yield printable(f"{scene}, {label}: {of_renders(runs.record.iloc[0].rendered_elsewhere)}")
     for scene, runs in ok.groupby("scene"):
         regions = {name: region for record in runs.record if record for name, region in record.regions.items()}
         for name, region in sorted(regions.items()):
@@ -106,3 +109,9 @@ def _notes(chapter: Results) -> Iterator[str]:
             yield printable(
                 f"{scene}: PSNR {name} is over {share} % of the pixels of {region.views} views, from {region.source}"
             )
+
+
+def of_renders(renders: Renders) -> str:
+    """Say of which files the images of another program were, and how they were matched to the views."""
+    reduced = f", reduced from {renders.resized_from}" if renders.resized_from else ""
+    return f"rendered elsewhere; {renders.kind}, matched to the views by {renders.matched}{reduced}"

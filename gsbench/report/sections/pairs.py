@@ -25,12 +25,12 @@ def pairs(chapter: Results, tests: pd.DataFrame) -> Section | None:
     tests = tests[tests.scenes > 0]
     if tests.empty:
         return None
-    main, arrays = chapter.runs.variant[chapter.runs.main].iloc[0], stats.grids(chapter)
+    main, arrays = set(chapter.runs.variant[chapter.runs.main]), stats.grids(chapter)
     rows = []
     for test in tests.to_dict("records"):
         better, other = test["weights"] if test["mean"] >= 0 else reversed(test["weights"])
         low, high = sorted((test["low"], test["high"])) if test["mean"] >= 0 else sorted((-test["low"], -test["high"]))
-        name = " − ".join(f"{m}" if v == main else f"{m} ({v or 'default'})" for m, v in (better, other))
+        name = " − ".join(f"{m}" if v in main else f"{m} ({v or 'default'})" for m, v in (better, other))
         ahead = 100 * stats.improvement(arrays, better, other)
         rows.append(
             {

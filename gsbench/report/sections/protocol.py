@@ -12,7 +12,9 @@ from gsbench.report.frame import Results, without
 from gsbench.report.section import Section, number, section, span
 
 WARNING = "WARNING"
-SILENT = {"resize": "area", "repaired": "none", "val_every": "none"}  # what a record means that lacks it
+# What a record means that lacks a setting.
+SILENT = {"resize": "area", "repaired": "none", "val_every": "none", "images": "floats", "reduced": "none"}
+ELSEWHERE = "rendered elsewhere"  # what a setting of a training is of images that another program rendered
 OF_ALL = {"machine": "machine", "commit": "git_commit", "versions": "versions"}  # the same for all scenes
 # The scenes on which gsbench's own settings were chosen; what holds on them may not hold on others.
 TUNED = frozenset(
@@ -67,6 +69,9 @@ def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> It
     silent = SILENT.get(setting, "none" if runs[column].isna().all() else "not recorded")
     values = runs[column].map(lambda value: silent if value is None or value != value else _short(setting, value))
     compared = runs.variant.map(lambda variant: without(variant, setting) == variant)
+    if setting not in SILENT:
+        is_trained = runs[column].notna() | ~runs.rendered_elsewhere
+        values, compared = values.where(is_trained, ELSEWHERE), compared & is_trained
     by_scene = values[compared].groupby(runs.scene[compared]).nunique()
     is_mixed = (by_scene > 1).any() or (setting in OF_ALL and values.nunique() > 1)
     for value, runs_with in runs.groupby(values):

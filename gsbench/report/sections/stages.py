@@ -14,7 +14,7 @@ LEAST_REST = 0.005  # share of the seconds below which the rest is not shown
 def stages(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table and the figure of the models with the settings that most runs share."""
     runs = chapter.finished.runs
-    runs = runs[runs.main & runs.train_s.notna()]
+    runs = runs[runs.main & runs.train_s.notna() & ~runs.rendered_elsewhere]
     scenes = covered(chapter.finished.runs[chapter.finished.runs.main], "model")
     runs = runs[runs.scene.isin(scenes)] if scenes else runs
     names = [stage for stage in STAGES if f"stage_{stage}" in runs and runs[f"stage_{stage}"].notna().any()]

@@ -1,0 +1,229 @@
+"""Score the renders of any method on a scene's test views (``python -m gsbench.score RENDERS --name NAME +exp=..``).
+
+The images are measured by the functions and the protocol that measure gsbench's own runs, and the record is one like
+theirs, so that tables, pairs and pages have it.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from gsbench import kernels
+from gsbench.errors import InputError, one_line, printable
+from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
+from gsbench.measure import record as records
+from gsbench.measure.images import strip, write_png
+from gsbench.measure.provenance import provenance
+from gsbench.measure.quality import SSIM_LEAST_SIDE, psnr
+from gsbench.measure.record import Cost, Record
+from gsbench.measure.renders import HOW_TO, CheckedRenders, check_renders
+from gsbench.models.registry import is_registered
+from gsbench.process.ending import end_with
+from gsbench.process.memory import is_out_of_memory
+from gsbench.run.execution import summary
+from gsbench.run.identity import RunSpec, identify
+from gsbench.run.measuring import measure_images, protocol_of
+from gsbench.run.settings import AUTO
+from gsbench.run.setup import check_folder, check_machine, evaluated_views, load_scene
+from gsbench.scenes import View
+from gsbench.train import losses
+
+# What a command line can set, as nothing is trained: experiment, scene, data, measurement, seed, device and folder.
+KEYS = ("exp", "scene", "data", "protocol", "seed", "device", "results")
+RECORDED = ("experiment", "seed", "device", "data", "scene", "protocol")  # keys of a config that the record has
+NAMED = 5  # files that a line names
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure the renders of the command line and write their record; return 0, or 2 after an error message."""
+    options = _parser().parse_intermixed_args(arguments)
+    try:
+        record, folder = score(options)
+    except (InputError, OSError, MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory
+        if isinstance(error, RuntimeError) and not is_out_of_memory(error):
+            raise
+        why = "out of memory: " if is_out_of_memory(error) else ""
+        print(f"gsbench.score: {why}{one_line(error)}", file=sys.stderr)
+        return 2
+    print(f"{record.scene} {record.model}: {summary(record)}; {folder / records.FILE_NAME}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m gsbench.score", description=__doc__.partition("\n")[0])
+    add = parser.add_argument
+    add("renders", type=Path, metavar="RENDERS", help="a folder of images (PNG, JPEG, .npy of floats), or a video")
+    add(
+        "overrides",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="+exp=NAME scene=NAME data.root=PATH, as for python -m gsbench",
+    )
+    add("--name", required=True, help="of the method, in tables")
+    add("--reduce", action="store_true", help="reduce larger images to the size of the views, by the mean of areas")
+    add("--train-seconds", type=float, metavar="S", help="of its training, on this machine")
+    add("--fps", type=float, metavar="F", help="frames a second, on this machine")
+    add("--gaussians", type=int, metavar="N", help="of its model")
+    add("--megabytes", type=float, metavar="MB", help="of its model's parameters")
+    add("--config-dir", type=Path, metavar="FOLDER", help="of your own YAML files")
+    return parser
+
+
+def score(options: argparse.Namespace) -> tuple[Record, Path]:
+    """Measure the renders that the options name, write the record, and return it with its folder.
+
+    Raises:
+        InputError: the options, the scene or the renders are invalid; nothing is written.
+    """
+    costs = _costs(options)
+    spec, folder = _run_of(options)
+    config = spec.config
+    check_machine(config)
+    scene = load_scene(config)
+    views = evaluated_views(scene, config.scene.eval_split)
+    renders = check_renders(options.renders, views, scene.background, reduces=options.reduce)
+    print(printable(_matching(renders, views)))
+    check_folder(folder)
+    measured = measure_images(views, renders.images(), scene.background, config)
+    on_gpu = config.device.startswith("cuda")
+    record = Record(
+        status="ok",
+        reason=None,
+        experiment=config.experiment,
+        model=options.name,
+        scene=config.scene.name,
+        dataset=config.data.dataset,
+        seed=config.seed,
+        effects=None,
+        protocol=protocol_of(config, scene) | _departures(renders),
+        provenance=provenance(
+            config={key: spec.plain[key] for key in RECORDED},
+            data_hash=scene.fingerprint,
+            data_notes=scene.notes,
+            threads=torch.get_num_threads(),
+            instruction_set=kernels.instruction_set(),
+            device=torch.cuda.get_device_name(config.device) if on_gpu else None,
+        ),
+        metrics=measured.metrics,
+        missing=measured.missing,
+        per_view=measured.per_view,
+        regions=measured.regions,
+        cost=costs,
+        exact=sorted({name for view in measured.per_view for name in view.exact}),
+        parts={"score": other_metrics(views, renders)},
+        rendered_elsewhere=renders.facts,
+    )
+    records.write(record, folder / records.FILE_NAME)
+    if measured.shown:
+        write_png(strip(measured.shown), folder / "pictures.png")
+    if (measured.metrics["psnr"] or 0) < (measured.metrics["psnr_background_only"] or 0):
+        print(f"{config.scene.name}: PSNR is below that of the background alone: are these images of these views?")
+    return record, folder
+
+
+def _run_of(options: argparse.Namespace) -> tuple[RunSpec, Path]:
+    """Compose the config of the scene, and return it with the folder of the record.
+
+    Raises:
+        InputError: an override is wrong or of a training, or the name is that of a model or of a trained run.
+    """
+    for word in options.overrides:
+        key = word.lstrip("+~").partition("=")[0].partition(".")[0]
+        if key not in KEYS:
+            raise InputError(f"{word!r:.200}: expected a key of {', '.join(KEYS)}, as nothing is trained: leave it out")
+    if is_registered(options.name.removesuffix("_noagr").removesuffix("_agr")) or options.name == AUTO:
+        raise InputError(
+            f"--name: expected a name that no model of gsbench has, got {options.name}: try {options.name}_official"
+        )
+    with hydra_with(options.config_dir):
+        runs, is_sweep = runs_of(Command(options.overrides, False, options.config_dir, False))
+        if is_sweep:
+            raise InputError("scene: expected one, as there is one set of renders: add scene=NAME", docs=HOW_TO)
+        spec = identify(compose_run(runs[0]).config)
+    config = spec.config
+    folder = records.run_path(Path(config.results), config.experiment, config.scene.name, options.name, config.seed)
+    if (folder / records.CHECKPOINT).exists():
+        raise InputError(f"--name: expected another one, {folder} has a run that gsbench trained")
+    return spec, folder
+
+
+def _costs(options: argparse.Namespace) -> Cost:
+    """Return what the user states of the method's cost.
+
+    Raises:
+        InputError: a number is not positive.
+    """
+    stated = {name: getattr(options, name) for name in ("train_seconds", "fps", "gaussians", "megabytes")}
+    for name, value in stated.items():
+        if value is not None and not 0 < value < 1e15:
+            raise InputError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
+    size = None if options.megabytes is None else round(options.megabytes * 1e6)
+    return Cost(options.train_seconds, {}, None, options.fps, options.gaussians, size, None)
+
+
+def _matching(renders: CheckedRenders, views: Sequence[View]) -> str:
+    """Say which file was taken for which view."""
+    pairs = [f"{file} is {view.name}" for file, view in zip(renders.files, views, strict=True)]
+    shown = pairs if len(pairs) <= NAMED else [*pairs[: NAMED - 1], "..", pairs[-1]]
+    text = f"{len(pairs)} images ({renders.facts.kind}), matched to the views by {renders.facts.matched}: "
+    others = f"; not read: {', '.join(renders.others[:NAMED])}" if renders.others else ""
+    return text + ", ".join(shown) + others
+
+
+def _departures(renders: CheckedRenders) -> dict[str, Any]:
+    """Return in what the images depart from those that gsbench renders, as settings of which tables warn."""
+    facts = renders.facts
+    departures: dict[str, Any] = {"images": facts.kind}
+    if facts.resized_from is not None:
+        departures["reduced"] = f"from {facts.resized_from}, mean of areas"
+    return departures
+
+
+def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, float]:
+    """Return the means over views of the metrics of other papers; {} for images that are too small for a window."""
+    if min(min(view.camera.width, view.camera.height) for view in views) < SSIM_LEAST_SIDE:
+        return {}
+    values = [of_other_papers(image, view.image) for view, image in zip(views, renders.images(), strict=True)]
+    return {name: fmean(of_view[name] for of_view in values) for name in values[0]}
+
+
+def of_other_papers(render: Tensor, truth: Tensor) -> dict[str, float]:  # [H, W, 3], each
+    """Compute the SSIM of other papers, and PSNR after the affine map of colours that fits the image best.
+
+    `ssim_padded` is that of 3DGS and of SSIM1 of STG, with a zero-padded Gaussian window. `ssim_uniform` is
+    scikit-image's default, with a uniform window of 7 pixels; it takes data_range 2 for floats where none is named, as
+    in `ssim_uniform_range2`, SSIM2 of STG. DSSIM is (1 - SSIM) / 2.
+    """
+    a, b = (image.detach().double().clamp(0, 1) for image in (render, truth))
+    uniform = [
+        float(structural_similarity(a.cpu().numpy(), b.cpu().numpy(), channel_axis=-1, data_range=data_range))
+        for data_range in (1.0, 2.0)
+    ]
+    padded = float(losses.structural_similarity(a, b))
+    return {
+        "ssim_padded": padded,
+        "ssim_uniform": uniform[0],
+        "ssim_uniform_range2": uniform[1],
+        "dssim1": (1 - padded) / 2,
+        "dssim2": (1 - uniform[1]) / 2,
+        "psnr_color_corrected": psnr(_color_corrected(a, b), b),
+    }
+
+
+def _color_corrected(render: Tensor, truth: Tensor) -> Tensor:  # [H, W, 3] float64, each
+    """Map the colours c of a render to A c + b, with the A [3, 3] and b [3] of least squared error."""
+    colors = np.concatenate([render.cpu().reshape(-1, 3).numpy(), np.ones((render[..., 0].numel(), 1))], axis=1)
+    fit, *_ = np.linalg.lstsq(colors, truth.cpu().reshape(-1, 3).numpy())
+    return torch.from_numpy(colors @ fit).reshape(truth.shape).to(truth)
+
+
+if __name__ == "__main__":
+    end_with("gsbench.score", main)

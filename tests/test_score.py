@@ -1,0 +1,127 @@
+"""Scores of other programs' renders: those of gsbench's own runs give its own numbers, and wrong files are refused."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_run import overrides, run_here
+
+from gsbench.measure import record as files
+from gsbench.measure.record import Record
+from gsbench.models.render import render
+from gsbench.run.load import load_run, scene_of
+from gsbench.score import main, of_other_papers
+
+VIEWS = ("r_0", "r_1")  # of the split test
+SIZE = 16
+Images = dict[str, np.ndarray]  # [16, 16, 3] floats by view
+
+
+@pytest.fixture(scope="module")
+def trained(square: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Images]:
+    """A run of 30 steps, and its test renders as floats."""
+    record, folder = run_here(*overrides(square, tmp_path_factory.mktemp("run"), "model=3dgs"))
+    assert record.status == "ok", record.reason
+    run = load_run(folder)
+    views = scene_of(run).test
+    images = [render(run.model, view.camera, view.time, torch.zeros(3), False).numpy() for view in views]
+    return record, dict(zip(VIEWS, images, strict=True))
+
+
+def words_of(data: Path, results: Path) -> list[str]:
+    """The overrides of the scene."""
+    kept = ("+exp", "data.root", "data.scenes", "scene", "scene.name", "scene.downscale", "results")
+    return [word for word in overrides(data, results) if word.partition("=")[0] in kept]
+
+
+def write(folder: Path, images: Images) -> Path:
+    """Write images as PNG or, from floats, as .npy."""
+    folder.mkdir(exist_ok=True)
+    for name, image in images.items():
+        if image.dtype.kind == "f":
+            np.save(folder / f"{name}.npy", image)
+        else:
+            swapped = image if image.ndim == 2 else np.concatenate([image[..., 2::-1], image[..., 3:]], axis=-1)
+            assert cv2.imwrite(str(folder / f"{name}.png"), swapped)
+    return folder
+
+
+def score(renders: Path, data: Path, results: Path, *more: str) -> Record:
+    """Score renders, and return the record."""
+    assert main([str(renders), *words_of(data, results), "--name", "other", *more]) == 0
+    return files.read(results / "dnerf/square/other/seed0" / files.FILE_NAME)
+
+
+def in_8_bits(images: Images) -> Images:
+    return {name: (image.clip(0, 1) * 255).round().astype(np.uint8) for name, image in images.items()}
+
+
+def test_floats_of_an_own_run_have_its_numbers(trained, square, tmp_path, capsys):
+    """Catches a score by another protocol than that of runs: another background, clamp, mean, view or region."""
+    ours, images = trained
+    record = score(write(tmp_path / "npy", images), square, tmp_path / "results", "--gaussians", "7", "--fps", "50")
+    assert "2 images (floats), matched to the views by names: r_0.npy is test/r_0, r_1.npy is test/r_1" in (
+        capsys.readouterr().out
+    )
+    for name in ("psnr", "ssim", "psnr_channel_mean", "psnr_object", "psnr_background_only"):
+        assert record.metrics[name] == pytest.approx(ours.metrics[name], abs=1e-6), name
+    assert [view.name for view in record.per_view] == ["test/r_0", "test/r_1"]
+    assert [view.psnr for view in record.per_view] == pytest.approx([view.psnr for view in ours.per_view], abs=1e-6)
+    assert record.regions == ours.regions
+    assert {key: record.protocol[key] for key in ours.protocol if key != "backend"} == {
+        key: value for key, value in ours.protocol.items() if key != "backend"
+    }
+    assert (record.cost.num_gaussians, record.cost.fps, record.cost.train_s) == (7, 50.0, None)
+    assert (tmp_path / "results/dnerf/square/other/seed0/pictures.png").is_file()
+
+
+def test_pngs_differ_by_no_more_than_rounding(trained, square, tmp_path):
+    """Catches channels in another order, a gamma, and rows that are shifted: the root mean squared error of a view
+    changes by at most half a step of 8 bits."""
+    ours, images = trained
+    record = score(write(tmp_path / "png", in_8_bits(images)), square, tmp_path / "results")
+    for view, own_view in zip(record.per_view, ours.per_view, strict=True):
+        errors = [10 ** (-each.psnr / 20) for each in (view, own_view)]
+        assert abs(errors[0] - errors[1]) <= 0.5 / 255
+    assert record.protocol["images"] == "8-bit PNG"
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["train.iterations=5"], "as nothing is trained"),
+        (["--name", "7dgs_noagr"], "expected a name that no model of gsbench has"),
+        (["--name", "a/b"], "model: expected a name of letters"),
+        (["--fps", "0"], "--fps: expected a number above 0"),
+        (["scene=all"], "scene: expected one"),
+        (["data.rot=x"], "config key 'data.rot' is not known. Did you mean 'root'?"),
+    ],
+)
+def test_wrong_words_are_refused_in_a_line(more, words, square, tmp_path, capsys):
+    """Catches a setting of a training that is dropped, and renders that stand in tables as a model of gsbench."""
+    assert main([str(tmp_path), *words_of(square, tmp_path / "results"), "--name", "other", *more]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_the_ssim_of_other_papers():
+    """Catches another window, padding or data_range (RIVALS.md, section 9; computed there by numpy alone)."""
+    y, x = (grid / 24 for grid in np.mgrid[:24, :24])
+    a = 0.5 + 0.3 * np.sin(7 * x + 2 * y) * np.cos(5 * y)
+    b = (a + 0.05 * np.sin(31 * x * y + 0.5)).clip(0, 1)
+    values = of_other_papers(*(torch.from_numpy(image)[..., None].expand(-1, -1, 3) for image in (a, b)))
+    expected = {"ssim_padded": 0.94812566, "ssim_uniform": 0.93998970, "ssim_uniform_range2": 0.94841174,
+                "dssim1": 0.02593717, "dssim2": 0.02579413}  # fmt: skip
+    assert {name: values[name] for name in expected} == pytest.approx(expected, abs=1e-8)
+
+
+def test_colours_are_corrected_by_the_best_affine_map():
+    """Catches a gain without offset or without mixed channels: such a change of the truth is undone."""
+    truth = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.4 + 0.3
+    mixed = truth @ torch.tensor([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]], dtype=torch.float64) + 0.05
+    assert of_other_papers(mixed, truth)["psnr_color_corrected"] > 200
+    assert of_other_papers(torch.zeros_like(truth), truth)["psnr_color_corrected"] < 30
