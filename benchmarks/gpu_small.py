@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import torch
 
 from benchmarks.scene import camera, gaussians, model
-from gsbench.kernels.adam import adam
+from gsbench.kernels.adam import adam_all, flag_arrays
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.raster import RasterInputs, Viewport, backward_by_splat
 from gsbench.models import CameraTime
@@ -38,8 +38,11 @@ def main() -> None:
         sum(x.square().sum() for x in tensors_of(batch)).backward()
     image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()
-    rows = torch.rand(4, 300, 7, device="cuda").unbind()
-    adam(*rows, torch.rand(300, device="cuda") < 0.5, 0.1, [0.9, 0.999], 1e-15, torch.ones((), device="cuda"))
+    arrays = [[x, y] for x, y in zip(*(torch.rand(4, 300, 7, device="cuda").unbind() for _ in range(2)), strict=True)]
+    steps, skip = [torch.ones((), device="cuda")] * 2, torch.zeros((), device="cuda")
+    flag_arrays([*arrays[1], skip / skip], torch.zeros(3, device="cuda").bool(), skip)
+    drawn = [torch.rand(300, device="cuda") < 0.5, None]
+    adam_all(*arrays, steps, [0.1, 0.2], [0.9, 0.999], 1e-15, 1 - skip, drawn)
     torch.cuda.synchronize()
     print("every kernel ran")
 

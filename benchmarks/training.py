@@ -39,22 +39,20 @@ def training_step(fitted: GaussianModel, width: int, height: int, views: int) ->
 
 
 def adam_of(fitted: GaussianModel) -> Callable[[], None]:
-    """Return a call that updates all parameters with a gradient: by the CPU's kernel if it serves them, else by torch.
+    """Return a call that updates all parameters with a gradient: by the kernel if it serves them, else by torch.
 
     `gsbench.train.optim.Optimizer` chooses the same way.
     """
     parameters = [p for p in fitted.parameters() if p.requires_grad]
-    if parameters[0].device.type != "cpu" or not fitted.backend.serves(parameters[0]):
+    if not fitted.backend.serves(parameters[0]):
         return torch.optim.Adam(parameters, lr=RATE, betas=BETAS, eps=EPS, fused=True).step
-    states = [(p, torch.zeros_like(p), torch.zeros_like(p), torch.zeros(())) for p in parameters]
+    states = [(p, torch.zeros_like(p), torch.zeros_like(p), p.new_zeros(())) for p in parameters]
 
     def call() -> None:
         learning = [state for state in states if state[0].grad is not None]
         gradients = [p.grad for p, *_ in learning]
-        means, squares, steps = ([state[i] for state in learning] for i in (1, 2, 3))
+        updated, means, squares, steps = ([state[i] for state in learning] for i in range(4))
         torch._foreach_add_(steps, 1)
-        adam_all(
-            [p.data for p, *_ in learning], gradients, means, squares, steps, [RATE] * len(learning), list(BETAS), EPS
-        )
+        adam_all(updated, gradients, means, squares, steps, [RATE] * len(learning), BETAS, EPS)
 
     return call

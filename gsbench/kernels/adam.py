@@ -1,6 +1,7 @@
-"""Update parameters by Adam in place, several of them in one call, and check that gradients are finite.
+"""Check gradients for NaN and infinity and update parameters by Adam in place, all of them in one kernel call each.
 
-A small model has about twelve parameters, and the overhead of a torch call costs as much as the update of one.
+A small model has about twelve parameters, and the overhead of a torch call costs as much as the update of one. On a GPU
+neither call waits.
 """
 
 from collections.abc import Sequence
@@ -10,62 +11,8 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.headers import MAX_ADAM
-from gsbench.kernels.library import library_of
+from gsbench.kernels.library import Slots, library_of
 from gsbench.kernels.operation import address, addresses, in_rows
-from gsbench.kernels.tensors import check_number, check_tensor
-
-
-@torch.no_grad()
-def adam(
-    parameter: Tensor,  # [N, ...], updated
-    gradient: Tensor,  # [N, ...]
-    mean: Tensor,  # [N, ...] the running mean of the gradient, updated
-    square: Tensor,  # [N, ...] the running mean of the squared gradient, updated
-    drawn: Tensor,  # [N] bool: the rows to update
-    rate: float,  # the learning rate
-    betas: list[float],  # the decay rates of the two running means
-    eps: float,  # added to the square root of the mean square
-    step: Tensor,  # [] the number of this update, from 1
-) -> None:
-    """Do one Adam update (Kingma & Ba 2015, algorithm 1) of those rows (Gaussians) of a parameter that `drawn` selects.
-
-    Raises:
-        InputError: tensors are not contiguous float32 on one device, or their shapes do not match.
-    """
-    named = {"parameter": parameter, "gradient": gradient, "mean": mean, "square": square, "drawn": drawn, "step": step}
-    for name, x in named.items():
-        check_tensor(x, f"adam: {name}", (torch.bool if name == "drawn" else torch.float32,))
-        if not parameter.dim():
-            raise InputError("adam: expected parameter of at least one dimension, got none")
-        shape = {"drawn": parameter.shape[:1], "step": torch.Size()}.get(name, parameter.shape)
-        if x.shape != shape or x.device != parameter.device:
-            raise InputError(
-                f"adam: expected {name} of shape {list(shape)} on {parameter.device}, got {list(x.shape)} on {x.device}"
-            )
-    if not isinstance(betas, list | tuple) or len(betas) != 2:
-        raise InputError(f"adam: expected two betas, got {betas!r:.80}")
-    for name, number in (("rate", rate), ("eps", eps), ("betas", betas[0]), ("betas", betas[1])):
-        check_number(number, f"adam: {name}")
-    if not all(x.is_contiguous() and not x.is_neg() for x in (parameter, mean, square)):
-        raise InputError("adam: expected parameter, mean and square row by row in memory: call .contiguous()")
-    if not len(parameter):
-        return
-    gradient, drawn = in_rows([gradient, drawn])
-    slots = {
-        "N": len(parameter),
-        "width": parameter[0].numel(),
-        "drawn": address(drawn),
-        "gradient": address(gradient),
-        "rate": rate,
-        "beta1": betas[0],
-        "beta2": betas[1],
-        "eps": eps,
-        "step": address(step),
-        "out.parameter": address(parameter),
-        "out.mean": address(mean),
-        "out.square": address(square),
-    }
-    library_of(parameter.device.type).call("adam", slots, parameter)
 
 
 @torch.no_grad()
@@ -76,29 +23,40 @@ def adam_all(
     squares: Sequence[Tensor],  # the running means of the squared gradients, updated
     steps: Sequence[Tensor],  # of []: the number of this update for each parameter, from 1
     rates: Sequence[float],  # the learning rates
-    betas: list[float],  # the decay rates of the two running means
+    betas: Sequence[float],  # the decay rates of the two running means
     eps: float,  # added to the square root of the mean square
+    skip: Tensor | None = None,  # []: nothing is updated unless it is 0
+    drawn: Sequence[Tensor | None] | None = None,  # of [N] bool for a parameter [N, ...]: the rows to update; None: all
 ) -> None:
-    """Update several parameters on the CPU by Adam, each with its own learning rate, as `torch.optim.Adam` does.
+    """Update several parameters by Adam (Kingma & Ba 2015, algorithm 1), each with its own learning rate.
 
     Raises:
-        InputError: tensors are not contiguous float32 on the CPU, or their shapes do not match.
+        InputError: tensors are not contiguous float32 on one device, or their shapes do not match.
     """
+    if not parameters:
+        return
+    like, device = parameters[0], parameters[0].device
+    updated = list(zip(parameters, [None] * len(parameters) if drawn is None else drawn, strict=True))
     gradients = in_rows(list(gradients))
     for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():
         for x, parameter in zip(listed, parameters, strict=True):
-            if not (x.shape == parameter.shape and x.dtype == torch.float32 and x.is_cpu and x.is_contiguous()):
-                raise InputError(
-                    f"adam_all: expected {name} as contiguous float32 of shape {list(parameter.shape)} on "
-                    f"the CPU, got {x.dtype} of shape {list(x.shape)} on {x.device}"
-                )
-    for first in range(0, len(parameters), MAX_ADAM):
-        part = slice(first, first + MAX_ADAM)
-        slots = {
+            if not (x.shape == parameter.shape and _is_in_rows(x, torch.float32, device)):
+                raise _refusal(f"adam_all: {name}", x, torch.float32, parameter.shape, device)
+    for x in steps if skip is None else [*steps, skip]:
+        if x.dim() or not _is_in_rows(x, torch.float32, device):
+            raise _refusal("adam_all: step or skip", x, torch.float32, (), device)
+    for parameter, rows in updated:
+        if rows is not None and not (rows.shape == parameter.shape[:1] and _is_in_rows(rows, torch.bool, device)):
+            raise _refusal("adam_all: drawn", rows, torch.bool, parameter.shape[:1], device)
+    for part in _parts(len(parameters)):
+        slots: Slots = {
             "count": len(parameters[part]),
             "numbers": tuple([x.numel() for x in parameters[part]]),
+            "widths": tuple([0 if rows is None else x.numel() // max(1, len(rows)) for x, rows in updated[part]]),
+            "drawn": tuple([address(rows) for _, rows in updated[part]]),
             "gradients": addresses(gradients[part]),
             "steps": addresses(steps[part]),
+            "skip": address(skip),
             "rates": tuple(rates[part]),
             "beta1": betas[0],
             "beta2": betas[1],
@@ -107,23 +65,51 @@ def adam_all(
             "out.means": addresses(means[part]),
             "out.squares": addresses(squares[part]),
         }
-        library_of("cpu").call("adam_all", slots, parameters[0])
+        library_of(like.device.type).call("adam_all", slots, like)
 
 
 @torch.no_grad()
-def are_finite(arrays: Sequence[Tensor]) -> bool:
-    """Return whether all numbers of some float32 arrays on the CPU, of any shapes, are finite."""
-    rows = in_rows(list(arrays))
-    for first in range(0, len(rows), MAX_ADAM):
-        part = rows[first : first + MAX_ADAM]
-        flags = part[0].new_zeros(1, dtype=torch.int64)
-        slots = {
-            "count": len(part),
-            "numbers": tuple([x.numel() for x in part]),
-            "arrays": addresses(part),
-            "out.flags": flags.data_ptr(),
+def flag_arrays(
+    arrays: Sequence[Tensor | None],  # of any shapes; None counts as finite
+    flags: Tensor,  # bool, one for each array, set to true for those that have a number that is not finite
+    skip: Tensor,  # [], set to 1 if any array has
+) -> None:
+    """Find which arrays are not finite, without waiting for a GPU. What is finite changes neither `flags` nor `skip`.
+
+    Raises:
+        InputError: arrays are not float32 on one device, or there is not one flag for each.
+    """
+    device = skip.device
+    rows = in_rows([skip.new_empty(0) if x is None else x for x in arrays])
+    for x in [*rows, skip]:
+        if not _is_in_rows(x, torch.float32, device):
+            raise _refusal("flag_arrays: arrays", x, torch.float32, x.shape, device)
+    if not (flags.shape == (len(rows),) and _is_in_rows(flags, torch.bool, device)):
+        raise _refusal("flag_arrays: flags", flags, torch.bool, (len(rows),), device)
+    for part in _parts(len(rows)):
+        slots: Slots = {
+            "count": len(rows[part]),
+            "numbers": tuple([x.numel() for x in rows[part]]),
+            "arrays": addresses(rows[part]),
+            "out.flags": address(flags[part]),
+            "out.skip": address(skip),
         }
-        library_of("cpu").call("flag_arrays", slots, flags)
-        if flags.item():
-            return False
-    return True
+        library_of(skip.device.type).call("flag_arrays", slots, skip)
+
+
+def _parts(count: int) -> list[slice]:
+    """Return which of `count` arrays each call of a kernel takes."""
+    return [slice(first, min(first + MAX_ADAM, count)) for first in range(0, count, MAX_ADAM)]
+
+
+def _is_in_rows(x: Tensor, dtype: torch.dtype, device: torch.device) -> bool:
+    """Return whether a kernel can read a tensor; a training asks this of a hundred tensors in each step."""
+    return x.dtype == dtype and x.device == device and x.is_contiguous()
+
+
+def _refusal(name: str, x: Tensor, dtype: torch.dtype, shape: Sequence[int], device: torch.device) -> InputError:
+    """Return the error for a tensor that a kernel cannot read."""
+    return InputError(
+        f"{name}: expected contiguous {dtype} of shape {list(shape)} on {device}, "
+        f"got {x.dtype} of shape {list(x.shape)} on {x.device}"
+    )

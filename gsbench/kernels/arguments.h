@@ -313,21 +313,38 @@ GSB_FIELDS(SimilarityLoss, OUTPUTS, loss, gradient, scratch)
 
 // ---- gsbench/kernels/adam.py
 
-// Adam updates the rows of a parameter [N, width] that `drawn` selects.
+// Adam updates several parameters: all their numbers, or only the rows that `drawn` selects.
 struct AdamArgs {
-    int64_t N, width;
-    const bool* drawn;       // [N]
-    const float* gradient;   // [N, width]
-    double rate, beta1, beta2, eps;
-    const float* step;       // [], from 1
+    int count;
+    int64_t numbers[MAX_ADAM], widths[MAX_ADAM];         // of each parameter; of each of its rows
+    const bool* drawn[MAX_ADAM];                         // [numbers / widths]; null: all rows
+    const float *gradients[MAX_ADAM], *steps[MAX_ADAM];  // [numbers]; [], from 1
+    const float* skip;                                   // []: nothing is updated unless it is 0; may be null
+    double rates[MAX_ADAM], beta1, beta2, eps;
     int threads;
 };
-GSB_FIELDS(AdamArgs, INPUTS, N, width, drawn, gradient, rate, beta1, beta2, eps, step, threads)
+GSB_FIELDS(AdamArgs, INPUTS, count, numbers, widths, drawn, gradients, steps, skip, rates, beta1, beta2, eps, threads)
 
 struct AdamState {
-    float *parameter, *mean, *square;  // [N, width]
+    float *parameters[MAX_ADAM], *means[MAX_ADAM], *squares[MAX_ADAM];  // [numbers]
 };
-GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
+GSB_FIELDS(AdamState, OUTPUTS, parameters, means, squares)
+
+// Whether several arrays are finite.
+struct FiniteArgs {
+    int count;
+    int64_t numbers[MAX_ADAM];
+    const float* arrays[MAX_ADAM];  // [numbers]
+    int threads;
+};
+GSB_FIELDS(FiniteArgs, INPUTS, count, numbers, arrays, threads)
+
+// What is finite changes neither.
+struct ArrayFlags {
+    bool* flags;  // [count]: true if the array has a number that is not finite
+    float* skip;  // []: 1 if any array has
+};
+GSB_FIELDS(ArrayFlags, OUTPUTS, flags, skip)
 
 }  // namespace gsb
 
@@ -357,7 +374,8 @@ GSB_FIELDS(AdamState, OUTPUTS, parameter, mean, square)
     kernel(blend_backward, BlendArgs, BlendState, PictureGrads, BlendGrads)                    \
     kernel(flag_values, ValueArgs, ValueFlags)                                                 \
     kernel(l1_ssim, SimilarityArgs, SimilarityLoss)                                            \
-    kernel(adam, AdamArgs, AdamState)
+    kernel(adam_all, AdamArgs, AdamState)                                                      \
+    kernel(flag_arrays, FiniteArgs, ArrayFlags)
 
 // const A&, const B&, .. of the structures A, B, ..
 #define GSB_CONST_1(A) const A&

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from gsbench.kernels.adam import are_finite
-from gsbench.kernels.backends import CPU
+from gsbench.kernels.adam import flag_arrays
+from gsbench.kernels.backends import AUTO
 from gsbench.models import GaussianModel
 
 LOOK_EVERY = 50  # steps between two reads of the result on a GPU, since a read synchronises; on a CPU it is 1
@@ -20,16 +20,17 @@ class FiniteCheck:
     """Check the loss and the gradients of every step for NaN and infinity.
 
     On a GPU the result is read only every LOOK_EVERY steps. Until then, the tensor `skip` [] stops the updates: it is 1
-    from the first bad step on, and torch's fused Adam reads it as `found_inf`.
+    from the first bad step on, and Adam reads it.
     """
 
     def __init__(self, device: str) -> None:
         """Prepare the checks of a training on `device`, such as "cpu", "cuda" or "cuda:1"."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
         self.loss = math.nan  # loss of the last step whose result was read
-        self._names: list[str] = []
-        self._state = torch.zeros(4, device=device)  # skip, step, index of the first bad group in `_names`, loss
-        self.skip = self._state[0]
+        self.skip = torch.zeros((), device=device)
+        self._names: list[str] = []  # the group of each parameter
+        self._steps: list[tuple[int, Tensor]] = []  # number and loss of each step since the last look
+        self._flags = torch.empty(0)  # [every, parameters + 1] bool: what of each of these steps is not finite
 
     @torch.no_grad()
     def check(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
@@ -43,16 +44,13 @@ class FiniteCheck:
         Raises:
             DivergedError: a check failed, in this step or since the result was last read.
         """
-        gradients = {name: [p.grad for p in group if p.grad is not None] for name, group in groups.items()}
-        if self.every == 1 and _are_finite([loss, *[g for group in gradients.values() for g in group]]):
-            self.loss = float(loss)
-            self._state[3] = loss
-            return
-        self._names = list(gradients)
-        bad = torch.stack([*(~_all_finite(group, loss) for group in gradients.values()), ~loss.isfinite()]).float()
-        now = torch.stack([bad.amax(), loss.new_full((), step), bad.argmax().float(), loss])
-        self._state.copy_(torch.where(self.skip > 0, self._state, now))
-        if step % self.every == 0:
+        arrays = [*[p.grad for group in groups.values() for p in group], loss]
+        if self._flags.shape != (self.every, len(arrays)):
+            self._names = [name for name, group in groups.items() for _ in group]
+            self._flags = torch.zeros(self.every, len(arrays), dtype=torch.bool, device=loss.device)
+        _flag(arrays, self._flags[len(self._steps)], self.skip)
+        self._steps.append((step, loss))
+        if len(self._steps) == self.every:
             self.look()
 
     def look(self) -> None:
@@ -61,29 +59,29 @@ class FiniteCheck:
         Raises:
             DivergedError: a check failed; the message names the step and the parameter.
         """
-        bad, step, which, self.loss = self._state.tolist()
-        if not bad:
-            return
-        if which < len(self._names):
-            raise DivergedError(
-                f"step {step:.0f}: the gradient of '{self._names[int(which)]}' is not finite (loss {self.loss})"
-            )
-        raise DivergedError(f"step {step:.0f}: the loss is {self.loss}")
+        for (step, loss), flags in zip(self._steps, self._flags.tolist(), strict=False):
+            if any(flags):
+                self.loss = float(loss)
+                bad = flags.index(True)
+                if bad == len(self._names):
+                    raise DivergedError(f"step {step}: the loss is {self.loss}")
+                raise DivergedError(
+                    f"step {step}: the gradient of '{self._names[bad]}' is not finite (loss {self.loss})"
+                )
+        if self._steps:
+            self.loss = float(self._steps[-1][1])
+            self._steps.clear()
 
 
-def _are_finite(values: list[Tensor]) -> bool:
-    """Return whether all values are finite; if torch's sum of them overflows, also False."""
-    if all(CPU.serves(x) for x in values):
-        return are_finite(values)
-    return math.isfinite(float(sum(x.sum() for x in values)))
-
-
-def _all_finite(gradients: list[Tensor], like: Tensor) -> Tensor:
-    """Return whether all gradients are finite, as a bool tensor [] on the device of `like`."""
-    finite = torch.ones_like(like, dtype=torch.bool)
-    for gradient in gradients:
-        finite = finite & gradient.isfinite().all()
-    return finite
+def _flag(arrays: list[Tensor | None], flags: Tensor, skip: Tensor) -> None:
+    """Set `flags` [arrays] to true for arrays that are not finite, and then `skip` [] to 1."""
+    if AUTO.serves(skip) and all(x is None or x.dtype == skip.dtype for x in arrays):
+        flag_arrays(arrays, flags, skip)
+        return
+    for flag, x in zip(flags, arrays, strict=True):
+        if x is not None:
+            flag.copy_(~x.isfinite().all())
+    skip.masked_fill_(flags.any(), 1)
 
 
 def explain(model: GaussianModel) -> str:

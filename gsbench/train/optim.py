@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from gsbench.errors import InputError, did_you_mean
-from gsbench.kernels.adam import adam, adam_all
+from gsbench.kernels.adam import adam_all
 from gsbench.models import GaussianModel
 from gsbench.train.checkpoint import tensor
 
@@ -30,7 +30,7 @@ COOLED = 0.1  # share of a learning rate that is left at the end of a cooldown
 class Optimizer:
     """Optimize the parameters of a model by Adam with eps = 1e-15, as 3DGS does.
 
-    On the CPU, one call of a kernel updates all parameters. Otherwise torch.optim.Adam does. The kinds `adam` and
+    One call of a kernel updates all parameters; without kernels torch.optim.Adam does. The kinds `adam` and
     `sparse_adam` differ for Gaussians that no view of a batch sees. `adam` still moves them by their momentum.
     `sparse_adam` leaves them and their moments unchanged (Mallick et al. 2024, Taming 3DGS).
     """
@@ -75,15 +75,15 @@ class Optimizer:
         `FiniteCheck` ends the training.
         """
         rates = self.rates_at(step, factors)
+        means = self.model.splats["means"]  # the device and the type of all parameters
+        if self.model.backend.serves(means):
+            self._step_all(rates, drawn)
+            return
         if self.is_sparse:
             assert drawn is not None
             for name, parameter in self.model.splats.items():
                 self._step_rows(parameter, rates[name], drawn)
-        rated = [(p, rates[name]) for name, group in self.groups.items() for p in group if p.grad is not None]
-        means = self.model.splats["means"]  # the device and the type of all parameters
-        if rated and means.is_cpu and self.model.backend.serves(means) and self.skip is None:
-            self._step_all(rated)
-        elif rated:
+        if any(p.grad is not None for group in self.groups.values() for p in group):
             for group in self.torch_adam.param_groups:
                 group["lr"] = rates[group["name"]]
             if self.skip is not None:
@@ -107,16 +107,23 @@ class Optimizer:
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         return state
 
-    def _step_all(self, rated: list[tuple[nn.Parameter, float]]) -> None:
-        """Update several parameters by one call of the CPU kernel; `rated` pairs parameters with learning rates."""
-        parameters, rates = [p.data for p, _ in rated], [rate for _, rate in rated]
-        gradients = [p.grad for p, _ in rated if p.grad is not None]
-        states = [self._state_of(p) for p, _ in rated]
+    def _step_all(self, rates: dict[str, float], drawn: Tensor | None) -> None:
+        """Update all parameters by one call of the kernel."""
+        rated = [(p, rates[name]) for name, group in self.groups.items() for p in group if p.grad is not None]
+        if not rated:
+            return
+        parameters = [p for p, _ in rated]
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        states = [self._state_of(p) for p in parameters]
         steps, means, squares = ([state[key] for state in states] for key in ("step", "exp_avg", "exp_avg_sq"))
         torch._foreach_add_(steps, 1)
-        adam_all(parameters, gradients, means, squares, steps, rates, list(BETAS), EPS)
-        for parameter, _ in rated:
-            parameter.grad = None
+        if self.skip is not None:
+            torch._foreach_sub_(steps, [self.skip] * len(steps))
+        of_gaussians = {id(p) for p in self.model.splats.values()} if self.is_sparse else set()
+        rows = [drawn if id(p) in of_gaussians else None for p in parameters]
+        adam_all(parameters, gradients, means, squares, steps, [rate for _, rate in rated], BETAS, EPS, self.skip, rows)
+        for p in parameters:
+            p.grad = None
 
     def _step_rows(self, parameter: nn.Parameter, rate: float, drawn: Tensor) -> None:
         """Update only the Gaussians `drawn` [N] bool of a parameter, unless a gradient was not finite."""
@@ -126,10 +133,9 @@ class Optimizer:
             drawn = drawn & (self.skip == 0)
         state = self._state_of(parameter)
         state["step"] += 1 if self.skip is None else 1 - self.skip
-        update = adam if self.model.backend.serves(parameter) else adam_reference
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():
-            update(parameter, parameter.grad, *moments, drawn, rate, list(BETAS), EPS, state["step"])
+            adam_reference(parameter, parameter.grad, *moments, drawn, rate, BETAS, EPS, state["step"])
         parameter.grad = None
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
@@ -216,11 +222,11 @@ def adam_reference(
     square: Tensor,
     drawn: Tensor,
     rate: float,
-    betas: list[float],
+    betas: Sequence[float],
     eps: float,
     step: Tensor,
 ) -> None:
-    """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel `adam` does the same."""
+    """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel of `adam_all` does the same."""
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])

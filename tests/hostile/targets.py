@@ -8,7 +8,6 @@ import torch
 from cases import camera, gaussians
 from torch import Tensor
 
-from gsbench.kernels.adam import adam
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.refine import HIDDEN, refine
@@ -76,9 +75,6 @@ def targets() -> dict[str, Target]:
     colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
     moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
              "weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
-    step = {"parameter": rand(N, 3), "gradient": rand(N, 3), "mean": rand(N, 3), "square": rand(N, 3),
-            "drawn": torch.ones(N, dtype=torch.bool), "rate": 0.1, "betas": [0.9, 0.999], "eps": 1e-8,
-            "step": torch.tensor(1.0)}  # fmt: skip
     model = {"agr": True, "agr_octaves": 4, "sh_degree": 2, "time": 0.5, "center": torch.tensor([0.0, 0.0, -4.0])}
     models = {name: Target(_model, {"name": name, **options, **model}, ("center",)) for name, options in MODELS.items()}
     return models | {
@@ -100,7 +96,6 @@ def targets() -> dict[str, Target]:
         "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
                           ("target",)),
         "refine": Target(_refine, moved, ("units", "gamma")),
-        "adam": Target(adam, step, tuple(step)),
         "psnr": Target(psnr, images, ("a", "b")),
         "psnr_channel_mean": Target(psnr_channel_mean, images, ("a", "b")),
         "ssim": Target(ssim, images, ("a", "b")),

@@ -1,5 +1,4 @@
-// Adam on the selected rows of a parameter, without reading or writing the others; and Adam on several whole
-// parameters.
+// Adam on several parameters: on all their rows, or on the selected ones, without reading or writing the others.
 #include "../math/adam.h"
 
 #include "isa.h"
@@ -19,27 +18,8 @@ AdamRule rule_of(double rate, double beta1, double beta2, double eps, double ste
 
 }  // namespace
 
-void adam(const AdamArgs& a, const AdamState& state) {
-    const AdamRule rule = rule_of(a.rate, a.beta1, a.beta2, a.eps, *a.step);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
-    for (int64_t chunk = 0; chunk < a.N; chunk += CHUNK) {
-        const int64_t end = chunk + CHUNK < a.N ? chunk + CHUNK : a.N;
-        for (int64_t row = chunk; row < end;) {
-            if (!a.drawn[row]) {
-                ++row;
-                continue;
-            }
-            const int64_t first = row * a.width;  // neighbours that are drawn too go as one run
-            while (row < end && a.drawn[row]) ++row;
-#pragma omp simd
-            for (int64_t k = first; k < row * a.width; ++k) {
-                adam_update(rule, a.gradient[k], state.parameter[k], state.mean[k], state.square[k]);
-            }
-        }
-    }
-}
-
-void adam_all(const AdamAllArgs& a, const AdamAllState& state) {
+void adam_all(const AdamArgs& a, const AdamState& state) {
+    if (a.skip && *a.skip != 0.0f) return;
     int64_t total = 0;
     for (int i = 0; i < a.count; ++i) total += a.numbers[i];
 #pragma omp parallel num_threads(a.threads) if (total > MANY)
@@ -47,8 +27,26 @@ void adam_all(const AdamAllArgs& a, const AdamAllState& state) {
         const AdamRule rule = rule_of(a.rates[i], a.beta1, a.beta2, a.eps, *a.steps[i]);
         const float* g = a.gradients[i];
         float *p = state.parameters[i], *m = state.means[i], *v = state.squares[i];
+        if (!a.drawn[i]) {
 #pragma omp for simd schedule(static) nowait
-        for (int64_t k = 0; k < a.numbers[i]; ++k) adam_update(rule, g[k], p[k], m[k], v[k]);
+            for (int64_t k = 0; k < a.numbers[i]; ++k) adam_update(rule, g[k], p[k], m[k], v[k]);
+            continue;
+        }
+        const int64_t width = a.widths[i], N = width ? a.numbers[i] / width : 0;
+#pragma omp for schedule(static) nowait
+        for (int64_t chunk = 0; chunk < N; chunk += CHUNK) {
+            const int64_t end = chunk + CHUNK < N ? chunk + CHUNK : N;
+            for (int64_t row = chunk; row < end;) {
+                if (!a.drawn[i][row]) {
+                    ++row;
+                    continue;
+                }
+                const int64_t first = row * width;  // neighbours that are drawn too go as one run
+                while (row < end && a.drawn[i][row]) ++row;
+#pragma omp simd
+                for (int64_t k = first; k < row * width; ++k) adam_update(rule, g[k], p[k], m[k], v[k]);
+            }
+        }
     }
 }
 

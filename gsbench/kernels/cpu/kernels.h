@@ -83,30 +83,6 @@ GSB_FIELDS(ExactPicture, OUTPUTS, image, bound, culprit, branches)
 
 enum Branch : uint8_t { SKIPPED = 1, STOPPED = 2, ORDERED = 4 };  // alpha at 1/255, or culling; the early stop; equal depths
 
-// Adam on several whole parameters; on a GPU torch's own Adam does this.
-struct AdamAllArgs {
-    int count;
-    int64_t numbers[MAX_ADAM];
-    const float *gradients[MAX_ADAM], *steps[MAX_ADAM];  // of [numbers]; of [], from 1
-    double rates[MAX_ADAM], beta1, beta2, eps;
-    int threads;
-};
-GSB_FIELDS(AdamAllArgs, INPUTS, count, numbers, gradients, steps, rates, beta1, beta2, eps, threads)
-
-struct AdamAllState {
-    float *parameters[MAX_ADAM], *means[MAX_ADAM], *squares[MAX_ADAM];
-};
-GSB_FIELDS(AdamAllState, OUTPUTS, parameters, means, squares)
-
-// Whether several arrays are finite; on a GPU torch checks them.
-struct FiniteArgs {
-    int count;
-    int64_t numbers[MAX_ADAM];
-    const float* arrays[MAX_ADAM];  // of [numbers]
-    int threads;
-};
-GSB_FIELDS(FiniteArgs, INPUTS, count, numbers, arrays, threads)
-
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -114,9 +90,7 @@ GSB_FIELDS(FiniteArgs, INPUTS, count, numbers, arrays, threads)
     kernel(count_tiles, BinArgs, TileOffsets)      \
     kernel(fill_tiles, BinArgs, TileLists)         \
     kernel(exact_splats, ExactProjectArgs, ExactSplats)\
-    kernel(exact_image, ExactArgs, ExactPicture)   \
-    kernel(adam_all, AdamAllArgs, AdamAllState)    \
-    kernel(flag_arrays, FiniteArgs, ValueFlags)
+    kernel(exact_image, ExactArgs, ExactPicture)
 
 namespace gsb {
 

@@ -1,4 +1,4 @@
-// Adam on the selected rows of a parameter, one number per thread; math/adam.h has the formulas.
+// Adam on several parameters in one launch, some numbers of each parameter per thread; math/adam.h has the formulas.
 #include "../math/adam.h"
 
 #include <cmath>
@@ -8,24 +8,31 @@
 namespace gsb::cuda {
 namespace {
 
-__global__ void adam_kernel(AdamArgs a, AdamState state, AdamRule rule, float log_beta1, float log_beta2) {
-    const int64_t k = global_thread();
-    if (k >= a.N * a.width || !a.drawn[k / a.width]) return;
-    // 1 - beta^step, accurate if beta^step is near 1. The step is read on the device, so that the CPU does not wait for
-    // it.
-    const float left1 = -expm1f(*a.step * log_beta1), left2 = -expm1f(*a.step * log_beta2);
-    rule.unbias1 = 1.0f / left1, rule.unbias2 = 1.0f / sqrtf(left2);
-    adam_update(rule, a.gradient[k], state.parameter[k], state.mean[k], state.square[k]);
+__global__ void adam_kernel(const __grid_constant__ AdamArgs a, const __grid_constant__ AdamState state,
+                            float log_beta1, float log_beta2) {
+    if (a.skip && *a.skip != 0.0f) return;
+    const int64_t threads = static_cast<int64_t>(gridDim.x) * blockDim.x;
+    for (int i = 0; i < a.count; ++i) {
+        if (global_thread() >= a.numbers[i]) continue;
+        // 1 - beta^step, accurate if beta^step is near 1. The step is read on the device, so that the CPU does not wait
+        // for it.
+        const float left1 = -expm1f(*a.steps[i] * log_beta1), left2 = -expm1f(*a.steps[i] * log_beta2);
+        const auto f = [](double x) { return static_cast<float>(x); };
+        const AdamRule rule{f(a.rates[i]), f(a.beta1), f(a.beta2), f(a.eps), 1.0f / left1, 1.0f / sqrtf(left2)};
+        for (int64_t k = global_thread(); k < a.numbers[i]; k += threads) {
+            if (a.drawn[i] && !a.drawn[i][k / a.widths[i]]) continue;
+            float p = state.parameters[i][k], m = state.means[i][k], v = state.squares[i][k];  // loaded at once
+            adam_update(rule, a.gradients[i][k], p, m, v);
+            state.parameters[i][k] = p, state.means[i][k] = m, state.squares[i][k] = v;
+        }
+    }
 }
 
 }  // namespace
 
-void adam(const AdamArgs& a, const AdamState& state, Stream stream) {
-    if (a.N * a.width == 0) return;
-    const auto f = [](double x) { return static_cast<float>(x); };
-    const AdamRule rule{f(a.rate), f(a.beta1), f(a.beta2), f(a.eps), 0.0f, 0.0f};  // the step's are the kernel's
-    launch(adam_kernel, blocks_for(a.N * a.width), THREADS, stream, a, state, rule, f(std::log(a.beta1)),
-           f(std::log(a.beta2)));
+void adam_all(const AdamArgs& a, const AdamState& state, Stream stream) {
+    launch(adam_kernel, looping_blocks(largest(a.numbers)), THREADS, stream, a, state,
+           static_cast<float>(std::log(a.beta1)), static_cast<float>(std::log(a.beta2)));
 }
 
 }  // namespace gsb::cuda

@@ -2,6 +2,8 @@
 // `launch`.
 #pragma once
 
+#include <algorithm>
+
 #include "../math.h"
 #include "kernels.h"
 
@@ -40,6 +42,17 @@ constexpr int WARP = 32;
 constexpr unsigned ALL_LANES = 0xffffffffu;
 
 inline unsigned blocks_for(int64_t threads) { return static_cast<unsigned>((threads + THREADS - 1) / THREADS); }
+
+// Returns the number of blocks of a kernel whose threads loop over `numbers` numbers: at least one, and at most as many
+// as a large GPU runs at once.
+inline unsigned looping_blocks(int64_t numbers) {
+    constexpr unsigned MOST_BLOCKS = 1024;
+    const unsigned blocks = blocks_for(numbers) + 1;
+    return blocks < MOST_BLOCKS ? blocks : MOST_BLOCKS;
+}
+
+// Returns the size of the largest of several arrays; the sizes of those that are not there are 0.
+inline int64_t largest(const int64_t (&numbers)[MAX_ADAM]) { return *std::max_element(numbers, numbers + MAX_ADAM); }
 
 __device__ inline int64_t global_thread() { return static_cast<int64_t>(blockIdx.x) * blockDim.x + threadIdx.x; }
 
