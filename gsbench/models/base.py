@@ -103,6 +103,10 @@ class GaussianModel(nn.Module, ABC):
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
         """Return means and covariance parameters of the children of split Gaussians: two adjacent rows each."""
 
+    def clone(self, raw: Raw, generator: torch.Generator) -> Raw:
+        """Return the raw parameters in which clones of Gaussians differ from these; by default none."""
+        return {}
+
     def penalties(self) -> Sequence[tuple[float, Callable[[CameraTime, int], Tensor]]]:
         """Return terms of the loss of every view: a weight, and a function of the view and its index in the batch.
 
@@ -356,6 +360,12 @@ class GaussianModel(nn.Module, ABC):
         """Replace the copies `rows` [M] of split Gaussians by their children; two copies are next to each other."""
         raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
         for name, value in self.split(raw, generator).items():
+            self.splats[name].data[rows] = value
+
+    @torch.no_grad()
+    def clone_rows(self, rows: Tensor, generator: torch.Generator) -> None:
+        """Change the copies `rows` [M] of cloned Gaussians where the model's clones differ from their originals."""
+        for name, value in self.clone(self.raw_of(rows), generator).items():
             self.splats[name].data[rows] = value
 
     @torch.no_grad()

@@ -252,7 +252,7 @@ def test_the_equations_of_freetime() -> None:
     torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
 
 
-@pytest.mark.parametrize("name", ["dgs", "freetime"])
+@pytest.mark.parametrize("name", ["dgs", "freetime", "stg"])
 def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
     """Catches weights that are forgotten, and an opacity or a mean that is the one of a single view."""
     model, queries = lively(name, 100), [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]

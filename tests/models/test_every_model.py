@@ -296,10 +296,14 @@ def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
     model = active(variant, 4, sh_degree=degree)
     model.select(torch.arange(3))
     with_effect_sets(model, 1, 2)
-    if held := "precision" in model.splats:  # no gradient flows through the direction of dGS and dBS ..
+    held = set()  # through which no gradient flows ..
+    if "precision" in model.splats:  # .. to the direction of dGS and dBS,
         model.set_active(ActiveComponents(degree, False, True))
-    held |= "field" in model.groups()  # .. and through the positions that a field reads
-    splats, names = raw(model), sorted(set(model.splats) - ({"means"} if held else set()))
+        held = {"means"}
+    held |= {"means"} if "field" in model.groups() else set()  # the positions that a field reads,
+    if "path" in model.splats:  # and the times of a path, which AGR moves by the means
+        held = {"means", "times"} if model.agr else {"times"}
+    splats, names = raw(model), sorted(set(model.splats) - held)
     values = [splats[name].requires_grad_() for name in names]
     del model.splats
 

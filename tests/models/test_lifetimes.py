@@ -13,10 +13,11 @@ from gsbench.train.rows import START_BINS, Rows
 
 # The raw parameter and the column that hold the size in time, and a number that makes this size tiny.
 IN_TIME = {"4dgs": ("scales", 3, -20.0), "dbs": ("precision", -1, 20.0), "dgs": ("precision", -1, 20.0),
-           "freetime": ("durations", 0, -20.0), "ubs": ("scales", -1, -20.0)}  # fmt: skip
+           "freetime": ("durations", 0, -20.0), "stg": ("durations", 0, -20.0),
+           "ubs": ("scales", -1, -20.0)}  # fmt: skip
 TIMED = [name for name in NAMES if name in IN_TIME.keys() - {"ubs"} or ("time" in registry.find(name).observes
          and issubclass(registry.find(name), CholeskyModel))]  # fmt: skip
-EXACT = ("7dgs_nodir", "freetime")  # nothing else dims them: they are visible in the whole of their intervals
+EXACT = ("7dgs_nodir", "freetime", "stg")  # nothing else dims them: they are visible in the whole of their intervals
 LEAST = 0.04
 
 

@@ -102,7 +102,9 @@ class GradientDensification(GradientRule):
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
         chosen = torch.cat([unsplit, cloned, parents])
         self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(unsplit))
-        children = torch.arange(len(model) - len(parents), len(model), device=parents.device)
+        added = torch.arange(len(unsplit), len(model), device=parents.device)
+        clones, children = added.split([len(cloned), len(parents)])
+        model.clone_rows(clones, generator)
         model.split_rows(children, generator)
         return chosen, refused
 
