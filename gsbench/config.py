@@ -50,6 +50,7 @@ class SceneConfig:
     eval_split: str = key("test", "evaluated views; val for D-NeRF lego", choices=("test", "val"))
     val_every: int | None = key(None, "every n-th training view becomes val", low=2)
     frames: list[int] | None = key(None, "first and last frame; null: all")
+    leave_out: list[str] | None = key(None, "training cameras that are not read, such as cam13")
 
 
 @dataclass

@@ -6,7 +6,7 @@ All files are checked before the first one is measured; then one image at a time
 import hashlib
 import os
 import re
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,6 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -23,7 +22,7 @@ from gsbench.errors import InputError, one_line
 from gsbench.measure.record import Renders
 from gsbench.scenes import View
 from gsbench.scenes.files import fingerprint, without_suffix
-from gsbench.scenes.images import Pixels, Rendition, composite, decode_photo, photo_size, quiet_opencv, read_image
+from gsbench.scenes.images import Pixels, Rendition, composite, decode_photo, photo_size, read_image, video_frames
 
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".npy": "floats"}
 HOW_TO = "report.md#renders-of-other-programs"
@@ -102,7 +101,7 @@ def _of_video(
         start = file.read(8)
     if not any(re.match(pattern, start, re.DOTALL) for pattern in VIDEO_STARTS):
         raise InputError(f"{path}: expected a folder of images, or a video (mp4, webm, mkv, avi), got another file")
-    with closing(_frames(path)) as frames:
+    with closing(video_frames(path)) as frames:
         sizes = [(frame.shape[1], frame.shape[0]) for frame in islice(frames, len(views) + 1)]
     if len(sizes) != len(views):
         count = f"{len(sizes)} that OpenCV can read" if len(sizes) < len(views) else "more"
@@ -110,7 +109,7 @@ def _of_video(
     sizes = [_fitting(size, view, str(path), reduces) for size, view in zip(sizes, views, strict=True)]
     facts = Renders("video", "order", _resized(set(sizes), views), digest)
     numbers = tuple(f"frame {i}" for i in range(len(views)))
-    return CheckedRenders(facts, partial(_composited, partial(_frames, path), views, background), numbers)
+    return CheckedRenders(facts, partial(_composited, partial(video_frames, path), views, background), numbers)
 
 
 def _matched(
@@ -185,20 +184,6 @@ def _array(path: Path) -> NDArray[Any]:  # [H, W, 3|4]
     return array
 
 
-def _frames(path: Path) -> Generator[Pixels, None, None]:  # [H, W, 3]
-    """Yield the frames of a video, as far as OpenCV can read it."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent: an error of ours says what is wrong
-    with quiet_opencv():
-        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        try:
-            while video.grab():
-                is_read, frame = video.retrieve()
-                if is_read:
-                    yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # type: ignore[misc]  # OpenCV's stubs: any dtype
-        finally:
-            video.release()
-
-
 def _fitting(size: tuple[int, int], view: View, where: str, reduces: bool) -> tuple[int, int]:
     """Return the size of an image; raise InputError if it is not, and cannot be reduced to, that of its view."""
     (width, height), camera = size, view.camera
@@ -227,4 +212,4 @@ def _composited(
     """Yield each image over the background, in the size and on the device of its view."""
     for image, view in zip(images(), views, strict=True):
         size = view.camera.width, view.camera.height
-        yield composite(image, Rendition(1, background), size).to(view.pixels.device)
+        yield composite(image, Rendition(1, background), size).to(view.camera.K.device)

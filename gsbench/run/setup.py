@@ -77,6 +77,7 @@ def load_scene(config: Config) -> Scene:
         background=BACKGROUNDS[config.data.background],
         frames=config.scene.frames,
         repair=config.data.repair,
+        leave_out=config.scene.leave_out,
     )
     if config.scene.val_every is not None:
         scene = scene.with_val(config.scene.val_every)

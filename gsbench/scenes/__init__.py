@@ -25,6 +25,7 @@ class _Layout:
     reader: str  # module.function of this package: (root, rendition) -> Scene; imported late
     reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
     options: tuple[str, ...] = ()  # of `load` that only some layouts have
+    beside: str = "*"  # a pattern of names, one of which is there too; other data has poses_bounds.npy as well
 
 
 _LAYOUTS = (
@@ -49,6 +50,15 @@ _LAYOUTS = (
         "panoptic.load",
     ),
     _Layout(
+        "poses_bounds.npy",
+        "poses_bounds.npy beside the films cam00.mp4, cam01.mp4, ... or folders of their frames (Neural 3D Video: the "
+        "releases of github.com/facebookresearch/Neural_3D_Video)",
+        "n3v.load",
+        ("sparse",),
+        ("frames", "leave_out"),
+        "cam00*",
+    ),
+    _Layout(
         "sparse",
         "images (PNG or JPEG) beside a COLMAP model in sparse/0 (your own capture)",
         "colmap.load",
@@ -65,8 +75,9 @@ def load(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     frames: Sequence[int] | None = None,
     repair: Sequence[str] | None = None,
+    leave_out: Sequence[str] | None = None,
 ) -> Scene:
-    """Load a scene from a folder in the layout of Blender (D-NeRF), Technicolor, Panoptic Sports, COLMAP or nerfstudio.
+    """Load a scene from a folder in the layout of Blender (D-NeRF), Technicolor, N3V, Panoptic, COLMAP or nerfstudio.
 
     What was decided where the files leave a choice, such as which number of the names is the time, is printed and is
     in `Scene.notes`.
@@ -81,7 +92,8 @@ def load(
             to 8 bits and reduces it by Pillow's bicubic filter, as in the code of 3DGS.
         background: the background colour, RGB in [0, 1].
         frames: the first and the last frame, for a layout with numbered frames; None: all.
-        repair: names of damaged images, each replaced by the frame before of its camera, for the same layout.
+        repair: names of damaged images, each replaced by the frame before of its camera, for Technicolor.
+        leave_out: names of training cameras that are not read, such as cam13, for N3V.
 
     Raises:
         InputError: the layout is unknown, or the data has an error; the message names the file and field.
@@ -106,7 +118,7 @@ def load(
     if not numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")
     root = _folder(path)
-    present = [layout for layout in _LAYOUTS if os.path.lexists(root / layout.marker)]
+    present = [layout for layout in _LAYOUTS if os.path.lexists(root / layout.marker) and any(root.glob(layout.beside))]
     if not present:
         why = "a folder without a scene" if root.is_dir() else "no such folder"
         layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
@@ -114,6 +126,7 @@ def load(
     layout = present[0]
     more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
     more |= {} if repair is None else {"repair": _repair(repair, layout)}
+    more |= {} if leave_out is None else {"leave_out": _leave_out(leave_out, layout)}
     from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
 
     module, function = layout.reader.split(".")
@@ -143,6 +156,15 @@ def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
         raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")
+    return tuple(names)
+
+
+def _leave_out(names: object, layout: _Layout) -> tuple[str, ...]:
+    """Check and return the names of cameras to leave out; raise InputError for a layout without named cameras."""
+    if "leave_out" not in layout.options:
+        raise InputError(f"leave_out: {layout.marker} has no names of cameras, got {names!r:.80}: leave it out")
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"leave_out: expected names such as cam13, got {names!r:.80}")
     return tuple(names)
 
 

@@ -23,6 +23,7 @@ from gsbench.scenes import files, shots, times
 from gsbench.scenes.files import ImageFinder
 from gsbench.scenes.images import Rendition
 from gsbench.scenes.placement import standard_scene
+from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import HELD_OUT, Points, Scene, hold_out
 from gsbench.scenes.shots import MASKS, Lens, Shot
 
@@ -205,6 +206,18 @@ def read_images(file: ModelFile) -> list[PosedImage]:
     if not by_name:
         raise InputError(f"{file.path}: expected at least one image")
     return list(by_name.values())
+
+
+def points_beside(root: Path) -> tuple[Points, Path] | None:
+    """Return the initial points of a folder that has its cameras elsewhere, and their file.
+
+    They are those of the COLMAP model in `sparse/0`, or of `points3d.ply`; None if neither exists.
+    """
+    if (root / "sparse" / "0").is_dir():
+        file = read_part(root / "sparse" / "0", "points3D")
+        return read_points(file), file.path
+    ply = root / "points3d.ply"
+    return (read_ply(ply), ply) if ply.exists() else None
 
 
 def read_points(file: ModelFile) -> Points:

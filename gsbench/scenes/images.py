@@ -1,4 +1,4 @@
-"""Read PNG and JPEG images: check the file, decode it, composite it over the background, and reduce its size.
+"""Read PNG and JPEG images and videos: check the file, decode it, composite it over the background, reduce its size.
 
 A file that is damaged or of another kind raises `InputError`; `where` is its path, and the file that names it.
 """
@@ -7,7 +7,7 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,8 @@ from gsbench.errors import InputError, one_line
 from gsbench.process.memory import available, require
 from gsbench.reading import read_file
 
+# FFmpeg prints nothing, as an error of ours says what is wrong; OpenCV reads this at the first video of a process.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 Size = tuple[int, int]  # width and height, pixels
 Color = tuple[float, float, float]  # RGB in [0, 1]
@@ -52,7 +54,7 @@ class Kind(NamedTuple):
 COLORS = Kind({2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}, "8- or 16-bit RGB or RGBA")  # 3: a palette of RGB
 NUMBERS = Kind({0: (8,)}, "8-bit grey, the number of the object in each pixel")
 _DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel
-_DECODING = 64  # bytes per pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
+DECODING = 64  # bytes per pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
 # The images of a scene are stored as floats if all together need at most this many bytes, else in 8 bits. To convert an
 # image of 800 x 800 from 8 bits takes 6 ms on one thread. With 160 x 160 it would take 0.2 ms of a step of 6 ms.
 _MOST_FLOATS = 1 << 29
@@ -71,6 +73,26 @@ def quiet_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(before)
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[cv2.VideoCapture]:
+    """Open a video within a `with` block; OpenCV prints nothing."""
+    with quiet_opencv():
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        try:
+            yield video
+        finally:
+            video.release()
+
+
+def video_frames(path: Path) -> Generator[Pixels, None, None]:  # [H, W, 3]
+    """Yield the frames of a video, as far as OpenCV can read it."""
+    with open_video(path) as video:
+        while video.grab():
+            is_read, frame = video.retrieve()
+            if is_read:
+                yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # type: ignore[misc]  # OpenCV's stubs: any dtype
 
 
 def read_image(path: Path, where: str) -> bytes:
@@ -154,7 +176,7 @@ def count_readers(
 ) -> int:
     """Return how many threads can decode images at the same time, given the free memory and the size of all images."""
     pixels = size[0] * size[1]
-    kept_bytes, decoding_bytes = count * pixel_bytes * pixels // downscale**2, _DECODING * pixels
+    kept_bytes, decoding_bytes = count * pixel_bytes * pixels // downscale**2, DECODING * pixels
     what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
     require(kept_bytes + decoding_bytes, what, "use a larger scene.downscale or fewer images")
     free = available()
@@ -229,6 +251,19 @@ def composite(
     if size != (image.shape[1], image.shape[0]):  # with an integer factor INTER_AREA is the mean of each block
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.clip(image, 0, 1))  # float rounding may leave [0, 1] by an ulp
+
+
+def reduce_8_bits(
+    pixels: Pixels,  # [H, W, 3] of 8 bits
+    rendition: Rendition,
+    size: Size,  # after the reduction
+) -> Pixels:  # [h, w, 3] of 8 bits
+    """Reduce an opaque image as `composite` does, and round it to 8 bits."""
+    if rendition.resize == "pillow":
+        return np.array(Image.fromarray(pixels).resize(size, Image.Resampling.BICUBIC))
+    if size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
 def _white(pixels: NDArray[Any]) -> float:

@@ -53,6 +53,7 @@ class View:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # `image` composites pixels with alpha over this colour
     composited_alpha: Tensor | None = None  # [H, W] 8 bits: alpha of an image that was composited when it was loaded
     regions: Tensor | None = None  # [H, W] 8 bits: the number of the object seen in each pixel, 0 = none; None: unknown
+    is_on_disk: bool = False  # whether `pixels` maps a file: they stay on the CPU, and are read at each access
 
     @property
     def alpha(self) -> Tensor | None:
@@ -65,7 +66,7 @@ class View:
 
         An image that is stored in 8 bits is converted at each access.
         """
-        values = to_floats(self.pixels)
+        values = to_floats(self.pixels.to(self.camera.K.device))
         if values.shape[-1] == 3:
             return values
         alpha = values[..., 3:]
@@ -77,12 +78,12 @@ class View:
     @property
     def target(self) -> Tensor:
         """The image that a training loss takes, [H, W, 3]: the 8 bits of an image without alpha, otherwise `image`."""
-        return self.pixels if self.pixels.shape[-1] == 3 else self.image
+        return self.pixels.to(self.camera.K.device) if self.pixels.shape[-1] == 3 else self.image
 
     def to(self, device: str) -> "View":
         """Return a copy of the view whose tensors are on `device`."""
         alpha, regions = (x if x is None else x.to(device) for x in (self.composited_alpha, self.regions))
-        camera, pixels = self.camera.to(device), self.pixels.to(device)
+        camera, pixels = self.camera.to(device), self.pixels if self.is_on_disk else self.pixels.to(device)
         return replace(self, camera=camera, pixels=pixels, composited_alpha=alpha, regions=regions)
 
 

@@ -15,8 +15,7 @@ from gsbench.reading import read_file
 from gsbench.scenes import colmap, files, images, shots
 from gsbench.scenes.images import Rendition, Size
 from gsbench.scenes.placement import standard_scene
-from gsbench.scenes.points import read_ply
-from gsbench.scenes.scene import Points, Scene, View
+from gsbench.scenes.scene import Scene, View
 from gsbench.scenes.shots import Lens, Shot
 
 CAMERAS = "cameras_parameters.txt"
@@ -75,13 +74,14 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
+    points = colmap.points_beside(root)
     return standard_scene(
         name=root.name,
         train=train,
         val=[],
         test=test,
         background=rendition.background,
-        points=_points(root),
+        points=points[0] if points else None,
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
         up=None,
@@ -236,11 +236,3 @@ def _decode(image: _Image, data: bytes, *, is_named: bool = False) -> images.Pix
     if decoded.shape[2] != 3:
         raise InputError(f"{image.path}: expected an opaque RGB image, got one with alpha")
     return decoded
-
-
-def _points(root: Path) -> Points | None:
-    """Read initial points from the COLMAP model in sparse/0 or from points3d.ply; None if neither exists."""
-    if (root / "sparse" / "0").is_dir():
-        return colmap.read_points(colmap.read_part(root / "sparse" / "0", "points3D"))
-    ply = root / "points3d.ply"
-    return read_ply(ply) if ply.exists() else None
