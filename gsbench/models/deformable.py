@@ -81,8 +81,7 @@ class DeformationField(nn.Module):
 
     Its input is the encoded position and features of the time: those of a network of two layers, or the encoded time.
     Hidden layer depth // 2 + 1, counted from 0, reads the input once more, beside the layer before it. Positions are
-    in world units, as the authors have them: gsbench brings scenes to the size of D-NeRF's when it loads them. On a
-    CPU, the field has the same bits for any number of threads (`portable_math`).
+    in world units, as the authors have them: gsbench brings scenes to the size of D-NeRF's when it loads them.
     """
 
     def __init__(
@@ -93,13 +92,13 @@ class DeformationField(nn.Module):
         features = 1 + 2 * time_octaves
         self.of_time: nn.Module = nn.Identity()
         if time_network:
-            first, last = Linear(features, width, generator), Linear(width, TIME_FEATURES, generator)
-            self.of_time, features = nn.Sequential(first, nn.ReLU(), last), TIME_FEATURES
+            first, last = Linear(features, width, generator, relu=True), Linear(width, TIME_FEATURES, generator)
+            self.of_time, features = nn.Sequential(first, last), TIME_FEATURES
         inputs = 3 * (1 + 2 * octaves) + features
         self.rereads = depth // 2 + 1
         widths = [inputs, *[width] * (depth - 1)]
         widths = [n + inputs if i == self.rereads else n for i, n in enumerate(widths)]
-        self.layers = nn.ModuleList(Linear(n, width, generator) for n in widths)
+        self.layers = nn.ModuleList(Linear(n, width, generator, relu=True) for n in widths)
         self.head = Linear(width, 3 + 3 + 4, generator)
 
     def forward(
@@ -112,24 +111,26 @@ class DeformationField(nn.Module):
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
         hidden = inputs
         for i, layer in enumerate(self.layers):
-            hidden = torch.relu(layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden))
+            hidden = layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden)
         return self.head(hidden).split([3, 3, 4], -1)
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
     """Return [x, sin x, cos x, sin 2x, cos 2x, .. cos 2^(octaves-1) x], [N, C] -> [N, C (1 + 2 octaves)]."""
-    return torch.cat([x, *(wave(2.0**k * x) for k in range(octaves) for wave in (sin, cos))], -1)
+    angles = x[:, None] * 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)[:, None]  # [N, octaves, C]
+    return torch.cat([x, torch.stack([sin(angles), cos(angles)], 2).flatten(1)], -1)
 
 
 class Linear(nn.Module):
-    """A layer W x + b whose weights start as those of torch.nn.Linear, drawn from the run's seed."""
+    """A layer W x + b, with ReLU or without, whose weights start as those of torch.nn.Linear, drawn from the seed."""
 
-    def __init__(self, inputs: int, outputs: int, generator: torch.Generator) -> None:
+    def __init__(self, inputs: int, outputs: int, generator: torch.Generator, *, relu: bool = False) -> None:
         super().__init__()
+        self.relu = relu
         bound = 1 / math.sqrt(inputs)
         self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator))
         self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound, generator=generator))
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer to [N, inputs]."""
-        return linear(x, self.weight, self.bias)
+        return linear(x, self.weight, self.bias, relu=self.relu)

@@ -23,7 +23,7 @@ from gsbench.kernels.slices import slice_static
 
 N, C, WIDTH, HEIGHT = 5, 2, 20, 18
 TILES = count_tiles(WIDTH, HEIGHT)
-SIZES = {"N": N, "C": C, "sets": C, "D": 3, "rest": 7, "one": 1, "width": WIDTH, "height": HEIGHT,
+SIZES = {"N": N, "C": C, "K": 3, "sets": C, "D": 3, "rest": 7, "one": 1, "width": WIDTH, "height": HEIGHT,
          "pairs": C * TILES * N}  # fmt: skip
 OTHER_SIZE = 4  # where a name is neither above nor derived
 NUMBERS = {"near": 0.01, "far": 100.0, "waves": 2, "subtracts": False, "conditioned": EVERY_ROW, "refined": EVERY_ROW}
@@ -214,7 +214,7 @@ def test_wrong_arguments_are_refused(operation: Operation) -> None:
     at = call(operation)
     for name, x in at.tensors.items():
         other = torch.int64 if x.dtype is torch.int32 else torch.float64
-        free = name in operation.inputs and operation.inputs[name].is_list  # of any length
+        free = name in operation.inputs and has_any_length(operation, name)
         wrong = [x.to(other), x[..., None], x.to("meta"), "a tensor"]
         wrong += [torch.cat([x, x])] if x.dim() and not free else []
         wrong += [x.to_sparse()] if x.dim() else []
@@ -228,6 +228,13 @@ def test_wrong_arguments_are_refused(operation: Operation) -> None:
         if x.gradient is Gradient.REFUSED and x.dtypes[0] is torch.float32:
             with pytest.raises(InputError, match=f"^{operation.name} has no gradient by {name}: "):
                 operation(*at.with_(**{name: at.tensors[name].clone().requires_grad_()}))
+
+
+def has_any_length(operation: Operation, name: str) -> bool:
+    """Whether the first dimension of an input is one of no other input."""
+    first, *_ = sizes_of(operation.inputs[name].shape) or (None,)
+    others = {size for key, x in operation.inputs.items() if key != name for size in sizes_of(x.shape)}
+    return operation.inputs[name].is_list or (isinstance(first, str) and first.lstrip("?") not in others)
 
 
 @pytest.mark.parametrize("operation", [x for x in declared() if x.adds], ids=lambda operation: operation.name)

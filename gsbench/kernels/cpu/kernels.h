@@ -83,6 +83,36 @@ GSB_FIELDS(ExactPicture, OUTPUTS, image, bound, culprit, branches)
 
 enum Branch : uint8_t { SKIPPED = 1, STOPPED = 2, ORDERED = 4 };  // alpha at 1/255, or culling; the early stop; equal depths
 
+// A layer of a network, y = W x + b, of rows x; on a GPU torch computes it.
+struct LinearArgs {
+    int64_t N;
+    int C, K;
+    const float *x, *weight, *bias;  // [N, C] [K, C] [K]
+    bool relu;                       // y = max(0, W x + b)
+    int threads;
+};
+GSB_FIELDS(LinearArgs, INPUTS, N, C, K, x, weight, bias, relu, threads)
+
+struct Layer {
+    float* y;  // [N, K]
+};
+GSB_FIELDS(Layer, OUTPUTS, y)
+
+struct LayerState {
+    const float* y;
+};
+GSB_FIELDS(LayerState, OUTPUTS, y)
+
+struct LayerGrads {
+    const float* y;
+};
+GSB_FIELDS(LayerGrads, GIVEN, y)
+
+struct LinearGrads {
+    float *x, *weight, *bias;  // zero on entry; x null: not wanted
+};
+GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -90,7 +120,9 @@ enum Branch : uint8_t { SKIPPED = 1, STOPPED = 2, ORDERED = 4 };  // alpha at 1/
     kernel(count_tiles, BinArgs, TileOffsets)      \
     kernel(fill_tiles, BinArgs, TileLists)         \
     kernel(exact_splats, ExactProjectArgs, ExactSplats)\
-    kernel(exact_image, ExactArgs, ExactPicture)
+    kernel(exact_image, ExactArgs, ExactPicture)   \
+    kernel(linear, LinearArgs, Layer)              \
+    kernel(linear_backward, LinearArgs, LayerState, LayerGrads, LinearGrads)
 
 namespace gsb {
 

@@ -1,0 +1,182 @@
+// A layer of a network, y = W x + b with or without ReLU, for the rows x of an array, and its gradients.
+//
+// Every number of y is one sum, which starts at the bias and adds the inputs in order; gradients of the weights are
+// summed by chunks of rows, and the chunks in order. So the bits depend neither on threads nor on the size of a tile.
+// Rows whose gradient is zero, such as those of Gaussians behind others, are left out of the backward pass.
+#include "buffer.h"
+#include "isa.h"
+#include "rows.h"
+
+namespace gsb {
+inline namespace GSB_ISA {
+namespace {
+
+constexpr int64_t CHUNK = 256;  // rows, which stay in cache
+// A tile of a product has as many sums as keep the processor busy: each waits for its previous addition.
+#if defined(__AVX512F__)
+constexpr int TILE_ROWS = 8, TILE_VECTORS = 2;
+#else
+constexpr int TILE_ROWS = 4, TILE_VECTORS = 1;
+#endif
+constexpr int PANEL = TILE_VECTORS * LANES;  // columns
+
+// The left matrix of a product, A[r][i] = start[r * row + i * step].
+struct Left {
+    const float* start;
+    int64_t row, step;
+};
+
+// Adds A B to sums that begin at `begin(column)`, for R rows of A, from row r on, and a panel of B; finish(sum, row,
+// column) stores them.
+template <int R, class Begin, class Finish>
+GSB_HD inline void multiply_tile(const Left& A, int64_t r, const float* panel, int64_t inner, int column, Begin begin,
+                                 Finish finish) {
+    const float* a = A.start + r * A.row;
+    Vec sums[R][TILE_VECTORS];
+    GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) {
+        const Vec first = begin(column + v * LANES);
+        GSB_UNROLL for (int k = 0; k < R; ++k) sums[k][v] = first;
+    }
+    for (int64_t i = 0; i < inner; ++i) {
+        Vec b[TILE_VECTORS];
+        GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) b[v] = Vec::load(panel + i * PANEL + v * LANES);
+        GSB_UNROLL for (int k = 0; k < R; ++k) {
+            const Vec x(a[k * A.row + i * A.step]);
+            GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) sums[k][v] += x * b[v];
+        }
+    }
+    GSB_UNROLL for (int k = 0; k < R; ++k) {
+        GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) finish(sums[k][v], r + k, column + v * LANES);
+    }
+}
+
+// Computes the product for `rows` rows of A and the panel of B whose first column is `column`.
+template <class Begin, class Finish>
+void multiply(const Left& A, int64_t rows, const float* panel, int64_t inner, int column, Begin begin, Finish finish) {
+    int64_t r = 0;
+    for (; r + TILE_ROWS <= rows; r += TILE_ROWS) {
+        multiply_tile<TILE_ROWS>(A, r, panel, inner, column, begin, finish);
+    }
+    for (; r < rows; ++r) multiply_tile<1>(A, r, panel, inner, column, begin, finish);
+}
+
+// Returns how many of the sixteen columns from `column` on there are: zero or fewer if none.
+GSB_HD inline int lanes_of(int column, int columns) { return columns - column < LANES ? columns - column : LANES; }
+
+// Returns a `begin` of sums that start at a bias, and one of sums that start at zero.
+auto at_bias(const float* bias, int columns) {
+    return [=](int column) {
+        const int n = lanes_of(column, columns);
+        return n > 0 ? load_some(bias + column, n) : Vec(0.0f);
+    };
+}
+constexpr auto at_zero = [](int) { return Vec(0.0f); };
+
+// Writes the columns from `column` on of the rows row(0), row(1), .. to a panel, with zeros beside the last column.
+template <class Row>
+void fill_panel(Row row, int64_t rows, int column, int columns, float* panel) {
+    for (int64_t i = 0; i < rows; ++i) {
+        GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) {
+            const int at = column + v * LANES, n = lanes_of(at, columns);
+            (n > 0 ? load_some(row(i) + at, n) : Vec(0.0f)).store(panel + i * PANEL + v * LANES);
+        }
+    }
+}
+
+// Writes the panels of W^T, [K, C] -> [panels][C][PANEL].
+void fill_transposed(const LinearArgs& a, Buffer<float>& panels) {
+    panels.zero();
+    for (int k = 0; k < a.K; ++k) {
+        float* column = panels.data() + k / PANEL * PANEL * a.C + k % PANEL;
+        for (int c = 0; c < a.C; ++c) column[c * PANEL] = a.weight[k * a.C + c];
+    }
+}
+
+// Writes the rows that have a gradient to `rows`, and returns their number.
+int64_t rows_with_gradient(const LinearArgs& a, const float* g, int32_t* rows) {
+    Buffer<bool> has(static_cast<size_t>(a.N));
+#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
+    for (int64_t i = 0; i < a.N; ++i) has[static_cast<size_t>(i)] = !all_zero(g, a.K, i, 1);
+    int64_t count = 0;
+    for (int64_t i = 0; i < a.N; ++i) {
+        if (has[static_cast<size_t>(i)]) rows[count++] = static_cast<int32_t>(i);
+    }
+    return count;
+}
+
+// Writes the gradients of W x + b in `count` rows to G [count, K]: with ReLU, zero where y is zero.
+void before_relu(const LinearArgs& a, const float* y, const float* g, const int32_t* rows, int64_t count, float* G) {
+    for (int64_t i = 0; i < count; ++i) {
+        const int64_t at = int64_t{rows[i]} * a.K;
+        for (int k = 0; k < a.K; k += LANES) {
+            const int n = lanes_of(k, a.K);
+            Vec x = load_some(g + at + k, n);
+            if (a.relu) x = select(load_some(y + at + k, n) > Vec(0.0f), x, Vec(0.0f));
+            store_first(x, G + i * a.K + k, n);
+        }
+    }
+}
+
+}  // namespace
+
+void linear(const LinearArgs& a, const Layer& out) {
+    const int columns = (a.K + PANEL - 1) / PANEL * PANEL;
+    Buffer<float> transposed(static_cast<size_t>(int64_t{columns} * a.C));
+    fill_transposed(a, transposed);
+    const auto begin = at_bias(a.bias, a.K);
+#pragma omp parallel for num_threads(a.threads) schedule(dynamic, 1) if (a.N > CHUNK)
+    for (int64_t first = 0; first < a.N; first += CHUNK) {
+        const int64_t rows = a.N - first < CHUNK ? a.N - first : CHUNK;
+        for (int k = 0; k < a.K; k += PANEL) {
+            const auto finish = [&](Vec y, int64_t row, int column) {
+                const int n = lanes_of(column, a.K);
+                if (a.relu) y = select(y < Vec(0.0f), Vec(0.0f), y);  // NaN stays
+                if (n > 0) store_first(y, out.y + (first + row) * a.K + column, n);
+            };
+            multiply({a.x + first * a.C, a.C, 1}, rows, transposed.data() + k * a.C, a.C, k, begin, finish);
+        }
+    }
+}
+
+void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGrads& grads, const LinearGrads& out) {
+    Buffer<int32_t> rows(static_cast<size_t>(a.N));
+    const int64_t total = rows_with_gradient(a, grads.y, rows.data());
+    const int64_t weights = int64_t{a.K} * a.C, panel_rows = a.K > CHUNK ? a.K : CHUNK;
+    // Of each thread: gradients of a chunk before the ReLU, a panel, and gradients of the weights and biases.
+    const int64_t scratch_size = (CHUNK + 1) * a.K + panel_rows * PANEL + weights;
+    Buffer<float> scratch(static_cast<size_t>(scratch_size * a.threads));
+#pragma omp parallel for ordered num_threads(a.threads) schedule(static, 1) if (total > CHUNK)
+    for (int64_t first = 0; first < total; first += CHUNK) {
+        const int64_t count = total - first < CHUNK ? total - first : CHUNK;
+        const int32_t* chunk = rows.data() + first;
+        float* G = scratch.data() + scratch_size * thread_index();
+        float *panel = G + CHUNK * a.K, *g_weight = panel + panel_rows * PANEL, *g_bias = g_weight + weights;
+        before_relu(a, state.y, grads.y, chunk, count, G);
+        for (int c = 0; c < a.C; c += PANEL) {
+            if (out.x) {
+                fill_panel([&](int64_t k) { return a.weight + k * a.C; }, a.K, c, a.C, panel);
+                multiply({G, a.K, 1}, count, panel, a.K, c, at_zero, [&](Vec x, int64_t row, int column) {
+                    const int n = lanes_of(column, a.C);
+                    if (n > 0) store_first(x, out.x + int64_t{chunk[row]} * a.C + column, n);
+                });
+            }
+            fill_panel([&](int64_t i) { return a.x + int64_t{chunk[i]} * a.C; }, count, c, a.C, panel);
+            multiply({G, 1, a.K}, a.K, panel, count, c, at_zero, [&](Vec x, int64_t row, int column) {
+                const int n = lanes_of(column, a.C);
+                if (n > 0) store_first(x, g_weight + row * a.C + column, n);
+            });
+        }
+        __builtin_memset(g_bias, 0, sizeof(float) * static_cast<size_t>(a.K));
+        for (int64_t i = 0; i < count; ++i) {
+            for (int k = 0; k < a.K; ++k) g_bias[k] += G[i * a.K + k];
+        }
+#pragma omp ordered
+        {
+            for (int64_t k = 0; k < weights; ++k) out.weight[k] += g_weight[k];
+            for (int k = 0; k < a.K; ++k) out.bias[k] += g_bias[k];
+        }
+    }
+}
+
+}  // namespace GSB_ISA
+}  // namespace gsb
