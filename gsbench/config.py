@@ -63,10 +63,11 @@ class InitConfig:
 
 @dataclass
 class LearningRate:
-    """Set a learning rate that falls log-linearly from `start` to `end` over the run."""
+    """Set a learning rate that falls log-linearly from `start` to `end` over the run, or until an earlier step."""
 
     start: float = key(REQUIRED, "at the first step", low=0, high=inf)
     end: float | None = key(None, "at the last step; null: constant", low=0, high=inf)
+    until: int | None = key(None, "step of the end; null: the last", low=1)
     per_extent: bool = key(False, "the rate is multiplied by the scene's extent")
     per_run: bool = key(False, "the rate is multiplied by sqrt(recipe_iterations / iterations)")
 

@@ -46,13 +46,13 @@ class ActiveComponents:
 class Schedule:
     """Say what happens at each step of a training, counted from 0."""
 
-    def __init__(self, config: TrainConfig, sh_degree: int, agr: bool, warm_up: int = 0) -> None:
+    def __init__(self, config: TrainConfig, sh_degree: int, agr: bool, warm_up: float = 0.0) -> None:
         """Convert the steps in the settings, given for `recipe_iterations` iterations, to steps of this run.
 
-        `sh_degree` is the final SH degree, and `warm_up` the step at which the model's warm-up ends; 0: it has none.
+        `sh_degree` is the final SH degree, and `warm_up` the share of the run after which the model's warm-up ends.
         """
         self.config = config
-        self.warm_up = self.scaled(warm_up) if warm_up else 0
+        self.warm_up = round(warm_up * config.iterations)
         self.sh_degree = sh_degree
         self.agr = agr
         densify = config.densify

@@ -66,6 +66,14 @@ def test_rates_of_any_name_have_a_range(config):
         check_settings(broken)
 
 
+def test_a_rate_that_ends_early_needs_an_end(config):
+    """Catches `until` that silently does nothing, because the rate is constant."""
+    broken = copy.deepcopy(config)
+    broken.model.lr["opacities"].until = 20_000
+    with pytest.raises(InputError, match=r"^model\.lr\.opacities: expected an end with until=20000"):
+        check_settings(broken)
+
+
 @pytest.mark.parametrize("key", ["train.cooldown_from", "train.average_from"])
 def test_steps_end_with_the_recipe(key, config):
     """Catches an end of a training that begins after its last step, of the recipe's 30,000."""

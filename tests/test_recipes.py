@@ -54,6 +54,32 @@ def test_rates_are_those_published(recipe, iterations, expected, agr, options):
     assert Schedule(config.train, 3, config.agr).densify_every == 100
 
 
+def test_deformable_learns_as_its_authors_have_it():
+    """Catches rates of another length than 40,000 steps, means that still learn faster after 30,000, and densification
+    or a warm-up that ends elsewhere."""
+    config = composed("model=deformable", "+recipe=authors_deformable")
+    for share, means, field in ((0.0, 8e-4, 8e-4), (0.375, 8e-5, None), (0.75, 8e-6, None), (1.0, 8e-6, 1.6e-6)):
+        of_run = rates(config, share)
+        assert of_run["means"] == pytest.approx(means)
+        assert field is None or of_run["field"] == pytest.approx(field)
+        assert (of_run["scales"], of_run["quats"]) == (5e-3, 1e-3)
+    s = Schedule(config.train, 3, config.agr, build(config).warm_up)
+    assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 15_000, 100)
+
+
+def test_an_authors_recipe_is_for_their_model():
+    """Catches a field's rate that another model silently ignores."""
+    with pytest.raises(InputError, match="model '4dgs' has no '"):
+        rates(composed("model=4dgs", "+recipe=authors_deformable"), 0.0)
+
+
+def test_a_narrow_field_differs_in_size_only():
+    """Catches a rate of one width that the other lacks, and records that mix them."""
+    wide, narrow = composed("model=deformable").model, composed("model=deformable_narrow").model
+    assert (narrow.name, narrow.lr) == ("deformable_narrow", wide.lr)
+    assert narrow.options == wide.options | {"width": 64, "depth": 4}
+
+
 def test_7dgs_without_direction_learns_as_7dgs_does():
     """Catches a price of direction that is one of rates or of options: what both have is the same."""
     whole, less = composed("model=7dgs"), composed("model=7dgs_nodir")

@@ -46,7 +46,7 @@ class GaussianModel(nn.Module, ABC):
     lengths: ClassVar[tuple[str, ...]] = ("means",)  # the raw parameters of both kinds that are in world units
     initial_opacity: ClassVar[float] = 0.1
     kernel: Operation | None = None  # the kernel that computes slices as `condition` does; None: torch does
-    warm_up: int = 0  # the step, of 30,000, until which `active.warms_up`; a model with a static first stage sets it
+    warm_up: float = 0.0  # share of a training in which `active.warms_up`; a model with a static first stage sets it
 
     def __init_subclass__(cls, **more: Any) -> None:
         """Let torch slice a model that overrides `condition` and inherits the kernel of its base."""

@@ -26,6 +26,7 @@ TIME_FEATURES = 30  # outputs of the time network
 
 
 @register("deformable")
+@register("deformable_narrow")  # other options in its YAML, records under this name
 class DeformableModel(Gaussians3DModel):
     """Deformable-3DGS: canonical 3D Gaussians, as in 3DGS, and a field phi that deforms them at a time t,
 
@@ -38,7 +39,7 @@ class DeformableModel(Gaussians3DModel):
     """
 
     observes: ClassVar[tuple[str, ...]] = ("time",)
-    warm_up = 2_250  # the authors': 3,000 of 40,000
+    warm_up = 0.075  # the authors': 3,000 of 40,000
     field: "DeformationField"  # of an initialised model
 
     def __init__(

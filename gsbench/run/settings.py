@@ -84,7 +84,9 @@ def _check_steps(config: Config) -> None:
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:
-    """Raise InputError if a learning rate is negative, or if a log-linear decay starts or ends at zero."""
+    """Raise InputError if a learning rate is negative, or if a log-linear decay starts or ends at zero, or nowhere."""
+    if rate.until is not None and rate.end is None:
+        raise InputError(f"{key}: expected an end with until={rate.until}, got end null: set {key}.end")
     if rate.start < 0 or (rate.end is not None and (rate.end <= 0 or rate.start == 0)):
         raise InputError(
             f"{key}: expected start >= 0, and start > 0 with end > 0 or null, got start {rate.start}, end {rate.end}"

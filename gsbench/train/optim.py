@@ -199,6 +199,7 @@ def check_rates(groups: Collection[str], config: ModelConfig) -> None:
 def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) -> float:
     """Compute the learning rate of a step, counted from 0; it decays log-linearly from start to end, as in 3DGS.
 
+    A rate with `until` reaches its end at this step, scaled by iterations / recipe_iterations, and stays there.
     A rate with `per_extent` is multiplied by the radius of the scene. A rate with `per_run` is multiplied by
     sqrt(recipe_iterations / iterations), so a short run takes larger steps; this improved every model (docs/tuning.md).
     From a step on (`cooldown_from`, scaled by iterations / recipe_iterations), every rate is also multiplied by a
@@ -212,6 +213,8 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
         scale *= 1 - (1 - COOLED) * (progress - begin) / (1 - begin)
     if rate.end is None:
         return rate.start * scale
+    if rate.until is not None:
+        progress = min(1.0, progress * train.recipe_iterations / rate.until)
     return float(rate.start ** (1 - progress) * rate.end**progress * scale)
 
 

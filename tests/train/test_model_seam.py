@@ -22,7 +22,7 @@ class Deformed(Gaussians3DModel):
     """3DGS whose means a network moves over time, except in its warm-up."""
 
     observes: ClassVar[tuple[str, ...]] = ("time",)
-    warm_up = 9_000
+    warm_up = 0.3
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -46,6 +46,9 @@ PER_EXTENT, PER_RUN = LearningRate(1.6e-4, 1.6e-6, per_extent=True), LearningRat
         (PER_RUN, 0, 30_000, 1e-3),
         (LearningRate(1e-3, per_run=True), 0, 300, 1e-2),
         (LearningRate(1e-3), 0, 300, 1e-3),
+        (LearningRate(1e-2, 1e-4, until=15_000), 50, 200, 1e-3),  # of 30,000: half way, and then at its end
+        (LearningRate(1e-2, 1e-4, until=15_000), 100, 200, 1e-4),
+        (LearningRate(1e-2, 1e-4, until=15_000), 170, 200, 1e-4),
     ],
 )
 def test_a_rate_falls_log_linearly(rate: LearningRate, step: int, iterations: int, expected: float) -> None:

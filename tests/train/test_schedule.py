@@ -64,7 +64,7 @@ def test_growth_follows_the_resolution() -> None:
 
 def test_parts_act_only_where_they_are() -> None:
     """Catches a schedule that refines a model without AGR, and an early stop that keeps a static first stage."""
-    plain, warmed = (Schedule(TrainConfig(iterations=100, sh_every=1), 0, False, warm_up=at) for at in (0, 9_000))
+    plain, warmed = (Schedule(TrainConfig(iterations=100, sh_every=1), 0, False, warm_up=share) for share in (0, 0.3))
     assert not any(plain.active(step).refine for step in range(100))
     assert [step for step in range(100) if not warmed.is_complete(step)] == list(range(30))
 
