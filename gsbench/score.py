@@ -5,6 +5,7 @@ theirs, so that tables, pairs and pages have it.
 """
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,8 @@ from gsbench import kernels
 from gsbench.errors import InputError, one_line, printable
 from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
 from gsbench.measure import record as records
-from gsbench.measure.images import strip, write_png
+from gsbench.measure.flicker import films_of, tof
+from gsbench.measure.images import to_bytes, write_png
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import SSIM_LEAST_SIDE, psnr
 from gsbench.measure.record import Cost, Record
@@ -122,8 +124,8 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
         rendered_elsewhere=renders.facts,
     )
     records.write(record, folder / records.FILE_NAME)
-    if measured.shown:
-        write_png(strip(measured.shown), folder / "pictures.png")
+    for name, image in measured.images.items():
+        write_png(image, folder / name)
     if (measured.metrics["psnr"] or 0) < (measured.metrics["psnr_background_only"] or 0):
         print(f"{config.scene.name}: PSNR is below that of the background alone: are these images of these views?")
     return record, folder
@@ -188,11 +190,23 @@ def _departures(renders: CheckedRenders) -> dict[str, Any]:
 
 
 def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, float]:
-    """Return the means over views of the metrics of other papers; {} for images that are too small for a window."""
-    if min(min(view.camera.width, view.camera.height) for view in views) < SSIM_LEAST_SIDE:
-        return {}
-    values = [of_other_papers(image, view.image) for view, image in zip(views, renders.images(), strict=True)]
-    return {name: fmean(of_view[name] for of_view in values) for name in values[0]}
+    """Return the means of the metrics of other papers over views, and of tOF over films.
+
+    A metric is left out if the images are too small for it, or if there is no film.
+    """
+    films = [[view.name for view in film] for film in films_of(views)]
+    is_filmed = set(itertools.chain(*films))
+    values, frames = [], {}
+    for view, image in zip(views, renders.images(), strict=True):
+        truth = view.image
+        if min(truth.shape[:2]) >= SSIM_LEAST_SIDE:
+            values.append(of_other_papers(image, truth))
+        if view.name in is_filmed:
+            frames[view.name] = to_bytes(image.cpu().numpy()), to_bytes(truth.cpu().numpy())
+    means = {name: fmean(of_view[name] for of_view in values) for name in (values or [{}])[0]}
+    flows = [tof(*zip(*(frames[name] for name in film), strict=True)) for film in films]
+    known = [flow for flow in flows if flow is not None]
+    return means | ({"tof_farneback": fmean(known)} if known else {})
 
 
 def of_other_papers(render: Tensor, truth: Tensor) -> dict[str, float]:  # [H, W, 3], each

@@ -44,6 +44,9 @@ METRICS = (
     "psnr_best_on_test",  # dB, the best on test during training: it LEAKS, and is only for comparison with papers
     "psnr_moving",  # dB, over the pixels that move: gsbench.measure.regions
     "psnr_object",  # dB, over the pixels of objects
+    "flicker",  # steps of 8 bits, of the error in static pixels from frame to frame: gsbench.measure.flicker
+    "static_drift",  # the same from the first third of a film to the last
+    "flicker_truth",  # of the ground truth itself
     "psnr_float32",  # dB, the most by which float32 changes `psnr` of a view, of three views (gsbench.stability)
     "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )
@@ -87,7 +90,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Region:
-    """The pixels over which `psnr_moving` or `psnr_object` was measured."""
+    """The pixels over which `psnr_moving`, `psnr_object` or `flicker` was measured."""
 
     source: str  # what they were found in: "images of one camera", "masks" or "alpha"
     views: int  # number of views with such pixels
@@ -260,7 +263,9 @@ class Record:
     version: int = VERSION
     variant: str = ""  # settings of its training that differ from the experiment's, such as "iterations=10"
     overrides: list[str] = field(default_factory=list)  # `python -m gsbench` with these arguments repeats the run
-    regions: dict[str, Region] = field(default_factory=dict)  # by "moving" and "object", if there are such pixels
+    regions: dict[str, Region] = field(
+        default_factory=dict
+    )  # by "moving", "object" and "static", if there are such pixels
     on_demand: OnDemand | None = None  # what the time screen and the gate did; None: neither ran
     stop: Stop | None = None  # None: the last iteration was measured, without `train.patience`
     averaged: int = 0  # number of last iterations over which parameters were averaged; 0: they were not

@@ -10,7 +10,7 @@ Both are found in the ground truth, by integers only, so every machine finds the
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 
 import cv2
@@ -40,6 +40,7 @@ class Regions:
     masks: dict[str, Mask]  # [H, W] by the name of the view
     source: str  # what the region was found in; empty if there is none
     missing: str = ""
+    of_any_size: dict[str, Mask] = field(default_factory=dict)  # also those of fewer pixels
 
     @property
     def share(self) -> float:
@@ -62,7 +63,7 @@ def find_regions(views: Sequence[View]) -> dict[str, Regions]:
 
 def moving(views: Sequence[View]) -> Regions:
     """Find the moving pixels of views that share a camera; see the first lines of this module."""
-    groups = [group for group in _by_camera(views) if len(group) >= LEAST_VIEWS]
+    groups = [group for group in by_camera(views) if len(group) >= LEAST_VIEWS]
     if not groups:
         return Regions({}, "", f"needs {LEAST_VIEWS} evaluated views with the same camera")
     masks = {}
@@ -149,10 +150,10 @@ def _large(masks: dict[str, Mask], source: str) -> Regions:
     """Keep the masks of at least LEAST_PIXELS pixels."""
     kept = {name: mask for name, mask in masks.items() if mask.sum() >= LEAST_PIXELS}
     missing = "" if kept else f"no view has a region of {LEAST_PIXELS} pixels"
-    return Regions(kept, source if kept else "", missing)
+    return Regions(kept, source if kept else "", missing, masks)
 
 
-def _by_camera(views: Sequence[View]) -> list[list[View]]:
+def by_camera(views: Sequence[View]) -> list[list[View]]:
     """Group the views by equal cameras and image sizes."""
     cameras = [view.camera for view in views]
     keys = np.array(

@@ -34,6 +34,9 @@ RUNS = (
     RunColumn("psnr_best_on_test_db", "metrics.psnr_best_on_test", float, "the best on test in training, which LEAKS"),
     RunColumn("psnr_moving_db", "metrics.psnr_moving", float, "over the pixels that move"),
     RunColumn("psnr_object_db", "metrics.psnr_object", float, "over the pixels of objects"),
+    RunColumn("flicker", "metrics.flicker", float, "steps of 8 bits by which errors of static pixels change a frame"),
+    RunColumn("static_drift", "metrics.static_drift", float, "the same from the first third of a film to the last"),
+    RunColumn("flicker_truth", "metrics.flicker_truth", float, "of the ground truth itself"),
     RunColumn("psnr_float32_db", "metrics.psnr_float32", float, "the most by which float32 changes the PSNR of a view"),
     RunColumn("psnr_background_only_db", "metrics.psnr_background_only", float, "of the background alone"),
     RunColumn("ssim", "metrics.ssim", float, "scikit-image, Gaussian window"),
@@ -59,6 +62,7 @@ RUNS = (
     RunColumn("ssim_padded", "parts.score.ssim_padded", float, "of gsbench.score: SSIM of 3DGS, zero-padded Gaussian"),
     RunColumn("ssim_uniform", "parts.score.ssim_uniform", float, "SSIM with a uniform window of 7, scikit-image's"),
     RunColumn("ssim_uniform_range2", "parts.score.ssim_uniform_range2", float, "the same with data_range 2"),
+    RunColumn("tof_farneback", "parts.score.tof_farneback", float, "tOF (Farneback), pixels: `gsbench.score`"),
     RunColumn("dssim1", "parts.score.dssim1", float, "(1 - ssim_padded) / 2"),
     RunColumn("dssim2", "parts.score.dssim2", float, "(1 - ssim_uniform_range2) / 2"),
     RunColumn(

@@ -163,7 +163,7 @@ class Execution:
         )
 
     def draw(self) -> None:
-        """Write the measured renders as pictures.png, and the effects that Gaussians keep as effect_sets.png.
+        """Write the measured renders, such as pictures.png, and the effects that Gaussians keep as effect_sets.png.
 
         If the disk is full, the run has no images, but its record is already written.
         """

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsbench.config import Config
 from gsbench.errors import one_line
 from gsbench.gates import picture
+from gsbench.measure.flicker import FlickerScores
 from gsbench.measure.images import Pixels, strip
 from gsbench.measure.quality import evaluate, evenly
 from gsbench.measure.record import Cost, Region, ViewScore
@@ -44,13 +45,13 @@ class Measured:
 
 @dataclass(frozen=True)
 class MeasuredImages:
-    """The measurements of the images of evaluated views alone, and a few of these images beside the ground truth."""
+    """The measurements of the images of evaluated views alone, and pictures of some of them beside the ground truth."""
 
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
     per_view: list[ViewScore]
     regions: dict[str, Region]
-    shown: Pairs
+    images: dict[str, Pixels]  # by file name
 
 
 def measure_images(
@@ -62,14 +63,21 @@ def measure_images(
     """Measure the renders of the evaluated views, of which one at a time is in memory, by the protocol of a config."""
     shown: Pairs = []
     regions = RegionScores(views, config.protocol.quantise)
+    flicker = FlickerScores(views, regions.regions["moving"].of_any_size)
+    pairs = _beside_truth(views, renders, config.protocol.pictures, shown)
     quality = evaluate(
-        regions.measured(_beside_truth(views, renders, config.protocol.pictures, shown)),
+        regions.measured(flicker.measured(pairs)),
         background=background,
         quantised=config.protocol.quantise,
         weights=lpips_weights(config),
     )
-    metrics, missing = quality.metrics | regions.metrics(), quality.missing | regions.missing()
-    return MeasuredImages(metrics, missing, regions.with_scores(quality.per_view), regions.of_record(), shown)
+    return MeasuredImages(
+        quality.metrics | regions.metrics() | flicker.metrics(),
+        quality.missing | regions.missing() | flicker.missing(),
+        regions.with_scores(quality.per_view),
+        regions.of_record() | flicker.of_record(),
+        {"pictures.png": strip(shown)} | flicker.pictures() if shown else {},
+    )
 
 
 def protocol_of(config: Config, scene: Scene | None) -> dict[str, Any]:
@@ -115,12 +123,11 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Meas
     metrics["psnr_float32"], why = psnr_float32(trainer.model, trainer.views, renderer.background, renderer.antialias)
     if why:
         missing["psnr_float32"] = why
-    images = {"pictures.png": strip(measured.shown)} if measured.shown else {}
-    if measured.shown and with_effect_sets:
+    images = measured.images
+    if images and with_effect_sets:
         first = views[0]
-        images["effect_sets.png"] = picture.draw(
-            trainer.model, first.camera, first.time, renderer.background, renderer.antialias
-        )
+        effect_sets = picture.draw(trainer.model, first.camera, first.time, renderer.background, renderer.antialias)
+        images = images | {"effect_sets.png": effect_sets}
     return Measured(metrics, missing, measured.per_view, measured.regions, cost, note, images)
 
 

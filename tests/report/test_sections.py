@@ -20,13 +20,15 @@ from records import (
     runs_of,
     sections,
     three_lengths,
+    write_all,
 )
 
 from gsbench.measure.curve import Point
-from gsbench.measure.record import LengthChoice
+from gsbench.measure.images import write_png
+from gsbench.measure.record import LengthChoice, Record, Region
 from gsbench.measure.speed import RenderTimes
+from gsbench.report import frame, stats
 from gsbench.report import sections as of_report
-from gsbench.report import stats
 from gsbench.report.sections.budgets import basis, contests, is_beside_others, points
 from gsbench.report.sections.curves import events, mean_curves, profiles, round_numbers, targets
 from gsbench.report.sections.experiment import table
@@ -372,3 +374,27 @@ def test_renders_of_another_program_are_compared_and_choose_nothing():
     protocol = shown["protocol"].table
     assert set(protocol.setting[protocol.note == "WARNING"]) == {"images"}
     assert set(protocol.value[protocol.setting == "iterations"]) == {"1,000", "rendered elsewhere"}
+
+
+def test_what_flickers_is_a_table_with_a_picture_of_each_model(tmp_path):
+    """Catches a section without a film, another seed's picture, and a column that scenes without a film share."""
+
+    def filmed(model: str, seed: int, value: float) -> Record:
+        numbers = {"flicker": value, "static_drift": 1.0, "flicker_truth": 0.5}
+        region = Region("images of one camera", 6, 0.25, "5e" * 32)
+        return but(run(model, seed), metrics=numbers, regions={"static": region})
+
+    others = [but(run("a", scene="x"), missing={"flicker": "needs a film"}, metrics={"flicker": None})]
+    records = [filmed("a", 0, 2.0), filmed("a", 1, 3.0), filmed("b", 0, 4.0), *others]
+    folder = write_all(records, tmp_path)
+    for name, value in (("a/seed0", 1), ("a/seed1", 2), ("b/seed0", 3)):
+        write_png(np.full((9, 9, 3), 80 * value, np.uint8), folder / "suzanne" / name / "flicker.png")
+    (of_all,) = frame.load(folder).chapters()
+    section = {of.key: of for of in of_report.built(of_all)}["flicker"]
+    assert section.table[["model", "flicker", "seeds"]].to_numpy().tolist() == [["a", 2.5, 2], ["b", 4.0, 1]]
+    assert [image.caption for image in section.images] == ["suzanne, a", "suzanne, b"]
+    shown = sections(*records)["experiment"]
+    assert shown.table.set_index(["scene", "model"]).flicker["suzanne", "b"] == 4.0
+    assert "flicker: needs a film (x)" in shown.notes
+    assert "suzanne: flicker is over 25.0 % of the pixels of 6 views, from images of one camera" in shown.notes
+    assert "flicker" not in sections(run("a"))

@@ -1,5 +1,7 @@
 """What a finished training is measured by, PSNR at its best iteration on val too, and the line that it ends with."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,3 +59,21 @@ def test_views_at_the_cap_are_named() -> None:
     exact = summary(replace(make(), exact=["test/r_3"]))
     assert ". PSNR of test/r_3 is infinite or nearly so and counts as 100 dB" in exact
     assert "counts as" not in summary(make())
+
+
+def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> None:
+    """Catches numbers of renders in 8 bits in place of floats, and a film that leaves no picture."""
+    data = shutil.copytree(square, tmp_path / "data")
+    path = data / "square/transforms_test.json"
+    content = json.loads(path.read_text())
+    images = (("./test/r_0", 0.0), ("./train/r_2", 0.4), ("./test/r_1", 1.0))
+    content["frames"] = [content["frames"][0] | {"file_path": name, "time": time} for name, time in images]
+    path.write_text(json.dumps(content))
+    floats, folder = run_here(*overrides(data, tmp_path, "model=4dgs"))
+    assert floats.status == "ok", floats.reason
+    assert floats.metrics["flicker"] > 0 == floats.metrics["flicker_truth"]
+    assert floats.regions["static"].views == 3
+    assert (folder / "flicker.png").is_file()
+    in_8_bits, _ = run_here(*overrides(data, tmp_path, "model=4dgs", "protocol.quantise=true"))
+    assert in_8_bits.metrics["psnr"] != floats.metrics["psnr"]
+    assert in_8_bits.metrics["flicker"] == floats.metrics["flicker"]

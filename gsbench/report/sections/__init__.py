@@ -24,6 +24,7 @@ ORDER = [
     "lengths",
     "on_demand",
     "stages",
+    "flicker",
     "gallery",
     "protocol",
     "runs",

@@ -20,10 +20,21 @@ SHOWN = (
     "fps",
     "gaussians",
     "lpips_vgg",
+    "flicker",
+    "static_drift",
+    "flicker_truth",
     "psnr_best_on_test_db",
 )
 WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
-IF_MEASURED = ("psnr_moving_db", "psnr_object_db", "lpips_vgg", "psnr_best_on_test_db")
+IF_MEASURED = (
+    "psnr_moving_db",
+    "psnr_object_db",
+    "lpips_vgg",
+    "flicker",
+    "static_drift",
+    "flicker_truth",
+    "psnr_best_on_test_db",
+)
 TEXT = (
     "Mean over seeds ± half the width of the 95 % interval over seeds. Bold (in a terminal *): the best mean of a "
     "scene and every mean that does not differ from it: the interval of their paired difference contains zero, or they "
@@ -96,18 +107,21 @@ def _notes(chapter: Results) -> Iterator[str]:
         [(metric, why, run.scene) for run in ok.itertuples() for metric, why in run.missing.items()],
         columns=["metric", "why", "scene"],
     )
+    titles: dict[str, list[str]] = {}  # of the metrics that lack for a reason in some scenes
     for (metric, why), rows in lacks.groupby(["metric", "why"]):
         column = COLUMNS.get(metric) or COLUMNS.get(f"{metric}_db")
         scenes = "" if set(rows.scene) == set(ok.scene) else f" ({', '.join(sorted(set(rows.scene)))})"
-        yield printable(f"{column.title if column else metric}: {why}{scenes}")
+        titles.setdefault(f"{why}{scenes}", []).append(column.title if column else metric)
+    yield from (printable(f"{', '.join(metrics)}: {reason}") for reason, metrics in titles.items())
     for (scene, label), runs in ok[ok.rendered_elsewhere].groupby(["scene", "label"]):
         yield printable(f"{scene}, {label}: {of_renders(runs.record.iloc[0].rendered_elsewhere)}")
     for scene, runs in ok.groupby("scene"):
         regions = {name: region for record in runs.record if record for name, region in record.regions.items()}
         for name, region in sorted(regions.items()):
             share = number(100 * region.share, 1)
+            metric = "flicker" if name == "static" else f"PSNR {name}"
             yield printable(
-                f"{scene}: PSNR {name} is over {share} % of the pixels of {region.views} views, from {region.source}"
+                f"{scene}: {metric} is over {share} % of the pixels of {region.views} views, from {region.source}"
             )
 
 
