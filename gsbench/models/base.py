@@ -149,18 +149,27 @@ class GaussianModel(nn.Module, ABC):
         """Return the first and the last time at which each Gaussian can be visible, [N, 2]; None without time.
 
         A Gaussian with opacity o, mean time mu_t and lifetime s is visible at time t if o exp(-((t - mu_t) / s)^2 / 2)
-        is at least 1/255. Times are in [0, 1]; (inf, inf) marks a Gaussian that is never visible. The intervals only
-        serve to sort the Gaussians: they ignore AGR, the neural refinement.
+        is at least 1/255, unless `fading_times` says otherwise. Times are in [0, 1]; (inf, inf) marks a Gaussian that
+        is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
         lifetimes = self.lifetimes()
         if lifetimes is None:
             return None
         times, deviations = lifetimes
         opacities = torch.sigmoid(self.splats["opacities"])
-        half = sqrt(2 * log(opacities / ALPHA_MIN).clamp(min=0)) * deviations
+        half = self.fading_times(log(opacities / ALPHA_MIN).clamp(min=0), deviations)
         interval = torch.stack([times - half, times + half], 1)
         never = (half == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
         return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
+
+    def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
+        """Return how far from the mean time the opacity of each Gaussian falls to a share exp(-fading), [N].
+
+        Args:
+            fading: at least 0, [N].
+            lifetimes: s as `lifetimes` returns it, [N].
+        """
+        return sqrt(2 * fading) * lifetimes
 
     def hold_sizes(self, least: Tensor) -> None:
         """Raise the spatial sizes of each Gaussian to at least `least` [N], world units; by default do nothing."""

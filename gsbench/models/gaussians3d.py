@@ -7,6 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gsbench.kernels.operation import Operation
 from gsbench.kernels.slices import slice_static
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime
@@ -24,7 +25,7 @@ class Gaussians3DModel(GatedModel, gates=True):
     """3DGS: the covariance of a Gaussian is R S S^T R^T, with rotation R and scales S (3DGS, eq. 6)."""
 
     geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")
-    kernel = slice_static
+    kernel: Operation | None = slice_static
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres whose radii are the distances [N] of the points to their neighbours."""

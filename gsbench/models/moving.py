@@ -1,8 +1,7 @@
-"""Define dGS, dBS and FreeTimeGS: 3D Gaussians that keep one shape, while means and opacities change.
+"""Define dGS and dBS: 3D Gaussians that keep one shape, while means and opacities change with direction and time.
 
-Means and opacities change with time, in dGS and dBS also with the view direction. The equations of these two are those
-of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the authors' code. Wang et al.,
-"FreeTimeGS: Free Gaussian Primitives at Anytime and Anywhere", arXiv 2506.05348.
+The equations are those of "direct conditioning", a text under review for NeurIPS 2026, with the constants of the
+authors' code. `MovingGaussians3D` is also the base of FreeTimeGS and others.
 """
 
 import math
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.headers import DIRECT_FADING
-from gsbench.kernels.slices import slice_direct, slice_direct_beta, slice_free_time
+from gsbench.kernels.slices import slice_direct, slice_direct_beta, slice_static
 from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, exponents, opacity_factor, positive, profiles, shift_weights
@@ -24,7 +23,7 @@ from gsbench.models.camera_time import CameraTime, initial_times, times_inside, 
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import sizes
 from gsbench.models.gated import OPACITY_MARGIN
-from gsbench.models.gaussian_batch import Conditioned, reach
+from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.portable_math import exp, log
 from gsbench.models.registry import register
@@ -51,6 +50,16 @@ class MovingGaussians3D(Gaussians3DModel):
         shift, opacity_factor = self.change(raw, query)
         return Conditioned(raw["means"] + shift, self.factors(raw), opacity_factor)
 
+    def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
+        """Slice as other models do; where the kernel is that of 3DGS, torch moves and fades what it returns."""
+        geometry = super().slice_geometry(raw, query)
+        if self.kernel is not slice_static or not self.uses_kernel(raw):
+            return geometry
+        shift, factor = self.change({name: x[: self.conditioned] for name, x in raw.items()}, query)
+        static = len(raw["means"]) - len(shift)
+        means = geometry.means + F.pad(shift, (0, 0, 0, static))
+        return geometry._replace(means=means, opacities=geometry.opacities * F.pad(factor, (0, static), value=1.0))
+
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
         """Replace means and opacities by their weighted averages over views; see `GatedModel.frozen`."""
@@ -71,54 +80,6 @@ class MovingGaussians3D(Gaussians3DModel):
         if effect_sets.orders is not None:
             masks |= dict.fromkeys(self.moving, effect_sets.is_conditioned[:, None])
         return masks
-
-
-@register("freetime")
-class FreeTimeModel(MovingGaussians3D, gates=True):
-    """FreeTimeGS: each Gaussian has a mean time mu_t, a standard deviation in time s and a velocity v,
-
-        mean = mu_p + v (t - mu_t)      opacity = sigmoid(o) exp(-1/2 ((t - mu_t) / s)^2)      cov = R S S^T R^T
-
-    A velocity is the movement during the whole time range [0, 1], in world units.
-    """
-
-    observes = ("time",)
-    centers = ("means", "times")
-    geometry = ("scales", "quats", "durations", "velocities")
-    lengths = ("means", "velocities")
-    moving = ("times", "durations", "velocities")
-    kernel = slice_free_time
-
-    def __init__(
-        self,
-        *,
-        duration: float = math.sqrt(1 / 5),  # initial standard deviation in time: 4DGS', because points have no times
-        **options: Any,
-    ) -> None:
-        super().__init__(**options)
-        check_positive(duration, "duration")
-        self.duration = duration
-
-    def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return spheres at rest with mean times uniform in [-0.1, 1.1]."""
-        N = len(distances)
-        return super().initial_geometry(points, distances, generator) | {
-            "times": initial_times(points, generator),
-            "durations": torch.full((N, 1), math.log(self.duration)),
-            "velocities": torch.zeros(N, 3),
-        }
-
-    def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
-        assert query.time is not None
-        delta = query.time - raw["times"]
-        opacity_factor = exp(-0.5 * (delta / sizes(raw["durations"])).square())[:, 0]
-        return raw["velocities"] * delta, opacity_factor
-
-    def lifetimes(self) -> tuple[Tensor, Tensor]:
-        return self.splats["times"].detach()[:, 0], sizes(self.splats["durations"].detach()[:, 0])
-
-    def hold_lifetimes(self, least: float) -> None:
-        self.splats["durations"].data.clamp_(min=math.log(least))
 
 
 COUPLINGS = ("text", "interpolated", "none")

@@ -22,7 +22,8 @@ OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {  # the options of each model 
     "6dgs": ({}, {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False},
              {"scheme": "cholesky", "off_diagonal": "row_scaled"}),
     "7dgs_nodir": ({}, {"factor_order": "paper"}, {"off_diagonal": "row_scaled"}, {"scheme": "cholesky"}),
-    **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static", "freetime", "stg"), ({},)),
+    **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static", "freetime", "freetime_plus",
+                     "sharptime", "stg"), ({},)),
 }  # fmt: skip
 CASES = [(name, options) for name, every in OPTIONS.items() for options in every]
 SPREADS = {"betas": 0.7, "coupling": 0.5, "velocities": 0.5, "skew": 0.3, "directions": 0.7, "opacities": 2.0}
@@ -86,8 +87,8 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
 def _moving(model: MovingGaussians3D, g: torch.Generator) -> Raw:
     N = 45
     model.initialise(Points(torch.randn(N, 3, generator=g), torch.rand(N, 3, generator=g)), 1.0, g)
-    raw = {key: model.splats[key].detach() for key in dict.fromkeys(("means", *model.geometry, *model.centers,
-                                                                     "opacities"))}  # fmt: skip
+    names = dict.fromkeys(("means", *model.geometry, *model.centers, *model.moving, "opacities"))
+    raw = {key: model.splats[key].detach() for key in names}
     raw = {key: x + SPREADS.get(key, 0.3) * torch.randn(x.shape, generator=g) for key, x in raw.items()}
     raw["scales"] = torch.randn(N, 3, generator=g) - 1
     raw["scales"][3, 0] = -17.0  # beyond where sizes stop

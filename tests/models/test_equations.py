@@ -242,17 +242,7 @@ def test_precision_is_positive_and_couples_no_time() -> None:
     torch.testing.assert_close(L, torch.tensor(expected))
 
 
-def test_the_equations_of_freetime() -> None:
-    """Catches a velocity from t = 0, a duration without its square, a gate that moves with the camera."""
-    model = build("freetime")
-    raw = {"times": [[0.2]], "durations": [[math.log(0.5)]], "velocities": [[1.0, 0, -2]]}
-    query = CameraTime(torch.zeros(3), torch.tensor(0.7))
-    shift, opacity_factor = model.change({key: torch.tensor(value) for key, value in raw.items()}, query)
-    torch.testing.assert_close(shift, torch.tensor([[0.5, 0, -1.0]]))
-    torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
-
-
-@pytest.mark.parametrize("name", ["dgs", "freetime", "stg"])
+@pytest.mark.parametrize("name", ["dgs", "freetime", "freetime_plus", "sharptime", "stg"])
 def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
     """Catches weights that are forgotten, and an opacity or a mean that is the one of a single view."""
     model, queries = lively(name, 100), [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]

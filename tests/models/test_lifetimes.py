@@ -13,11 +13,12 @@ from gsbench.train.rows import START_BINS, Rows
 
 # The raw parameter and the column that hold the size in time, and a number that makes this size tiny.
 IN_TIME = {"4dgs": ("scales", 3, -20.0), "dbs": ("precision", -1, 20.0), "dgs": ("precision", -1, 20.0),
-           "freetime": ("durations", 0, -20.0), "stg": ("durations", 0, -20.0),
+           **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ("durations", 0, -20.0)),
            "ubs": ("scales", -1, -20.0)}  # fmt: skip
 TIMED = [name for name in NAMES if name in IN_TIME.keys() - {"ubs"} or ("time" in registry.find(name).observes
          and issubclass(registry.find(name), CholeskyModel))]  # fmt: skip
-EXACT = ("7dgs_nodir", "freetime", "stg")  # nothing else dims them: they are visible in the whole of their intervals
+# Nothing else dims these: they are visible in the whole of their intervals.
+EXACT = ("7dgs_nodir", "freetime", "sharptime", "stg")
 LEAST = 0.04
 
 
@@ -36,6 +37,8 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
         torch.testing.assert_close(lifetimes, S_t.sqrt())
     elif variant not in ("dgs", "dbs"):
         model.splats["times"].data[:4, 0] = torch.tensor([-9.0, -9.0, 10.0, 10.0])  # visible never
+    if variant == "freetime_plus":
+        model.splats["permanence"].data[4:12] = torch.linspace(-0.3, 2.0, 8)[:, None]  # some are visible always
     intervals = model.visible_intervals()
     assert variant in ("dgs", "dbs", "ndgs") or "," in variant or intervals[:4].isinf().all()
     first, last = intervals.unbind(1)

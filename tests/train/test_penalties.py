@@ -11,7 +11,7 @@ from tiny_training import trainer
 
 from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel, build
-from gsbench.models.moving import FreeTimeModel
+from gsbench.models.freetime import FreeTimeModel
 from gsbench.scenes.scene import Camera, Points, View
 from gsbench.schedule import ActiveComponents
 from gsbench.train import regularisers

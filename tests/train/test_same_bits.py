@@ -26,8 +26,8 @@ WITHOUT_AVX512 = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "OPENBLAS_CORETYPE": "Zen",
 }
-SLOW = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "deformable_narrow", "dgs", "freetime", "ndgs", "stg",
-        "ubs")  # fmt: skip
+SLOW = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "deformable_narrow", "dgs", "freetime", "freetime_plus",
+        "ndgs", "sharptime", "stg", "ubs")  # fmt: skip
 
 
 @pytest.mark.parametrize("model", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])

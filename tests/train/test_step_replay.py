@@ -16,7 +16,7 @@ from gsbench.train.loop import Trainer
 from gsbench.train.step import Step
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "7dgs_nodir", "dbs", "deformable", "dgs", "freetime", "ndgs",
-          "stg", "ubs")  # fmt: skip
+          "sharptime", "stg", "ubs")  # fmt: skip
 
 
 @pytest.fixture
