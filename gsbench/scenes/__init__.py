@@ -50,6 +50,13 @@ _LAYOUTS = (
         "panoptic.load",
     ),
     _Layout(
+        "dataset.json",
+        "dataset.json and metadata.json beside the folders camera and rgb/2x (HyperNeRF's vrig scenes: the releases of "
+        "github.com/google/hypernerf)",
+        "nerfies.load",
+        beside="camera",
+    ),
+    _Layout(
         "poses_bounds.npy",
         "poses_bounds.npy beside the films cam00.mp4, cam01.mp4, ... or folders of their frames (Neural 3D Video: the "
         "releases of github.com/facebookresearch/Neural_3D_Video)",

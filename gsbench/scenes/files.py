@@ -5,12 +5,18 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import TypeVar
 
 from gsbench.errors import InputError
+from gsbench.reading import MAX_JSON, parse, parse_json, read_file
+
+T = TypeVar("T")
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")  # of images, in any case; the first is preferred
+_MOST_KEYS = 8  # named in a sentence
 _DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")  # with which absolute paths begin on Windows
 
 
@@ -37,6 +43,23 @@ def find_inside(
             "make a link to it there"
         )
     return path
+
+
+def read_keys(kind: type[T], source: Path) -> tuple[T, str, set[str]]:
+    """Read the keys of a JSON file that a dataclass has; return its SHA-256 and the names of other keys too."""
+    data = read_file(source, str(source), MAX_JSON)
+    content = parse_json(data, str(source))
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]  # of a dataclass
+    if not isinstance(content, dict):
+        raise InputError(f"{source}: expected a JSON object with {', '.join(known)}, got a {type(content).__name__}")
+    kept = parse(kind, {key: content[key] for key in known if key in content}, str(source))
+    return kept, digest(data), {*content} - {*known}
+
+
+def unread(source: str, keys: Collection[str]) -> list[str]:
+    """Return a sentence on keys of a file that are not read, if there are any."""
+    shown = ", ".join(f"{key[:40]!a}" for key in sorted(keys)[:_MOST_KEYS]) + (", .." if len(keys) > _MOST_KEYS else "")
+    return [f"{source}: keys that are not read: {shown}"] if keys else []
 
 
 def without_suffix(name: str) -> str:

@@ -302,7 +302,7 @@ def _decode(film: _Film, frames: tuple[int, int], rendition: Rendition, size: Si
                     )
                 file.write(np.ascontiguousarray(images.reduce_8_bits(pixels, rendition, size)).data)
                 written += 1
-        if written <= frames[1] - frames[0]:
+        if written != frames[1] - frames[0] + 1:
             raise InputError(f"{film.path}: the film ends before frame {frames[0] + written}: copy it again")
         part.replace(path)
     finally:

@@ -3,7 +3,7 @@
 import io
 import os
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsbench.errors import InputError, one_line
 from gsbench.process.memory import require
-from gsbench.reading import MAX_JSON, parse, parse_json, read_file
+from gsbench.reading import read_file
 from gsbench.scenes import files, shots
 from gsbench.scenes.images import Rendition
 from gsbench.scenes.placement import standard_scene
@@ -94,13 +94,7 @@ def load(root: Path, rendition: Rendition) -> Scene:
 
 def _read_split(root: Path, source: Path) -> _Split:
     """Read and check a file of cameras; the images are not read yet."""
-    data = read_file(source, str(source), MAX_JSON)
-    content = parse_json(data, str(source))
-    if not isinstance(content, dict):
-        raise InputError(f"{source}: expected a JSON object with fn, k and w2c, got a {type(content).__name__}")
-    known = {field.name for field in fields(_Meta)}
-    unread = ", ".join(f"{key[:40]!a}" for key in sorted(content.keys() - known))
-    meta = parse(_Meta, {key: value for key, value in content.items() if key in known}, str(source))
+    meta, digest, others = files.read_keys(_Meta, source)
     times, cameras = len(meta.fn), len((meta.fn or [[]])[0])
     if not cameras or {*map(len, meta.fn), *map(len, meta.cam_id)} != {cameras} or len(meta.cam_id) != times:
         raise InputError(f"{source}: fn, cam_id: expected one image and number for each camera at each time")
@@ -121,9 +115,8 @@ def _read_split(root: Path, source: Path) -> _Split:
             _check_pinhole(lens.K, f"{source}: k[{time}][{camera}]")
             moment = time / max(1, times - 1)
             listed.append(Shot(path, mask, stem, f"{path} ({where})", moment, torch.from_numpy(pose), lens))
-    notes = [f"{source.name}: keys that are not read: {unread}"] if unread else []
     numbers = {number for row in meta.cam_id for number in row}
-    return _Split(listed, numbers, times, files.digest(data), notes)
+    return _Split(listed, numbers, times, digest, files.unread(source.name, others))
 
 
 def _array(nested: list[Any], shape: tuple[int, ...], where: str) -> NDArray[np.float64]:

@@ -33,7 +33,6 @@ _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 # The transform by which nerfstudio made the poses from COLMAP's is part of the poses, and of the points.
 _NERFSTUDIO_KEYS = frozenset((*_SPLITS, "ply_file_path", "applied_transform", "applied_scale"))
 _FRAME_KEYS = {"file_path", "transform_matrix", "time", "rotation"}  # NeRF-synthetic's rotation is not part of the pose
-_MOST_KEYS = 8  # named in a sentence
 _OWN_TIMES = "give them their own times"
 _LARGEST = 1e30  # largest number in a file; its square in double and its sums in single precision are finite
 _AGREE = 1e-3  # relative tolerance between two statements of one focal length
@@ -230,11 +229,10 @@ def _read_split(
         what = name.removeprefix("transforms_").removesuffix(".json")
         raise InputError(f"{source}: frames: expected at least one frame, the {what} split is empty")
     checked = [_read_frame(root, content, frame, source, index, finder) for index, frame in enumerate(frames)]
-    unread = sorted(content.keys() - _LENS_KEYS - {"frames", *keys})
-    unread += sorted({key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS - set(unread))
-    shown = ", ".join(f"{key[:40]!a}" for key in unread[:_MOST_KEYS]) + (", .." if len(unread) > _MOST_KEYS else "")
-    notes = [f"{name}: keys that are not read: {shown}"] if unread else []
-    return Split(source, checked, content, files.digest(data), notes)
+    unread = (content.keys() - _LENS_KEYS - {"frames", *keys}) | (
+        {key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS
+    )
+    return Split(source, checked, content, files.digest(data), files.unread(name, unread))
 
 
 def _shots_of(frames: Sequence[Frame], timed: Sequence[float | None], size: Size) -> list[Shot]:

@@ -96,8 +96,8 @@ def test_frames_and_cameras_can_be_chosen(root: Path) -> None:
     """Catches frames counted from 1, a row of poses that moves to the next film, and a choice that is not told."""
     all_frames = scenes.load(root)
     whole = {view.name: view for view in all_frames.train}
-    scene = scenes.load(root, frames=(2, 4), leave_out=["cam01"])
-    assert [view.name for view in scene.train] == [f"{name}/000{n}" for n in (2, 3, 4) for name in ("cam02", "cam04")]
+    scene = scenes.load(root, frames=(1, 3), leave_out=["cam01"])
+    assert [view.name for view in scene.train] == [f"{name}/000{n}" for n in (1, 2, 3) for name in ("cam02", "cam04")]
     assert [view.time for view in scene.test] == [0.0, 0.5, 1.0]
     for view in scene.train:
         assert torch.equal(view.pixels, whole[view.name].pixels)

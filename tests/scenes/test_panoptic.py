@@ -110,7 +110,7 @@ def points(**arrays: np.ndarray) -> Callable[[Path], object]:
 
 FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (lambda root: (root / "test_meta.json").unlink(), "test_meta.json: expected a file, found none"),
-    (lambda root: (root / "train_meta.json").write_text("[]"), "expected a JSON object with fn, k and w2c"),
+    (lambda root: (root / "train_meta.json").write_text("[]"), "expected a JSON object with w, h, k"),
     (edit(lambda content: content.pop("k")), r"train_meta\.json: .*missing required field k"),
     (edit(lambda content: content["fn"][1].pop()), "one image and number for each camera at each time"),
     (edit(lambda content: content.update(fn=[])), "one image and number"),
