@@ -10,15 +10,8 @@ import gsbench  # noqa: F401  before torch: how its threads wait is settled as i
 
 # Files of many seconds and few tests: first, so that at the end no process waits for another's.
 LONGEST = (
-    "test_adding_a_kernel.py",
-    "test_audit.py",
-    "test_adding_a_model.py",
-    "test_command_line.py",
-    "test_checkpoint.py",
-    "test_selection.py",
-    "test_install.py",
-    "test_start.py",
-    "test_end_to_end.py",
+    *("test_adding_a_kernel.py", "test_audit.py", "test_adding_a_model.py", "test_command_line.py"),
+    *("test_checkpoint.py", "test_selection.py", "test_install.py", "test_start.py", "test_end_to_end.py"),
 )
 
 

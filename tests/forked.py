@@ -84,9 +84,15 @@ def _ask(asked: dict[str, Any]) -> int | None:
     """Ask the process that forks, which is started first if there is none."""
     if not _servers:
         _servers.append(
-            subprocess.Popen([sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                             cwd=ROOT, env=os.environ | ENVIRONMENT)
-        )  # fmt: skip
+            subprocess.Popen(
+                [sys.executable, __file__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                cwd=ROOT,
+                env=os.environ | ENVIRONMENT,
+            )
+        )
     (server,) = _servers
     assert server.stdin is not None
     assert server.stdout is not None

@@ -27,12 +27,14 @@ def main() -> None:
             sys.exit(f"smoke: expected an installed gsbench, found the checkout's: {file}")
         if (built == "True") != (expected == "cpu"):
             sys.exit(f"smoke: expected kernels for {expected}, {'found them' if built == 'True' else 'found none'}")
-        words = ["+exp=mini", "model=3dgs", "scene=suzanne", f"train.iterations={STEPS}", "train.curve_points=1",
-                 "scene.downscale=4", "data.initial_points=500", "results=results"]  # fmt: skip
+        words = ["+exp=mini", "model=3dgs", "scene=suzanne", "scene.downscale=4", "data.initial_points=500"]
+        words += [f"train.iterations={STEPS}", "train.curve_points=1", "results=results"]
         done = run(folder, "-m", "gsbench", *words)
         if sum(line.startswith(SLOW) for line in done.stderr.splitlines()) != (expected == "reference"):
-            sys.exit(f"smoke: expected {'one line' if expected == 'reference' else 'no line'} that there are no "
-                     f"kernels: {done.stderr}")  # fmt: skip
+            sys.exit(
+                f"smoke: expected {'one line' if expected == 'reference' else 'no line'} that there are no "
+                f"kernels: {done.stderr}"
+            )
         (path,) = Path(folder).glob("results/mini/suzanne/*/seed0/record.json")
         psnr = json.loads(path.read_text())["metrics"]["psnr"]
         print(f"smoke: {STEPS} steps by {expected}: {psnr:.2f} dB on test, by {file}")

@@ -88,15 +88,23 @@ def test_the_worked_example_builds_and_differentiates(tmp_path):
         if path.name not in KEPT:
             path.write_text("")
     # Unoptimised, and for one instruction set, the widest: what is tested is that it compiles and is right.
-    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Debug", "-DGSB_OPTIMISATION=-O0",
-               "-DCMAKE_CXX_FLAGS_DEBUG=-O0 -DNDEBUG", f"-DGSB_LEVELS={kernels.instruction_set() or 'native'}",
-               f"-DPython_EXECUTABLE={sys.executable}"]  # fmt: skip
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Debug", "-DCMAKE_CXX_FLAGS_DEBUG=-O0 -DNDEBUG"]
+    options += ["-DGSB_OPTIMISATION=-O0", f"-DGSB_LEVELS={kernels.instruction_set() or 'native'}"]
+    options.append(f"-DPython_EXECUTABLE={sys.executable}")
     shim = [f"CMakeFiles/_cuda.dir/gsbench/kernels/cuda/{name}.o" for name in ("ball.cu", "bindings.cpp")]
-    for command in (["cmake", "-S", str(project), "-B", str(build), *options],
-                    ["cmake", "--build", str(build), "--target", "_native", *shim]):  # fmt: skip
+    for command in (
+        ["cmake", "-S", str(project), "-B", str(build), *options],
+        ["cmake", "--build", str(build), "--target", "_native", *shim],
+    ):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     shutil.copy(next(build.glob("_native*.so")), project / "gsbench/kernels")
-    done = subprocess.run([sys.executable, "-c", CHECK], capture_output=True, text=True, cwd=project, check=False,
-                          env={**environment(), "PYTHONPATH": os.fspath(project)})  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", CHECK],
+        capture_output=True,
+        text=True,
+        cwd=project,
+        check=False,
+        env={**environment(), "PYTHONPATH": os.fspath(project)},
+    )
     assert done.returncode == 0, done.stderr

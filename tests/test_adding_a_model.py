@@ -66,9 +66,12 @@ def run(project: Path, module: str, *words: str) -> subprocess.CompletedProcess[
     """Run a module of the copy."""
     return subprocess.run(
         [sys.executable, "-c", START, module, *words],
-        capture_output=True, text=True, cwd=project, check=False,
+        capture_output=True,
+        text=True,
+        cwd=project,
+        check=False,
         env={**environment(), "PYTHONPATH": os.fspath(project)},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +124,11 @@ def test_export_start_from_a_ply_and_a_nan(project, data, gated, tmp_path):
     assert "Traceback" not in done.stderr, done.stderr
     results = [record.read(path) for path in record.find(tmp_path / "started")]
     assert sorted((run_record.model, run_record.status) for run_record in results) == [
-        ("balls", "diverged"), ("balls", "ok"), ("blinks", "diverged"), ("blinks", "ok")
-    ]  # fmt: skip
+        ("balls", "diverged"),
+        ("balls", "ok"),
+        ("blinks", "diverged"),
+        ("blinks", "ok"),
+    ]
     for run_record in results:
         assert run_record.status == "ok" or "the first is Gaussian " in str(run_record.reason)
 
@@ -133,6 +139,8 @@ def test_the_example_passes_the_linters(tmp_path):
     source.write_text(next(text for path, text in blocks().items() if path.endswith(".py")))
     done = subprocess.run(
         [sys.executable, "-m", "ruff", "check", "--config", str(ROOT / "pyproject.toml"), str(source)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout

@@ -97,8 +97,12 @@ def commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     if shutil.which("git") is None:
         pytest.skip("needs git")
     root = tmp_path / "repository"
-    texts = {"benchmarks/__init__.py": "", "benchmarks/__main__.py": MAIN, "gsbench/__init__.py": "MILLISECONDS = 0",
-             "benchmarks/rows.py": "SECTIONS = {'loss': None, 'step': None}"}  # fmt: skip
+    texts = {
+        "benchmarks/__init__.py": "",
+        "benchmarks/__main__.py": MAIN,
+        "gsbench/__init__.py": "MILLISECONDS = 0",
+        "benchmarks/rows.py": "SECTIONS = {'loss': None, 'step': None}",
+    }
     for path, text in texts.items():
         (root / path).parent.mkdir(parents=True, exist_ok=True)
         (root / path).write_text(text)

@@ -93,10 +93,14 @@ def test_facts_are_those_of_the_code():
     assert KEYS["train.densify.max_gaussians"].low == KEYS["data.initial_points"].low == LEAST_GAUSSIANS
 
 
-PLAIN: dict[str, Any] = {"experiment": "a", "train": {"iterations": 9, "checkpoint_minutes": 2, "noise": None},
-                         "model": {"lr": {"means": {"start": 1}}, "compared": {"a": 1}},
-                         "protocol": {"renders": 30, "best_on_test": False},
-                         "effects": {"gate": "off", "budget_db": 0.05}, "launch": {"cpus": 4}}  # fmt: skip
+PLAIN: dict[str, Any] = {
+    "experiment": "a",
+    "train": {"iterations": 9, "checkpoint_minutes": 2, "noise": None},
+    "model": {"lr": {"means": {"start": 1}}, "compared": {"a": 1}},
+    "protocol": {"renders": 30, "best_on_test": False},
+    "effects": {"gate": "off", "budget_db": 0.05},
+    "launch": {"cpus": 4},
+}
 
 
 def changed(dotted: str, value: Any) -> dict[str, Any]:
@@ -174,8 +178,10 @@ def test_a_dataclass_of_another_module_joins_a_group():
 
 def test_the_schema_needs_no_library():
     """Catches a hook that imports torch, which takes seconds, or gsbench.config, which then lacks its keys."""
-    program = ("import sys, {}; from gsbench import config, config_key; print(*config_key.declared(config.Config));"
-               "assert not {{'torch', 'hydra', 'omegaconf'}} & sys.modules.keys()")  # fmt: skip
+    program = (
+        "import sys, {}; from gsbench import config, config_key; print(*config_key.declared(config.Config));"
+        "assert not {{'torch', 'hydra', 'omegaconf'}} & sys.modules.keys()"
+    )
     hooks = [f"gsbench.train.hooks.{path.stem}" for path in (ROOT / "gsbench/train/hooks").glob("[!_]*.py")]
     for first in ("gsbench.config", *hooks):
         command = [sys.executable, "-c", program.format(first)]

@@ -25,8 +25,14 @@ print(getattr(build, hook)(out, dict(setting.split("=", 1) for setting in settin
 
 def built(hook: str, project: Path, out: Path, *settings: str, **environment: str) -> tuple[Path, str]:
     """Call a hook of the build backend as pip does; returns the file it made and what it said."""
-    done = subprocess.run([sys.executable, "-c", HOOK, hook, str(out), *settings], cwd=project, capture_output=True,
-                          text=True, check=False, env={**os.environ, **environment})  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", HOOK, hook, str(out), *settings],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **environment},
+    )
     assert done.returncode == 0, done.stderr + done.stdout
     return out / done.stdout.splitlines()[-1], done.stderr + done.stdout
 
@@ -41,8 +47,15 @@ def test_the_sdist_has_what_builds_and_tests_it(sdist):
     assert sdist.name == f"gsbench_splatting-{__version__}.tar.gz"  # as .github/workflows/wheels.yml expects it
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    for name in ("CMakeLists.txt", "conf/exp/mini.yaml", "gsbench/kernels/cpu/triangular.cpp", "tests/smoke.py",
-                 "gsbench/scenes/sample/suzanne/transforms_train.json", "constraints.txt", "LICENSE"):  # fmt: skip
+    for name in (
+        "CMakeLists.txt",
+        "conf/exp/mini.yaml",
+        "gsbench/kernels/cpu/triangular.cpp",
+        "tests/smoke.py",
+        "gsbench/scenes/sample/suzanne/transforms_train.json",
+        "constraints.txt",
+        "LICENSE",
+    ):
         assert name in names
     assert not [name for name in names if re.match(r"results/|build/|\.venv/|dist/", name) or name.endswith(".so")]
     assert sdist.stat().st_size < 15 * MB

@@ -91,8 +91,11 @@ def test_make_installs_locks_and_nothing_else():
 def test_a_file_with_another_hash_is_refused(tmp_path):
     """Catches options of pip under which hashes are not looked at: the Makefile's own are tried on a small wheel."""
     wheel, lock = tmp_path / "trial-1-py3-none-any.whl", tmp_path / "lock.txt"
-    texts = {"METADATA": "Metadata-Version: 2.1\nName: trial\nVersion: 1\n", "RECORD": "",
-             "WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"}  # fmt: skip
+    texts = {
+        "METADATA": "Metadata-Version: 2.1\nName: trial\nVersion: 1\n",
+        "RECORD": "",
+        "WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
     with zipfile.ZipFile(wheel, "w") as archive:
         for name, text in texts.items():
             archive.writestr(f"trial-1.dist-info/{name}", text)
@@ -101,8 +104,12 @@ def test_a_file_with_another_hash_is_refused(tmp_path):
     right = hashlib.sha256(wheel.read_bytes()).hexdigest()
     for digest, message in (("0" * 64, "DO NOT MATCH THE HASHES"), (right, "")):
         lock.write_text(f"trial==1 --hash=sha256:{digest}\n")
-        done = subprocess.run([*pip, "--target", str(tmp_path / "out"), "--requirement", str(lock)],
-                              capture_output=True, text=True, check=False)  # fmt: skip
+        done = subprocess.run(
+            [*pip, "--target", str(tmp_path / "out"), "--requirement", str(lock)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert bool(done.returncode) == bool(message), done.stderr
         assert message in done.stderr
         assert (tmp_path / "out").exists() != bool(message)

@@ -114,8 +114,13 @@ def test_the_ssim_of_other_papers():
     a = 0.5 + 0.3 * np.sin(7 * x + 2 * y) * np.cos(5 * y)
     b = (a + 0.05 * np.sin(31 * x * y + 0.5)).clip(0, 1)
     values = of_other_papers(*(torch.from_numpy(image)[..., None].expand(-1, -1, 3) for image in (a, b)))
-    expected = {"ssim_padded": 0.94812566, "ssim_uniform": 0.93998970, "ssim_uniform_range2": 0.94841174,
-                "dssim1": 0.02593717, "dssim2": 0.02579413}  # fmt: skip
+    expected = {
+        "ssim_padded": 0.94812566,
+        "ssim_uniform": 0.93998970,
+        "ssim_uniform_range2": 0.94841174,
+        "dssim1": 0.02593717,
+        "dssim2": 0.02579413,
+    }
     assert {name: values[name] for name in expected} == pytest.approx(expected, abs=1e-8)
 
 

@@ -102,7 +102,10 @@ def test_mypy_reads_the_types(tmp_path):
     user.write_text("import gsbench\n\nreveal_type(gsbench.ssim)\ngsbench.rasterise\n")
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), str(user)],
-        capture_output=True, text=True, cwd=ROOT, env=environment(),
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment(),
+    )
     assert 'Revealed type is "def (a: ' in done.stdout, done.stdout
     assert 'Module has no attribute "rasterise"' in done.stdout, done.stdout

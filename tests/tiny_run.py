@@ -46,10 +46,10 @@ def write_moving_square(root: Path, name: str = "square") -> Path:
 def overrides(data: Path, results: Path, *more: str) -> list[str]:
     """The overrides of a run of 30 steps on that data set."""
     return [
-        "+exp=dnerf", f"data.root={data}", "data.scenes=[square]", "scene=custom", "scene.name=square",
-        "scene.downscale=1", "data.initial_points=40", "train.iterations=30", "train.batch_size=2",
-        "train.curve_points=2", f"results={results}", *more,
-    ]  # fmt: skip
+        *("+exp=dnerf", f"data.root={data}", "data.scenes=[square]", "data.initial_points=40"),
+        *("scene=custom", "scene.name=square", "scene.downscale=1"),
+        *("train.iterations=30", "train.batch_size=2", "train.curve_points=2", f"results={results}", *more),
+    ]
 
 
 def environment() -> dict[str, str]:

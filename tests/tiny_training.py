@@ -30,8 +30,8 @@ def compose(model: str, steps: int, *overrides: str) -> Config:
 @functools.cache
 def _composed(model: str, steps: int, *overrides: str) -> Config:
     register_schema()
-    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}",
-             "train.densify.every=25", *NARROW.get(model, []), *overrides]  # fmt: skip
+    names = ["+exp=mini", "scene=moving-matte", f"model={model}", f"train.iterations={steps}"]
+    names += ["train.densify.every=25", *NARROW.get(model, []), *overrides]
     if GlobalHydra.instance().is_initialized():
         composed = hydra.compose("config", names)
     else:

@@ -178,9 +178,13 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
     ],
 )
 def test_a_hostile_or_damaged_archive_is_refused(
-    archive: bytes, message: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    archive: bytes,
+    message: str,
+    address: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a file that is written beside the folder, and half a data set in it."""
     Handler.files["dnerf.zip"] = archive
     assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2

@@ -135,10 +135,12 @@ def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
     scene, K = rigged(still, 4, 3), torch.tensor([[57.6, 0.0, width / 2], [0.0, 57.6, height / 2], [0.0, 0.0, 1.0]])
     angle = 0.045 * 48 / 57.6 / math.sqrt(2)
     turned = [
-        replace(view, camera=replace(camera(azimuth + angle * moment, 0.2), K=K, width=width, height=height),
-                time=moment)
-        for azimuth in (0.0, 1.5, 3.0, 4.5) for view, moment in zip(scene.train, (0.0, 0.5, 1.0), strict=False)
-    ]  # fmt: skip
+        replace(
+            view, camera=replace(camera(azimuth + angle * moment, 0.2), K=K, width=width, height=height), time=moment
+        )
+        for azimuth in (0.0, 1.5, 3.0, 4.5)
+        for view, moment in zip(scene.train, (0.0, 0.5, 1.0), strict=False)
+    ]
     assert [len(place) for place in group_by_viewpoint(turned, scene.extent).held] == [3] * 4
 
 
@@ -150,8 +152,10 @@ def test_viewpoints_are_those_of_the_cameras() -> None:
     assert viewpoints.loose == list(range(60))
     scene = rigged(still, 4, 4)
     random = torch.Generator().manual_seed(0)
-    train = [replace(v, camera=replace(v.camera, viewmat=v.camera.viewmat + 1e-6 * torch.randn(4, 4, generator=random)))
-             for v in scene.train]  # fmt: skip
+    train = [
+        replace(v, camera=replace(v.camera, viewmat=v.camera.viewmat + 1e-6 * torch.randn(4, 4, generator=random)))
+        for v in scene.train
+    ]
     assert sorted(map(len, group_by_viewpoint(train, scene.extent).fixed)) == [4] * 4
     lens = torch.tensor([[1.1], [1.1], [1.0]])
     zoomed = [replace(v, camera=replace(v.camera, K=v.camera.K * lens)) if v.time > 0.5 else v for v in train]

@@ -172,9 +172,12 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
 
 @pytest.mark.parametrize(
     ("scores", "line"),
-    [([30.0, 20.0], "no simplification cost at most"), ([100.0, 100.0], "a PSNR of 100 dB on val cannot show a loss"),
-     ([math.nan], "a PSNR of nan dB on val cannot show a loss")],
-)  # fmt: skip
+    [
+        ([30.0, 20.0], "no simplification cost at most"),
+        ([100.0, 100.0], "a PSNR of 100 dB on val cannot show a loss"),
+        ([math.nan], "a PSNR of nan dB on val cannot show a loss"),
+    ],
+)
 def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
     scores: list[float], line: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -123,11 +123,13 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert answer["p"] == 0.001
     assert answer.keys() >= {"z", "free", "seconds", "reason"}
     for wrong, line in (
-        ([], "expected one of"), (["x", "--checkpoint", "y"], "expected one of"),
+        ([], "expected one of"),
+        (["x", "--checkpoint", "y"], "expected one of"),
         (["/nowhere"], "/nowhere"),
-        (["--checkpoint", "/nowhere"], "/nowhere"), (["x", "--budget-db", "nan"], "--budget-db"),
+        (["--checkpoint", "/nowhere"], "/nowhere"),
+        (["x", "--budget-db", "nan"], "--budget-db"),
         *((["x", "--seed", seed], "--seed") for seed in ("-1", str(2**63), "9" * 5000)),
-    ):  # fmt: skip
+    ):
         assert command.main(wrong) == 2
         error = capsys.readouterr().err
         assert line in error

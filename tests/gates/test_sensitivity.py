@@ -70,8 +70,10 @@ def test_prediction_against_brute_force(name: str) -> None:
 def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
     """Catches a simplification drawn behind or within its own opaque Gaussian, and so predicted too cheap."""
     random = torch.Generator().manual_seed(0)
-    points = Points(torch.cartesian_prod(torch.tensor([-0.9, 0, 0.9]), torch.tensor([-0.5, 0.5]), torch.zeros(1)),
-                    torch.rand(6, 3, generator=random))  # fmt: skip
+    points = Points(
+        torch.cartesian_prod(torch.tensor([-0.9, 0, 0.9]), torch.tensor([-0.5, 0.5]), torch.zeros(1)),
+        torch.rand(6, 3, generator=random),
+    )
     ratios = {}
     for name, logit in (("transparent", -2.0), ("opaque", 4.0)):
         model = build("7dgs_nodir", lambda_t=0.001)

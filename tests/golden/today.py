@@ -23,19 +23,13 @@ PUBLISHED = Path(__file__).resolve().parents[2] / "results" / "published"
 Numbers = dict[str, float]  # by "table/row/column"
 WORDS = {"yes": 1.0, "no": 0.0, "unknown": math.nan, "agrees": 1.0, "undecided": 0.0, "differs": -1.0}
 # The columns that name a row of a table; other texts than WORDS are free.
-NAMES = ("table", "dataset", "row", "experiment", "scene", "model", "method", "variant", "recipe", "source", "protocol",
-         "budget", "target", "effect", "pair", "quantity")  # fmt: skip
+NAMES = (
+    *("table", "dataset", "row", "experiment", "scene", "model", "method", "variant", "recipe", "source"),
+    *("protocol", "budget", "target", "effect", "pair", "quantity"),
+)
 SECTIONS = (
-    "experiment",
-    "budgets",
-    "frontier",
-    "quality",
-    "effects",
-    "on_demand",
-    "stages",
-    "pairs",
-    "curves",
-    "lengths",
+    *("experiment", "budgets", "frontier", "quality", "effects"),
+    *("on_demand", "stages", "pairs", "curves", "lengths"),
 )
 
 

@@ -27,23 +27,30 @@ NUMBERS: dict[str, Callable[[], today.Numbers]] = {
     "mini.against_itself": lambda: today.against("mini", (0, 1, 2), (0, 1, 2)),
     "mini.against_other_seeds": lambda: today.against("mini", (0,), (1, 2)),
     "frontier.against_shared_seeds": lambda: today.against("frontier", (0, 1), (1, 2)),
-}  # fmt: skip
-SHORT = ("train.iterations=60", "train.recipe_iterations=60", "train.densify.start=8", "train.densify.every=8",
-         "train.densify.stop=48", "train.densify.max_gaussians=200", "data.initial_points=100", "train.curve_points=6",
-         "train.sh_every=12")  # fmt: skip
+}
+SHORT = (
+    *("train.iterations=60", "train.recipe_iterations=60", "train.curve_points=6", "train.sh_every=12"),
+    *("train.densify.start=8", "train.densify.every=8", "train.densify.stop=48", "train.densify.max_gaussians=200"),
+    "data.initial_points=100",
+)
 # By the name of the golden. Together they have every part of a training that an option turns on.
 TRAININGS: dict[str, tuple[str, ...]] = {
-    "3dgs": ("model=3dgs", *SHORT, "train.densify.kind=mcmc", "train.penalties.opacity.weight=0.01",
-             "train.penalties.size={weight: 0.01, start: 10, stop: 50}", "train.lengths=2"),
-    "4dgs": ("+exp=mini", "scene=suzanne", "scene.downscale=5", "model=4dgs", *SHORT,
-             "train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1",
-             "train.coarse=[[2,20]]", "train.cooldown_from=50",
-             "raster.antialias=true", "optim=sparse_adam", "seed=3"),
+    "3dgs": (
+        *("model=3dgs", *SHORT, "train.densify.kind=mcmc", "train.lengths=2"),
+        *("train.penalties.opacity.weight=0.01", "train.penalties.size={weight: 0.01, start: 10, stop: 50}"),
+    ),
+    "4dgs": (
+        *("+exp=mini", "scene=suzanne", "scene.downscale=5", "model=4dgs", *SHORT, "optim=sparse_adam", "seed=3"),
+        *("train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1"),
+        *("train.coarse=[[2,20]]", "train.cooldown_from=50", "raster.antialias=true"),
+    ),
     "patience": ("model=4dgs", *SHORT, "train.patience=0.5"),  # ends with its best iteration
-    "7dgs": ("model=7dgs", "data.initial_lambda_t=0.05", "train.iterations=800", "train.densify.stop=17000",
-             "train.densify.every=50", "train.densify.max_gaussians=2000", "data.initial_points=100",
-             "train.average_from=25000", "effects.gate=both", "train.checkpoint_minutes=0.003"),
-}  # fmt: skip
+    "7dgs": (
+        *("model=7dgs", "data.initial_lambda_t=0.05", "data.initial_points=100", "train.iterations=800"),
+        *("train.densify.stop=17000", "train.densify.every=50", "train.densify.max_gaussians=2000"),
+        *("train.average_from=25000", "effects.gate=both", "train.checkpoint_minutes=0.003"),
+    ),
+}
 RESUMED = ("7dgs", 2)  # killed after so many checkpoints, again and again
 COMMANDS = (
     "+exp=mini scene=suzanne",
@@ -74,7 +81,7 @@ COMMANDS = (
     " train.densify.thin_to=0.5 train.ssim_weight=0.3 train.batch_size=3 train.curve_points=5 seed=1",
     "+exp=colmap scene=custom scene.name=garden data.root=/data/garden scene.val_every=8",
     "+exp=pbr data.root=/data scene=dust model=ndgs device=cuda:1 train.checkpoint_minutes=30 launch.at_once=2",
-)  # fmt: skip
+)
 
 
 def trainings(folder: Path) -> dict[str, Any]:
@@ -120,9 +127,12 @@ def differing(kept: today.Numbers, present: today.Numbers) -> list[str]:
     return [
         f"{key}: expected {number}, got {present.get(key)}"
         for key, number in kept.items()
-        if not (math.isnan(present.get(key, math.nan)) if math.isnan(number) else
-                math.isclose(number, present.get(key, math.nan), rel_tol=1e-9, abs_tol=1e-12))
-    ]  # fmt: skip
+        if not (
+            math.isnan(present.get(key, math.nan))
+            if math.isnan(number)
+            else math.isclose(number, present.get(key, math.nan), rel_tol=1e-9, abs_tol=1e-12)
+        )
+    ]
 
 
 def main(names: list[str]) -> None:

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-NUMBERS = (0, -1, 1, 0.5, 1e-300, 1e-30, 1e30, 1e39, 1e308, -1e308, 2**31, 2**63, 10**400,
-           float("nan"), float("inf"), -float("inf"))  # fmt: skip
+NUMBERS = (
+    *(0, -1, 1, 0.5, 1e-300, 1e-30, 1e30, 1e39, 1e308, -1e308),
+    *(2**31, 2**63, 10**400, float("nan"), float("inf"), -float("inf")),
+)
 TEXTS = ("", " ", "\0", "a\nb", "../..", "/etc/passwd", "\ud800", "\u202e", "ü", "nan", "x" * 5000, "-", ".", "~")
 OTHERS = (None, True, False, [], {}, [[]], {"": None}, [1, [2, [3, [4]]]], [0] * 5000)
 

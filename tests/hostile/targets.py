@@ -53,38 +53,37 @@ def targets() -> dict[str, Target]:
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=g)
 
+    def rows(**widths: int) -> dict[str, Tensor]:
+        return {name: rand(N, width) for name, width in widths.items()}
+
     scene = {key: x.float() if isinstance(x, Tensor) else x for key, x in (gaussians(g, N) | camera(20, 12)).items()}
     images = {"a": rand(12, 13, 3), "b": rand(12, 13, 3)}
     common = {"means": rand(N, 3), "opacities": rand(N)}
-    static = {"scales": rand(N, 3), "quats": rand(N, 4), "opacities": rand(N)}
-    rotated = {**common, "times": rand(N, 1), "scales": rand(N, 4), "left_quats": rand(N, 4),
-               "right_quats": rand(N, 4), "clock": torch.tensor(2.0), "time": torch.tensor(0.5),
-               "log_lambda_t": torch.tensor(0.1)}  # fmt: skip
-    triangular = {**common, "directions": rand(N, 3), "times": rand(N, 1), "log_diagonal": rand(N, 7),
-                  "shape": rand(N, 3), "motion": rand(N, 12), "coupling": rand(N, 6), "center": rand(3),
-                  "time": torch.tensor(0.5), "log_lambda_d": torch.tensor(0.1), "log_lambda_t": torch.tensor(0.1),
-                  "conditioned_first": True}  # fmt: skip
-    universal = {**common, "directions": rand(N, 3), "times": rand(N, 1), "scales": rand(N, 7), "skew": rand(N, 3),
-                 "lower": rand(N, 18), "betas": rand(N, 5), "center": rand(3), "time": torch.tensor(0.5)}  # fmt: skip
-    timed = {"times": rand(N, 1), "time": torch.tensor(0.5)}
-    free = {**common, **static, **timed, "durations": rand(N, 1), "velocities": rand(N, 3)}
-    coupled = {**common, **timed, "directions": rand(N, 3), "scales": rand(N, 3), "precision": rand(N, 7),
-               "coupling": rand(N, 12), "center": rand(3)}  # fmt: skip
-    direct = {**coupled, "quats": rand(N, 4), "shares": rand(N, 2)}
-    direct_beta = {**coupled, "skew": rand(N, 3), "betas": rand(N, 5)}
+    static = {**rows(scales=3, quats=4), "opacities": rand(N)}
+    rotated = common | rows(times=1, scales=4, left_quats=4, right_quats=4)
+    rotated |= {"clock": torch.tensor(2.0), "time": torch.tensor(0.5), "log_lambda_t": torch.tensor(0.1)}
+    triangular = common | rows(directions=3, times=1, log_diagonal=7, shape=3, motion=12, coupling=6)
+    triangular |= {"center": rand(3), "time": torch.tensor(0.5), "conditioned_first": True}
+    triangular |= {"log_lambda_d": torch.tensor(0.1), "log_lambda_t": torch.tensor(0.1)}
+    universal = common | rows(directions=3, times=1, scales=7, skew=3, lower=18, betas=5)
+    universal |= {"center": rand(3), "time": torch.tensor(0.5)}
+    timed = {**rows(times=1), "time": torch.tensor(0.5)}
+    free = common | static | timed | rows(durations=1, velocities=3)
+    coupled = common | timed | rows(directions=3, scales=3, precision=7, coupling=12) | {"center": rand(3)}
+    direct = coupled | rows(quats=4, shares=2)
+    direct_beta = coupled | rows(skew=3, betas=5)
     colors = {**common, "sh0": rand(N, 1, 3), "shN": rand(N, 15, 3), "center": rand(3), "degree": 3}
-    moved = {"a": rand(N, 3), "b": rand(N, 7), "weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN),
-             "weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}  # fmt: skip
+    moved = rows(a=3, b=7) | {"weight_in": rand(2 * HIDDEN, 5), "bias_in": rand(2 * HIDDEN)}
+    moved |= {"weight_out": rand(10, HIDDEN), "bias_out": rand(10), "units": rand(10) + 1, "gamma": rand(2)}
+    joint = {"mean": rand(N, 7), "factor": rand(N, 7, 7) + 2 * torch.eye(7), "query": rand(N, 4)}
+    joint["scheme"] = "square_root"
     model = {"agr": True, "agr_octaves": 4, "sh_degree": 2, "time": 0.5, "center": torch.tensor([0.0, 0.0, -4.0])}
     models = {name: Target(_model, {"name": name, **options, **model}, ("center",)) for name, options in MODELS.items()}
     return models | {
         "rasterize": Target(rasterize, {**scene, "background": rand(3), "backend": "cpu"}, ("Ks",)),
         "rasterize by auto": Target(rasterize, {**scene, "background": rand(3), "antialias": True}, ("Ks",)),
         "rasterize by reference": Target(rasterize, {**scene, "near": 0.1, "backend": "reference"}, ("Ks",)),
-        "slice_gaussians": Target(
-            slice_gaussians, {"mean": rand(N, 7), "factor": rand(N, 7, 7) + 2 * torch.eye(7), "query": rand(N, 4),
-                              "scheme": "square_root"}
-        ),
+        "slice_gaussians": Target(slice_gaussians, joint),
         "slice_static": Target(slice_static, static),
         "slice_rotated": Target(slice_rotated, rotated, ("clock", "time")),
         "slice_triangular": Target(slice_triangular, triangular, ("center", "time")),
@@ -93,8 +92,9 @@ def targets() -> dict[str, Target]:
         "slice_direct_beta": Target(slice_direct_beta, direct_beta, ("center", "time")),
         "slice_free_time": Target(slice_free_time, free, ("time",)),
         "show_colors": Target(show_colors, colors, ("center", "opacities")),
-        "l1_ssim": Target(l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2},
-                          ("target",)),
+        "l1_ssim": Target(
+            l1_ssim, {"image": rand(12, 13, 3), "target": rand(12, 13, 3), "ssim_weight": 0.2}, ("target",)
+        ),
         "refine": Target(_refine, moved, ("units", "gamma")),
         "psnr": Target(psnr, images, ("a", "b")),
         "psnr_channel_mean": Target(psnr_channel_mean, images, ("a", "b")),
@@ -103,7 +103,7 @@ def targets() -> dict[str, Target]:
         "evaluate": Target(_evaluate, {**images, "background": (0.0, 0.5, 1.0)}, ("a", "b")),
         "random_points": Target(_random_points, {"count": 5, "half_width": 1.3}),
         "nearest_distances": Target(nearest_distances, {"means": rand(N, 3), "k": 3}, ("means",)),
-    }  # fmt: skip
+    }
 
 
 @torch.enable_grad()

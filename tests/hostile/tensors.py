@@ -21,10 +21,9 @@ REPEATED: dict[str, Change] = {
     "one column for all, stride 0": lambda x: x[..., :1].expand(x.shape),
     "overlapping": lambda x: x.flatten()[: len(x)].as_strided(x.shape, (0,) * (x.dim() - 1) + (1,)),
 }
+KINDS = ("float16", "bfloat16", "float64", "int32", "int64", "uint8", "bool", "complex64", "float8_e4m3fn")
 OTHERS: dict[str, Change] = {
-    **{str(kind).removeprefix("torch."): lambda x, kind=kind: x.to(kind)
-       for kind in (torch.float16, torch.bfloat16, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool,
-                    torch.complex64, torch.float8_e4m3fn)},
+    **{kind: lambda x, kind=kind: x.to(getattr(torch, kind)) for kind in KINDS},
     "sparse": lambda x: x.to_sparse(),
     "mkldnn": lambda x: x.detach().to_mkldnn(),
     "quantised": lambda x: torch.quantize_per_tensor(x.detach(), 0.1, 0, torch.quint8),
@@ -42,9 +41,11 @@ OTHERS: dict[str, Change] = {
     "one dimension more": lambda x: x[None],
     "a scalar": lambda x: x.flatten()[0],
     "a billion rows": lambda x: x[:1].expand(10**9, *x.shape[1:]),
-    **{f"with {value}": lambda x, value=value: _with(x, value)
-       for value in (float("nan"), float("inf"), -1.0, 1e38, -1e38, 1e-45, 1e10)},
-}  # fmt: skip
+    **{
+        f"with {value}": lambda x, value=value: _with(x, value)
+        for value in (float("nan"), float("inf"), -1.0, 1e38, -1e38, 1e-45, 1e10)
+    },
+}
 
 
 def disturb_layout(r: random.Random, x: Tensor, repeat: bool) -> tuple[Tensor, str]:

@@ -64,10 +64,12 @@ def replaced(state: Any, path: tuple[Any, ...], change: Callable[[Any], Any]) ->
 
 
 HARMS: list[Callable[[torch.Tensor], Any]] = [
-    lambda x: x[:-1] if x.dim() else x[None], lambda x: x.to(torch.float16), lambda x: x.double(), lambda x: x[None],
-    lambda x: x.new_zeros(0), lambda x: x.to_sparse(), lambda x: x.to("meta"), lambda x: x.flatten()[: x.numel() // 2],
-    lambda x: torch.zeros(1).expand((*x.shape[:1], 7) if x.dim() else (3,)), lambda _: "text", lambda _: None,
-]  # fmt: skip
+    lambda x: x[:-1] if x.dim() else x[None],
+    *(lambda x: x.to(torch.float16), lambda x: x.double(), lambda x: x[None], lambda x: x.new_zeros(0)),
+    *(lambda x: x.to_sparse(), lambda x: x.to("meta"), lambda x: x.flatten()[: x.numel() // 2]),
+    lambda x: torch.zeros(1).expand((*x.shape[:1], 7) if x.dim() else (3,)),
+    *(lambda _: "text", lambda _: None),
+]
 
 
 def harm(draw: random.Random, value: Any) -> Any:
@@ -210,17 +212,26 @@ VALUES = (None, -1, 0, 10**30, 1e300, "", "text", "../..", "${oc.env:HOME}", "${
 
 
 WRONG: list[tuple[str, tuple[Any, ...], Any]] = [  # part of a checkpoint, where in it, a value that is refused
-    ("config", ("train", "recipe_iterations"), 0), ("config", (), {}),
-    ("config", ("seed",), "x"), ("config", ("train",), 3), ("config", ("model", "name"), "nosuch"),
-    ("scene", (), {}), ("scene", ("extent",), "x"), ("scene", ("up",), [0.0, 0.0, 0.0]),
-]  # fmt: skip
+    ("config", ("train", "recipe_iterations"), 0),
+    ("config", (), {}),
+    ("config", ("seed",), "x"),
+    ("config", ("train",), 3),
+    ("config", ("model", "name"), "nosuch"),
+    ("scene", (), {}),
+    ("scene", ("extent",), "x"),
+    ("scene", ("up",), [0.0, 0.0, 0.0]),
+]
 
 
 def test_any_value_in_a_config_or_a_scene_is_one_line(folder: Path) -> None:
     """Catches a division by recipe_iterations=0, and every other value that no run of gsbench has written."""
     whole, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
-    cases = [(part, path, draw.choice(VALUES)) for part in ("config", "scene")
-             for path in leaves(getattr(whole, part)) if path]  # fmt: skip
+    cases = [
+        (part, path, draw.choice(VALUES))
+        for part in ("config", "scene")
+        for path in leaves(getattr(whole, part))
+        if path
+    ]
     refused = {}
     for part, path, value in [*WRONG, *draw.sample(cases, SAMPLE)]:
         state = replaced(getattr(whole, part), path, lambda _, value=value: value)

@@ -46,9 +46,8 @@ from gsbench.measure import record
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(
-    words: list[str], status: int, message: str, square: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    words: list[str], status: int, message: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Catches a stack trace of gsbench's or of Hydra's, one exit status for bad input and for failed runs, and a fault
     that costs a whole training before it is noticed."""
     assert main_here(*overrides(square, tmp_path, "model=3dgs"), *words) == status

@@ -32,9 +32,11 @@ from gsbench.run.identity import identify
 from gsbench.train import checkpoint
 
 SAMPLE, ALL = 30, 700
-NUMBERS = ("0", "1", "-1", "2", "0.5", "1e-3", "1e39", "-1e-9", "nan", "inf", "-inf", "1.5", "9223372036854775807",
-           "9223372036854775808", "1e400", "100000", "true", "null", "abc", "''", "[]", "{a: 1}", "no", "'\\0'",
-           "../..", "pkg://nosuch", "/dev/zero", "/proc/self/mem", "cuda:7", "cpu:5", "é")  # fmt: skip
+NUMBERS = (
+    *("0", "1", "-1", "2", "0.5", "1e-3", "1e39", "-1e-9", "nan", "inf", "-inf", "1.5"),
+    *("9223372036854775807", "9223372036854775808", "1e400", "100000", "true", "null", "abc", "''", "[]", "{a: 1}"),
+    *("no", "'\\0'", "../..", "pkg://nosuch", "/dev/zero", "/proc/self/mem", "cuda:7", "cpu:5", "é"),
+)
 LONG = ("train.iterations", "train.recipe_iterations", "data.initial_points", "protocol.renders")  # many are slow
 SECONDS = 60
 
@@ -55,8 +57,11 @@ def keys() -> list[str]:
     composed = hydra.compose("config", ["+exp=mini", "scene=suzanne", "model=7dgs"])
     plain = OmegaConf.to_container(composed)
     assert isinstance(plain, dict)
-    return [*(key for key, _ in flat(plain) if key != "results"), "+foo", "+train.foo", "+model.options.foo",
-            "+model.lr.means.foo", "~data.root", "~model.lr.motion", "model", "scene", "train", "protocol"]  # fmt: skip
+    return [
+        *(key for key, _ in flat(plain) if key != "results"),
+        *("+foo", "+train.foo", "+model.options.foo", "+model.lr.means.foo", "~data.root", "~model.lr.motion"),
+        *("model", "scene", "train", "protocol"),
+    ]
 
 
 def case(seed: int, known: list[str]) -> list[str]:

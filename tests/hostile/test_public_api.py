@@ -25,8 +25,11 @@ from gsbench.errors import InputError
 from gsbench.models import CameraTime
 from gsbench.raster import RasterOutput, rasterize
 
-NUMBERS = (0, 1, -1, 2, 17, 2**31, 2**63, 10**30, 0.0, 0.5, 1e-30, 1e30, float("nan"), float("inf"), True, False, None,
-           "", "x", "no", "paper", "cpu", "reference", "schur", [], (0.0, 0.0, 0.0), torch.tensor(1.0))  # fmt: skip
+NUMBERS = (
+    *(0, 1, -1, 2, 17, 2**31, 2**63, 10**30),
+    *(0.0, 0.5, 1e-30, 1e30, float("nan"), float("inf")),
+    *(True, False, None, "", "x", "no", "paper", "cpu", "reference", "schur", [], (0.0, 0.0, 0.0), torch.tensor(1.0)),
+)
 UNIQUE = ("viewmats", "Ks", "factor", "factors")  # repeated rows would be no rotation, or singular
 LIMIT_S = 30  # of a case; the first gradient of a process takes 8, while torch imports what it needs for it
 MEMORY = 8 << 30  # bytes of address space beyond those that torch takes

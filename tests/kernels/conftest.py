@@ -70,15 +70,16 @@ def shim() -> ModuleType:
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or ROOT / "build/shim" / str(sys.implementation.cache_tag))
-    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", "-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG",
-               f"-DPython_EXECUTABLE={sys.executable}",
-               f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]  # fmt: skip
+    options = ["-G", "Ninja", "-DCUDA=shim", "-DCMAKE_BUILD_TYPE=Release", "-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG"]
+    options += [f"-DPython_EXECUTABLE={sys.executable}", f"-DGSB_SANITIZE={os.environ.get('GSBENCH_SANITIZE', '')}"]
     plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}  # a sanitizer's is not cmake's
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # another process of these tests waits until it is built
-        for command in (["cmake", "-S", str(ROOT), "-B", str(folder), *options],
-                        ["cmake", "--build", str(folder), "--target", "_cuda"]):  # fmt: skip
+        for command in (
+            ["cmake", "-S", str(ROOT), "-B", str(folder), *options],
+            ["cmake", "--build", str(folder), "--target", "_cuda"],
+        ):
             done = subprocess.run(command, capture_output=True, text=True, env=plain)
             assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     spec = importlib.util.spec_from_file_location("_cuda", next(folder.glob("_cuda.*.so")))

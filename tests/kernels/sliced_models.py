@@ -16,15 +16,24 @@ from gsbench.scenes.scene import Points
 Raw = dict[str, Tensor]
 CENTER, TIME = torch.tensor([0.3, -0.2, -3.0]), torch.tensor(0.4)
 OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {  # the options of each model that change its kernel
-    "7dgs": ({}, {"factor_order": "paper"}, {"off_diagonal": "raw"}, {"off_diagonal": "row_scaled"},
-             {"factor_order": "paper", "off_diagonal": "raw"}, {"scheme": "cholesky"},
-             {"scheme": "cholesky", "factor_order": "paper"}),
-    "6dgs": ({}, {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False},
-             {"scheme": "cholesky", "off_diagonal": "row_scaled"}),
+    "7dgs": (
+        {},
+        {"factor_order": "paper"},
+        {"off_diagonal": "raw"},
+        {"off_diagonal": "row_scaled"},
+        {"factor_order": "paper", "off_diagonal": "raw"},
+        {"scheme": "cholesky"},
+        {"scheme": "cholesky", "factor_order": "paper"},
+    ),
+    "6dgs": (
+        {},
+        {"factor_order": "paper", "off_diagonal": "row_scaled", "directional_half": False},
+        {"scheme": "cholesky", "off_diagonal": "row_scaled"},
+    ),
     "7dgs_nodir": ({}, {"factor_order": "paper"}, {"off_diagonal": "row_scaled"}, {"scheme": "cholesky"}),
-    **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static", "freetime", "freetime_plus",
-                     "sharptime", "stg"), ({},)),
-}  # fmt: skip
+    **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static"), ({},)),
+    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ({},)),
+}
 CASES = [(name, options) for name, every in OPTIONS.items() for options in every]
 SPREADS = {"betas": 0.7, "coupling": 0.5, "velocities": 0.5, "skew": 0.3, "directions": 0.7, "opacities": 2.0}
 
@@ -44,8 +53,12 @@ def sliced_model(name: str, options: dict[str, Any], dtype: torch.dtype, times: 
 
 
 def _lambdas(name: str) -> dict[str, float]:
-    return {"7dgs": {"lambda_d": 0.3, "lambda_t": 0.5}, "6dgs": {"lambda_d": 0.3}, "7dgs_nodir": {"lambda_t": 0.5},
-            "4dgs": {"lambda_t": 0.7}}.get(name, {})  # fmt: skip
+    return {
+        "7dgs": {"lambda_d": 0.3, "lambda_t": 0.5},
+        "6dgs": {"lambda_d": 0.3},
+        "7dgs_nodir": {"lambda_t": 0.5},
+        "4dgs": {"lambda_t": 0.7},
+    }.get(name, {})
 
 
 def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
@@ -59,8 +72,11 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
     N, k = 45, {"7dgs": 4, "6dgs": 3, "7dgs_nodir": 1, "ubs": 4, "ubs_static": 3}.get(name, 0)
     raw = {"means": normal(N, 3), "opacities": normal(N, size=2)}
     if isinstance(model, CholeskyModel):
-        raw |= {"log_diagonal": normal(N, k + 3, size=0.3, mean=-0.5), "shape": normal(N, 3, size=0.5),
-                "motion": normal(N, 3 * k, size=0.5)}  # fmt: skip
+        raw |= {
+            "log_diagonal": normal(N, k + 3, size=0.3, mean=-0.5),
+            "shape": normal(N, 3, size=0.5),
+            "motion": normal(N, 3 * k, size=0.5),
+        }
         if name != "7dgs_nodir":
             raw |= {"directions": normal(N, 3), "coupling": normal(N, k * (k - 1) // 2, size=0.5)}
         if options.get("scheme") != "cholesky":  # which keeps no digits of these
@@ -73,8 +89,13 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
         raw |= {"scales": normal(N, 3, size=0.5, mean=-1), "quats": normal(N, 4)}
         raw["scales"][3:5, 0] = torch.tensor([17.0, -17.0])  # beyond where sizes stop
     else:
-        raw |= {"directions": normal(N, 3), "scales": normal(N, 3 + k, mean=-1), "skew": normal(N, 3, size=0.5),
-                "lower": normal(N, 3 * k + k * (k - 1) // 2, size=0.5), "betas": normal(N, 1 + k, mean=-1)}  # fmt: skip
+        raw |= {
+            "directions": normal(N, 3),
+            "scales": normal(N, 3 + k, mean=-1),
+            "skew": normal(N, 3, size=0.5),
+            "lower": normal(N, 3 * k + k * (k - 1) // 2, size=0.5),
+            "betas": normal(N, 1 + k, mean=-1),
+        }
         raw["betas"][:3] = 0.0  # the root of I - B is zero
         raw["betas"][3:5] = torch.tensor([17.0, -17.0])[:, None]  # beyond where exponents stop
         raw["scales"][5:7, 0] = torch.tensor([-7.0, -17.0])  # a size that 1 + e^x would round; one that stops

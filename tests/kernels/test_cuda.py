@@ -69,6 +69,11 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
         message = re.fullmatch("(.+) need [0-9.]+ MiB on .+: lower the image's size.+", str(error.value))
         assert message, str(error.value)
         buffers.add(message[1])
-    assert buffers >= {"projected Gaussians", "lists of each tile's Gaussians", "images", "gradients",
-                       "scratch space of gradients"}  # fmt: skip
+    assert buffers >= {
+        "projected Gaussians",
+        "lists of each tile's Gaussians",
+        "images",
+        "gradients",
+        "scratch space of gradients",
+    }
     assert_gradients_close(run(refused=0), expected)

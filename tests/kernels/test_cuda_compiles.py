@@ -18,8 +18,8 @@ LOCAL_MEMORY = {"colors.cu": 152, "triangular.cu": 392, "blend_backward_by_splat
 def test_compiles_without_a_warning(source: Path, tmp_path: Path) -> None:
     """Catches host code called on the device, a missing __device__, what a shim would let pass; arrays that are indexed
     at run time and so leave the registers, and registers that run out: both slow a kernel down and change no result."""
-    command = ["nvcc", "-std=c++20", "-arch=sm_90", "--ftz=true", "--cubin", "-Xptxas", "-v", "-Werror", "all-warnings",
-               "-Xcompiler", "-Wno-unknown-pragmas", str(source), "-o", str(tmp_path / "out.cubin")]  # fmt: skip
+    command = ["nvcc", "-std=c++20", "-arch=sm_90", "--ftz=true", "--cubin", "-Xptxas", "-v", "-Werror", "all-warnings"]
+    command += ["-Xcompiler", "-Wno-unknown-pragmas", str(source), "-o", str(tmp_path / "out.cubin")]
     done = subprocess.run(command, capture_output=True, text=True)
     printed = done.stdout + done.stderr
     assert done.returncode == 0, printed[-4000:]

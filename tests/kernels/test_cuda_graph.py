@@ -119,10 +119,18 @@ def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
     with torch.no_grad():
         means, factors, opacities, colors, _ = fitted.slice(CameraTime.at(at.center, 0.4))
         image, needed = draw_within(
-            RasterInputs(means[:N], factors[:N], opacities[:N], colors[None, :N], at.viewmat[None], at.K[None],
-                         torch.tensor(BACKGROUND, device=device)),
-            Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False), room,
-        )  # fmt: skip
+            RasterInputs(
+                means[:N],
+                factors[:N],
+                opacities[:N],
+                colors[None, :N],
+                at.viewmat[None],
+                at.K[None],
+                torch.tensor(BACKGROUND, device=device),
+            ),
+            Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False),
+            room,
+        )
     assert needed.tolist()[-1] == 0
     assert image.isfinite().all()
     if N:

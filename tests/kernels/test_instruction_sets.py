@@ -38,7 +38,7 @@ def calls() -> dict[str, Callable[[], object]]:
             rasterize(*splats, viewmats, Ks, 200, 200, beta_exponents=b).image.sum().backward()
         ),
         "loss": lambda: l1_ssim(image, target, 0.2).backward(),
-    }  # fmt: skip
+    }
 
 
 def milliseconds(call: Callable[[], object]) -> float:

@@ -11,8 +11,10 @@ from gsbench.train.losses import photometric
 
 # Rows are filtered four at a time from fourteen: every height about those numbers, and widths about whole vectors. More
 # than 448 columns are done in blocks; a GPU's tiles are of 16 x 16.
-SIZES = [(1, 1), (3, 40), (4, 5), (5, 16), (6, 1), (11, 1), (12, 21), (13, 5), (14, 32), (15, 6), (16, 16), (17, 33),
-         (18, 11), (19, 1), (20, 7), (21, 7), (37, 50), (48, 16), (90, 61), (17, 449), (13, 1000)]  # fmt: skip
+SIZES = [
+    *((1, 1), (3, 40), (4, 5), (5, 16), (6, 1), (11, 1), (12, 21), (13, 5), (14, 32), (15, 6), (16, 16)),
+    *((17, 33), (18, 11), (19, 1), (20, 7), (21, 7), (37, 50), (48, 16), (90, 61), (17, 449), (13, 1000)),
+]
 
 
 def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -75,8 +77,11 @@ def test_bytes_have_the_bits_of_floats(height: int, width: int, place: Place) ->
 def test_errors() -> None:
     """Catches pictures of different size or type that would be read past their end."""
     a, b = pictures(8, 8)
-    for first, second, message in ((a, b[1:], "of one size"), (a.double(), b.double(), "float32"),
-                                   (a, b.to(torch.int8), "target: expected float32 or uint8, got int8"),
-                                   (a, b.clone().requires_grad_(), "no gradient by target")):  # fmt: skip
+    for first, second, message in (
+        (a, b[1:], "of one size"),
+        (a.double(), b.double(), "float32"),
+        (a, b.to(torch.int8), "target: expected float32 or uint8, got int8"),
+        (a, b.clone().requires_grad_(), "no gradient by target"),
+    ):
         with pytest.raises(InputError, match=message):
             l1_ssim(first, second, 0.2)

@@ -44,16 +44,18 @@ def decided(name: str) -> Tensor:
 
 def differentiate(arguments: Arguments, backend: str, where: Tensor) -> tuple[RasterOutput, dict[str, Tensor]]:
     """A picture, and the gradients of a random sum over some of its pixels, in float64 on the CPU."""
-    inputs = {k: v.clone().requires_grad_(k in DIFFERENTIABLE) if isinstance(v, Tensor) else v
-              for k, v in arguments.items()}  # fmt: skip
+    inputs = {
+        k: v.clone().requires_grad_(k in DIFFERENTIABLE) if isinstance(v, Tensor) else v for k, v in arguments.items()
+    }
     output = rasterize(**inputs, backend=backend)
     output.info.means2d.retain_grad()
     g = torch.Generator().manual_seed(1)
     weights = [torch.randn(x.shape, generator=g) * where[..., None] for x in (output.image, output.alpha)]
     sum((x * w.to(x)).sum() for x, w in zip((output.image, output.alpha), weights, strict=True)).backward()
     leaves = {k: inputs[k] for k in DIFFERENTIABLE if k in inputs} | {"means2d": output.info.means2d}
-    return output, {k: torch.zeros_like(x).cpu().double() if x.grad is None else x.grad.cpu().double()
-                    for k, x in leaves.items()}  # fmt: skip
+    return output, {
+        k: torch.zeros_like(x).cpu().double() if x.grad is None else x.grad.cpu().double() for k, x in leaves.items()
+    }
 
 
 @cache
@@ -135,8 +137,9 @@ def test_same_bits_for_any_number_of_threads(name: str) -> None:
     arguments = with_background(name)
     if name == "random":  # several tiles and several tasks of every loop
         g = torch.Generator().manual_seed(0)
-        arguments = cast(gaussians(g, 3000, size=0.05) | camera(150, 100) | {"background": torch.ones(3)},
-                         torch.float32)  # fmt: skip
+        arguments = cast(
+            gaussians(g, 3000, size=0.05) | camera(150, 100) | {"background": torch.ones(3)}, torch.float32
+        )
     results = []
     for number in (1, 2, 5):
         torch.set_num_threads(number)
@@ -159,15 +162,20 @@ def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
-    [("means", torch.nan, "means: expected finite"), ("factors", torch.inf, "factors: expected finite"),
-     ("opacities", 1.5, "opacities: expected values in"), ("colors", -torch.inf, "colors: expected finite"),
-     ("viewmats", torch.nan, "viewmats: expected finite"), ("Ks", 0.0, "Ks: expected positive"),
-     ("background", torch.nan, "background: expected finite"),
-     ("beta_exponents", 0.0, "beta_exponents: expected exponents above 0"),
-     ("beta_exponents", -1.0, "beta_exponents: expected exponents above 0"),
-     ("beta_exponents", torch.inf, "beta_exponents: expected finite"),
-     ("beta_exponents", torch.nan, "beta_exponents: expected finite")],
-)  # fmt: skip
+    [
+        ("means", torch.nan, "means: expected finite"),
+        ("factors", torch.inf, "factors: expected finite"),
+        ("opacities", 1.5, "opacities: expected values in"),
+        ("colors", -torch.inf, "colors: expected finite"),
+        ("viewmats", torch.nan, "viewmats: expected finite"),
+        ("Ks", 0.0, "Ks: expected positive"),
+        ("background", torch.nan, "background: expected finite"),
+        ("beta_exponents", 0.0, "beta_exponents: expected exponents above 0"),
+        ("beta_exponents", -1.0, "beta_exponents: expected exponents above 0"),
+        ("beta_exponents", torch.inf, "beta_exponents: expected finite"),
+        ("beta_exponents", torch.nan, "beta_exponents: expected finite"),
+    ],
+)
 def test_bad_values_are_named(name: str, value: float, message: str, place: Place) -> None:
     """Catches a value that shows late, as a picture of NaN: on a GPU the check does not wait for the device."""
     arguments = with_background("beta_of_three_cameras", device=place.device)
@@ -202,9 +210,19 @@ def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
     for backend in ("cpu", "reference"):
         factor = torch.diag(torch.tensor([1.0, 1, 0]))[None].requires_grad_()
         exponents = torch.tensor([0.2], requires_grad=True)
-        out = rasterize(torch.tensor([[0.0, 0, 1]]), factor, torch.ones(1), torch.ones(1, 1),
-                        torch.eye(4).repeat(4, 1, 1), Ks, 1, 1, eps2d=0.0, beta_exponents=exponents,
-                        backend=backend)  # fmt: skip
+        out = rasterize(
+            torch.tensor([[0.0, 0, 1]]),
+            factor,
+            torch.ones(1),
+            torch.ones(1, 1),
+            torch.eye(4).repeat(4, 1, 1),
+            Ks,
+            1,
+            1,
+            eps2d=0.0,
+            beta_exponents=exponents,
+            backend=backend,
+        )
         slopes = [torch.autograd.grad(x, (factor, exponents), retain_graph=True) for x in out.alpha.flatten()]
         gradients.append((out.alpha.detach().flatten(), *map(torch.stack, zip(*slopes, strict=True))))
     for got, want in zip(*gradients, strict=True):

@@ -48,8 +48,10 @@ def test_refinement(N: int, widths: list[int], place: Place) -> None:
     for a, b in zip(actual, expected, strict=True):
         assert (a.cpu() - b).norm() <= 1e-5 * b.norm(), "digits are lost"
     few = N <= 300  # of many rows one is where rounding switches a ReLU, and has another gradient
-    assert_same(gradients(actual, [*inputs * few, *single.parameters()]),
-                gradients(expected, [*values * few, *exact.parameters()]))  # fmt: skip
+    assert_same(
+        gradients(actual, [*inputs * few, *single.parameters()]),
+        gradients(expected, [*values * few, *exact.parameters()]),
+    )
 
 
 def intervals_around(time: Tensor, count: int) -> tuple[Tensor, Tensor]:

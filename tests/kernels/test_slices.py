@@ -14,9 +14,12 @@ from gsbench.models.effect_sets import EffectSets
 
 SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of 45 rows 0, 1, 22, 44 and all
 WITHOUT_KERNEL: list[tuple[str, dict[str, Any]]] = [
-    ("7dgs", {"scheme": "schur"}), ("4dgs", {"scheme": "schur"}), ("ubs", {"modulation": "raw"}),
-    ("dgs", {"coupling": "none"}), ("dgs", {"coupling": "interpolated"}),
-]  # fmt: skip
+    ("7dgs", {"scheme": "schur"}),
+    ("4dgs", {"scheme": "schur"}),
+    ("ubs", {"modulation": "raw"}),
+    ("dgs", {"coupling": "none"}),
+    ("dgs", {"coupling": "interpolated"}),
+]
 CONDITIONED = [(name, options) for name, options in CASES if name not in ("3dgs", "ubs", "ubs_static")]
 
 
@@ -33,8 +36,10 @@ def test_slice(name: str, options: dict[str, Any], place: Place) -> None:
         return
     actual = slice_of(model, single)
     assert_same(actual, expected)
-    assert_same(gradients(actual, [*single.values(), *model.log_lambda.parameters()]),
-                gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]))  # fmt: skip
+    assert_same(
+        gradients(actual, [*single.values(), *model.log_lambda.parameters()]),
+        gradients(expected, [*raw.values(), *exact.log_lambda.parameters()]),
+    )
 
 
 @pytest.mark.parametrize(("name", "options"), CONDITIONED)
@@ -113,10 +118,10 @@ def test_arguments_are_taken_by_name() -> None:
 
 def test_arguments_that_do_not_fit_are_refused() -> None:
     """Catches a slice of nothing, and a prefix longer than the arrays, which a kernel would read past their end."""
+    rows, none, by_default = torch.ones(2, 3), torch.ones(2, 0), (None, None, None)
+    shape = (rows, rows, none, none, torch.ones(2), torch.zeros(3))
     with pytest.raises(InputError, match="expected directions, times or both, got neither"):
-        slice_triangular(torch.ones(2, 3), None, None, torch.ones(2, 3), torch.ones(2, 3), torch.ones(2, 0),
-                         torch.ones(2, 0), torch.ones(2), torch.zeros(3), None, None, None,
-                         conditioned_first=True)  # fmt: skip
+        slice_triangular(rows, None, None, *shape, *by_default, conditioned_first=True)
     model, raw = sliced_model("7dgs", {}, torch.float32)
     for count in (46, -1):
         model.effect_sets = EffectSets(0, count, None)

@@ -75,9 +75,18 @@ def test_a_tape_runs_backwards_for_several_vectors() -> None:
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize(
     ("name", "agr", "classed"),
-    [("3dgs", False, False), ("4dgs", False, False), ("6dgs", False, False), ("7dgs", False, False),
-     ("7dgs", True, False), ("4dgs", True, False), ("7dgs", True, True), ("4dgs", True, True), ("3dgs", True, True)],
-)  # fmt: skip
+    [
+        ("3dgs", False, False),
+        ("4dgs", False, False),
+        ("6dgs", False, False),
+        ("7dgs", False, False),
+        ("7dgs", True, False),
+        ("4dgs", True, False),
+        ("7dgs", True, True),
+        ("4dgs", True, True),
+        ("3dgs", True, True),
+    ],
+)
 def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) -> None:
     """Catches an operation left out of the chain, a gradient given twice, or to another tensor."""
     fitting, batch = fitted(name, agr=agr, classed=classed), views(3)
@@ -100,8 +109,10 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) 
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize(("name", "agr", "classed"), [("7dgs", True, False), ("4dgs", False, False),
-                                                      ("7dgs", True, True), ("4dgs", True, True)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "agr", "classed"),
+    [("7dgs", True, False), ("4dgs", False, False), ("7dgs", True, True), ("4dgs", True, True)],
+)
 def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, classed: bool, place: Place) -> None:
     """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
     blending, projection, colours and slices to the parameters, or in the sum over views."""
@@ -214,8 +225,10 @@ def test_what_is_added_does_not_depend_on_what_is_there() -> None:
 
     def gradient(sums: dict[int, Tensor]) -> Tensor:
         with Tape() as tape:
-            shown = [show_colors(sh0, shN, place, faded, center=torch.zeros(3), degree=3)[0]
-                     for place in (means, 3 * means + 1)]  # fmt: skip
+            shown = [
+                show_colors(sh0, shN, place, faded, center=torch.zeros(3), degree=3)[0]
+                for place in (means, 3 * means + 1)
+            ]
             value = (shown[0] * shown[1].square()).sum()
         tape.backward(value, torch.ones(()), [sh0, shN], sums)
         return sums[id(sh0)]

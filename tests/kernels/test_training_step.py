@@ -11,8 +11,13 @@ from gsbench.kernels.library import CudaLibrary
 from gsbench.train.divergence import LOOK_EVERY
 
 _aten = torch.ops.aten
-WITHOUT_LAUNCH = {_aten.empty.memory_format, _aten.empty_strided.default, _aten.empty_like.default,
-                  _aten.new_empty.default, _aten.detach.default}  # fmt: skip
+WITHOUT_LAUNCH = {
+    _aten.empty.memory_format,
+    _aten.empty_strided.default,
+    _aten.empty_like.default,
+    _aten.new_empty.default,
+    _aten.detach.default,
+}
 
 
 class Calls(TorchDispatchMode):

@@ -35,13 +35,22 @@ def overrides(model: str, scene: str, seed: int) -> list[str]:
 def record(model: str, scene: str, seed: int) -> dict[str, Any]:
     """A record of a run that ended well, in plain JSON."""
     psnr, golden = 28 + (seed * 37 + len(model) * 11 + len(scene)) % 100 / 100, make()
-    return asdict(replace(
-        golden, experiment="crowd", model=model, scene=scene, dataset="crowd", seed=seed,
-        overrides=overrides(model, scene, seed), metrics=dict.fromkeys(METRICS, 0.5) | {"psnr": psnr}, missing={},
-        provenance=replace(golden.provenance, config={"seed": seed, "all": asdict(Config())}),
-        per_view=[ViewScore(f"r_{i}", psnr + i / 10, 28.0, 0.9, 0.1) for i in range(20)],
-        curve=[Point(1500 * (i + 1), 30.0 * i, 20 + i / 3) for i in range(20)],
-    ))  # fmt: skip
+    return asdict(
+        replace(
+            golden,
+            experiment="crowd",
+            model=model,
+            scene=scene,
+            dataset="crowd",
+            seed=seed,
+            overrides=overrides(model, scene, seed),
+            metrics=dict.fromkeys(METRICS, 0.5) | {"psnr": psnr},
+            missing={},
+            provenance=replace(golden.provenance, config={"seed": seed, "all": asdict(Config())}),
+            per_view=[ViewScore(f"r_{i}", psnr + i / 10, 28.0, 0.9, 0.1) for i in range(20)],
+            curve=[Point(1500 * (i + 1), 30.0 * i, 20 + i / 3) for i in range(20)],
+        )
+    )
 
 
 def write(count: int, results: Path) -> Path:

@@ -48,10 +48,12 @@ def hydra() -> Iterator[None]:
         ("+exp=mini scene=suzanne", None),
         ("+exp=mini scene=suzanne +launch=local", None),
         ("+exp=mini scene=dust +launch=slurm", ["+exp=mini scene=dust +launch=slurm"]),
-        ("+exp=ablation scene=dust +ablation=none,schur", ["+ablation=none +exp=ablation scene=dust",
-                                                           "+ablation=schur +exp=ablation scene=dust"]),
+        (
+            "+exp=ablation scene=dust +ablation=none,schur",
+            ["+ablation=none +exp=ablation scene=dust", "+ablation=schur +exp=ablation scene=dust"],
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
     """Catches scenes that one job does one after the other, axes in another order, a run for Slurm that trains on the
     login node, axes of an experiment that a command line cannot replace, and a plan for a run that is of no sweep."""
@@ -68,10 +70,20 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
         ("+exp=mini --multi", "--multi: expected -m"),
         ("+exp=mini data.scenes=[new] scene=newer", "scene 'newer' is not known"),
-        *((f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d") for word in (
-            "at_once=-2", "minutes=0", "cpus=0", "gpus=-1", "requeues=-1", "signal_seconds=0", "signal_seconds=65536")),
+        *(
+            (f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d")
+            for word in (
+                "at_once=-2",
+                "minutes=0",
+                "cpus=0",
+                "gpus=-1",
+                "requeues=-1",
+                "signal_seconds=0",
+                "signal_seconds=65536",
+            )
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
     """Catches a sweep of no run that ends well, options of Hydra that would be dropped in silence, a scene that is no
     scene, and a job that is submitted and fails, or is never requeued, for a number out of its range."""

@@ -96,10 +96,14 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.Monk
     """Catches a sweep that ends badly because of a run of another sweep in the same folder of results."""
     words = ["+exp=mini", "scene=suzanne", "model=3dgs", f"results={tmp_path}"]
     ends = {"0": Ended(reason="step 0: nan"), "1": Ended("mini/record.json")}
-    monkeypatch.setattr(launcher, "do_planned", lambda config, folder, number: plan.write_ended(
-        folder, number, ends[str(config.config.seed)]))  # fmt: skip
-    monkeypatch.setattr(status, "_kept", lambda _, run: run and run.ended.record and RecordStatus(
-        tmp_path, "ok", None, 20.0, 0.0))  # fmt: skip
+    monkeypatch.setattr(
+        launcher,
+        "do_planned",
+        lambda config, folder, number: plan.write_ended(folder, number, ends[str(config.config.seed)]),
+    )
+    monkeypatch.setattr(
+        status, "_kept", lambda _, run: run and run.ended.record and RecordStatus(tmp_path, "ok", None, 20.0, 0.0)
+    )
     with hydra_with(None):
         outcomes = [launcher.launch([compose_run([*words, f"seed={seed}"])], None) for seed in ends]
     assert [[run.reason for run in outcome.broken] for outcome in outcomes] == [["step 0: nan"], []]

@@ -19,8 +19,12 @@ from gsbench.train import checkpoint
 
 def words(data: Path, results: Path, iterations: int) -> list[str]:
     """A sweep of three seeds, two at a time."""
-    return ["-m", *overrides(data, results, f"train.iterations={iterations}", "train.densify.stop=1", "model=3dgs",
-                             "seed=0,1,2"), "+launch=parallel", "launch.at_once=2"]  # fmt: skip
+    return [
+        "-m",
+        *overrides(data, results, f"train.iterations={iterations}", "train.densify.stop=1", "model=3dgs", "seed=0,1,2"),
+        "+launch=parallel",
+        "launch.at_once=2",
+    ]
 
 
 def workers(results: Path) -> list[int]:
@@ -79,8 +83,9 @@ def test_a_signal_lets_each_run_save_and_no_other_begins(
     assert saved == {run.step for run in runs if run.state == "stopped"}
     assert {int(step) for step in re.findall(r"stopped at step (\d+), saved in", sweep.err)} == saved
     assert {run.reason for run in runs} == {
-        None, *(f"stopped at step {step} of 100000: the same command continues" for step in saved)
-    }  # fmt: skip
+        None,
+        *(f"stopped at step {step} of 100000: the same command continues" for step in saved),
+    }
 
 
 @pytest.mark.parametrize("launch", ["local", "parallel"])

@@ -67,26 +67,24 @@ def test_each_run_is_a_job_in_the_image(log: Path, square: Path, tmp_path: Path)
     that Slurm does not get."""
     image, results = tmp_path / "gsbench.sif", tmp_path / "results"
     image.touch()
-    words = overrides(square, results, "+launch=slurm", f"launch.container={image}", "launch.gpus=1", "seed=0,1",
-                      "launch.at_once=3", "launch.minutes=7", "+launch.sbatch.account=vision", "launch.memory=1G",
-                      "+launch.sbatch.requeue=false", "model=3dgs", "train.iterations=2")  # fmt: skip
+    of_jobs = ["+launch=slurm", f"launch.container={image}", "launch.gpus=1", "launch.at_once=3", "launch.minutes=7"]
+    of_jobs += ["+launch.sbatch.account=vision", "launch.memory=1G", "+launch.sbatch.requeue=false"]
+    words = overrides(square, results, *of_jobs, "seed=0,1", "model=3dgs", "train.iterations=2")
     ended = gsbench("-m", *words)
     assert ended.returncode == 0, ended.stderr + "".join(path.read_text() for path in results.rglob("*.log"))
     runs = status.status(status.read(results / "dnerf"))
     assert [(run.state, run.job) for run in runs] == [("done", None)] * 2
     asked = (log / "sbatch").read_text().splitlines()
-    assert {"--array=0-1%3", "--time=7", "--mem=1G", "--gpus-per-node=1", "--account=vision", "--signal=USR2@120",
-            "--cpus-per-task=4", "--job-name=dnerf", "--open-mode=append"} <= set(asked)  # fmt: skip
+    options = {"--array=0-1%3", "--time=7", "--mem=1G", "--gpus-per-node=1", "--account=vision", "--signal=USR2@120"}
+    assert options | {"--cpus-per-task=4", "--job-name=dnerf", "--open-mode=append"} <= set(asked)
     assert not [word for word in asked if "requeue" in word or "partition" in word]
     in_image, other = [path.read_text().splitlines() for path in sorted(log.glob("apptainer.*"))]
     assert in_image[:-1] == other[:-1]
     assert {in_image[-1], other[-1]} == {"0", "1"}
     assert {str(results), str(square), str(ROOT)} <= set(in_image[in_image.index("--bind") + 1].split(","))
     (folder,) = results.glob("dnerf/.sweep/*")
-    assert [*in_image[:3], *in_image[4:-1]] == [
-        "exec", "--nv", "--bind", "--pwd", str(ROOT), str(image), "python3", "-P", "-u", "-m", "gsbench.launch", "job",
-        str(folder),
-    ]  # fmt: skip
+    program = ["python3", "-P", "-u", "-m", "gsbench.launch", "job", str(folder)]
+    assert [*in_image[:3], *in_image[4:-1]] == ["exec", "--nv", "--bind", "--pwd", str(ROOT), str(image), *program]
 
 
 def test_a_stopped_run_is_requeued_as_often_as_it_may(log: Path, tmp_path: Path) -> None:
@@ -112,8 +110,9 @@ def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path,
         f'"$@" & until grep -q \'"step": [1-9]\' {tmp_path}/results/dnerf/*/*/*/progress.json; do sleep 0.02; done\n'
         f"[ -e {log}/scontrol ] || kill -USR2 $!\nwait $!\n"
     )
-    words = overrides(square, tmp_path / "results", "+launch=slurm", "model=3dgs", "train.iterations=10000",
-                      "train.densify.stop=1")  # fmt: skip
+    words = overrides(
+        square, tmp_path / "results", "+launch=slurm", "model=3dgs", "train.iterations=10000", "train.densify.stop=1"
+    )
     sweep = gsbench("-m", *words, "train.checkpoint_minutes=60", "train.curve_points=3")
     (path,) = (tmp_path / "results").rglob("0.log")
     assert (log / "scontrol").read_text() == "requeue 70\n", path.read_text()

@@ -40,9 +40,14 @@ def planned(experiment: Path, name: str = "2026-11-22_00-00-00.000000", **of: An
 
 
 def traced(
-    experiment: Path, plan_of: dict[str, Any] | None = None, progress_of: dict[str, Any] | None = None,
-    record_of: dict[str, Any] | str | None = None, ended: Ended | None = None, log: str = "", stops: bool = False,
-) -> Path:  # fmt: skip
+    experiment: Path,
+    plan_of: dict[str, Any] | None = None,
+    progress_of: dict[str, Any] | None = None,
+    record_of: dict[str, Any] | str | None = None,
+    ended: Ended | None = None,
+    log: str = "",
+    stops: bool = False,
+) -> Path:
     """Write what a run leaves, and return its folder: its plan, progress, record, the note of its end, and its log."""
     folder = experiment / "lego" / "7dgs" / "seed0"
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,17 +103,34 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
         (None, {"plan_of": {}, "progress_of": {}, "record_of": {}}, "done", None),
         (None, {"plan_of": {"started": time.time() - 100}, "record_of": DIVERGED}, "failed", "diverged: step 7: loss"),
         # .. of the command that made it, which did not name the seed
-        (None, {"plan_of": GONE, "record_of": {"overrides": ["+exp=crowd", "model=7dgs", "scene=lego"]},
-                "ended": Ended("crowd/lego/7dgs/seed0/record.json", None)}, "done", None),
-        *((None, {"record_of": text}, "failed", "seed0/record.json") for text in (
-            "", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0")),
+        (
+            None,
+            {
+                "plan_of": GONE,
+                "record_of": {"overrides": ["+exp=crowd", "model=7dgs", "scene=lego"]},
+                "ended": Ended("crowd/lego/7dgs/seed0/record.json", None),
+            },
+            "done",
+            None,
+        ),
+        *(
+            (None, {"record_of": text}, "failed", "seed0/record.json")
+            for text in ("", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0")
+        ),
         # the note of its end alone
         (None, {"plan_of": {}, "ended": Ended(None, "seed: expected >= 0, got -1")}, "failed", "seed: expected >= 0"),
-        (Queue({}), {"plan_of": JOB, "ended": Ended(None, "it ended without a record"),
-                     "log": "step 5\ngsbench: error: its record cannot be written: No space left on device\n"},
-         "failed", "it ended without a record; its log ends: gsbench: error: its record cannot be written: No space"),
+        (
+            Queue({}),
+            {
+                "plan_of": JOB,
+                "ended": Ended(None, "it ended without a record"),
+                "log": "step 5\ngsbench: error: its record cannot be written: No space left on device\n",
+            },
+            "failed",
+            "it ended without a record; its log ends: gsbench: error: its record cannot be written: No space",
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_state_of_a_run_follows_from_its_traces(
     queue: Queue | None, traces: dict[str, Any], state: str, reason: str | None, tmp_path: Path
 ) -> None:
@@ -153,16 +175,21 @@ def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
     ("job", "step", "log", "reason"),
     [
         (
-            "FAILED|9:0", "OUT_OF_MEMORY|0:125",
+            "FAILED|9:0",
+            "OUT_OF_MEMORY|0:125",
             "step 5\nslurmstepd: error: Detected 1 oom_kill event\nsrun: error: n1: task 0: Killed",
             "job 7_0 ended: OUT_OF_MEMORY; its log ends: slurmstepd: error: Detected 1 oom_kill event",
         ),
-        ("FAILED|1:0", "COMPLETED|0:0", "bar 50 %| gsbench: error: no such file\nbye",
-         "job 7_0 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file"),
+        (
+            "FAILED|1:0",
+            "COMPLETED|0:0",
+            "bar 50 %| gsbench: error: no such file\nbye",
+            "job 7_0 ended: FAILED, exit 1:0; its log ends: gsbench: error: no such file",
+        ),
         ("TIMEOUT|0:0", "CANCELLED|0:15", "step 5\nstep 6", "job 7_0 ended: TIMEOUT; its log ends: step 6"),
     ],
     ids=["memory", "error", "time"],
-)  # fmt: skip
+)
 def test_a_lost_job_says_how_it_ended(
     job: str, step: str, log: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,14 +207,16 @@ def test_a_lost_job_says_how_it_ended(
 @pytest.mark.parametrize(
     ("log", "cause"),
     [
-        ("/opt/python: Permission denied\nsrun: error: n1: task 0: Exited with exit code 13\n",
-         "/opt/python: Permission denied"),
+        (
+            "/opt/python: Permission denied\nsrun: error: n1: task 0: Exited with exit code 13\n",
+            "/opt/python: Permission denied",
+        ),
         ("srun: error: n1: task 0: Exited with exit code 13\n", "srun: error: n1: task 0: Exited with exit code 13"),
         ("loading\nRuntimeError: this\nsrun: error: n1: task 0: Exited with exit code 1\n", "RuntimeError: this"),
         ("step 5\nslurmd: error: Detected 1 oom_kill event\nstep 6", "slurmd: error: Detected 1 oom_kill event"),
         ("", "(empty)"),
     ],
-)  # fmt: skip
+)
 def test_a_log_is_quoted_where_it_names_the_cause(log: str, cause: str, tmp_path: Path) -> None:
     """Catches `exit code 13` alone for a job whose log says in its first line that Python may not be run."""
     path = tmp_path / "7_0_log.err"
@@ -266,11 +295,14 @@ def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
 
 def test_only_what_differs_names_a_run() -> None:
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
-    runs = [RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
-            for seed, state in enumerate(["done", "failed", "done"])]  # fmt: skip
+    runs = [
+        RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
+        for seed, state in enumerate(["done", "failed", "done"])
+    ]
     assert lines(status.Experiment(Path("results/crowd")), runs) == [
-        "results/crowd: 3 runs: 2 done, 1 failed", "  failed   seed=1  why",
-    ]  # fmt: skip
+        "results/crowd: 3 runs: 2 done, 1 failed",
+        "  failed   seed=1  why",
+    ]
 
 
 def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None:

@@ -98,9 +98,15 @@ def result(name: str, psnr_val: float | None, error: DivergedError | None = None
 
 @pytest.mark.parametrize(
     ("scores", "chosen"),
-    [([100.0, 100.0, 100.0], 2), ([None, None], 1), ([None, 20.0], 1), ([20.0, None], 0), ([30.0, 20.0], 0),
-     ([20.0, 30.0, 30.0, 25.0], 2)],
-)  # fmt: skip
+    [
+        ([100.0, 100.0, 100.0], 2),
+        ([None, None], 1),
+        ([None, 20.0], 1),
+        ([20.0, None], 0),
+        ([30.0, 20.0], 0),
+        ([20.0, 30.0, 30.0, 25.0], 2),
+    ],
+)
 def test_the_last_of_equal_candidates_is_taken(scores: list[float | None], chosen: int) -> None:
     """Catches the first candidate, which is the shortest training, that is taken as nothing speaks against it."""
     results = [result(str(i), score) for i, score in enumerate(scores)]
@@ -160,10 +166,12 @@ def test_an_empty_val_view_changes_no_choice(words: tuple[str, ...], square: Pat
 
 @pytest.mark.parametrize(
     ("words", "line"),
-    [(("train.lengths=2",), "PSNR cannot decide between iterations=15, iterations=30, so the last of them is taken"),
-     (("train.patience=0.2",), "PSNR on val is equal at 4 steps, 8 to 30: it cannot decide, and the last of them"),
-     (("train.average_from=15",), "it cannot decide, and the last are kept")],
-)  # fmt: skip
+    [
+        (("train.lengths=2",), "PSNR cannot decide between iterations=15, iterations=30, so the last of them is taken"),
+        (("train.patience=0.2",), "PSNR on val is equal at 4 steps, 8 to 30: it cannot decide, and the last of them"),
+        (("train.average_from=15",), "it cannot decide, and the last are kept"),
+    ],
+)
 def test_a_val_of_empty_views_decides_nothing(
     words: tuple[str, ...], line: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

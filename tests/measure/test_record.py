@@ -197,9 +197,19 @@ def test_a_wrong_value_is_refused_by_name(tmp_path, place, value, words):
 
 @pytest.mark.parametrize(
     "text",
-    [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000, b'{"version": 1}', b'{"version": 1, "version": 1}',
-     b'{"version": ' + b"9" * 5000 + b"}", b'{"version": NaN}'],
-)  # fmt: skip
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"version": 1}',
+        b'{"version": 1, "version": 1}',
+        b'{"version": ' + b"9" * 5000 + b"}",
+        b'{"version": NaN}',
+    ],
+)
 def test_what_is_no_record_is_refused(tmp_path, text):
     """Would catch a stack trace (RecursionError, UnicodeDecodeError, KeyError) on a file that is not a record."""
     path = tmp_path / "record.json"

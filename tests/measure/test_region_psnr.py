@@ -23,8 +23,9 @@ def view(name: str, square: tuple[int, int] | None, *, turned: float = 0.0, alph
         x, y = square
         image[y : y + 12, x : x + 12] = torch.tensor([0.4, 0.4, 0.9])
         covered[y : y + 12, x : x + 12] = 255
-    return View(name, Camera(viewmat, torch.eye(3), WIDTH, HEIGHT), 0.0, image,
-                composited_alpha=covered if alpha else None)  # fmt: skip
+    return View(
+        name, Camera(viewmat, torch.eye(3), WIDTH, HEIGHT), 0.0, image, composited_alpha=covered if alpha else None
+    )
 
 
 def test_what_moves_is_found_at_one_camera() -> None:
@@ -65,8 +66,9 @@ def test_objects_are_those_of_masks_or_of_alpha() -> None:
     assert of_objects(views).masks["0"].sum() == 144
     numbered = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     numbered[:9] = 3
-    masked = [View(v.name, v.camera, v.time, v.pixels, composited_alpha=v.composited_alpha, regions=numbered)
-              for v in views]  # fmt: skip
+    masked = [
+        View(v.name, v.camera, v.time, v.pixels, composited_alpha=v.composited_alpha, regions=numbered) for v in views
+    ]
     assert of_objects(masked).source == "masks"
     assert of_objects(masked).masks["0"].sum() == 9 * WIDTH
     assert "masks" in of_objects([view("0", (10, 10))]).missing

@@ -228,8 +228,12 @@ def test_the_equations_of_dgs() -> None:
 def test_the_equations_of_dbs() -> None:
     """Catches an exponent of another variable, weights b / 4 that are not those of V_qq delta, and exp for softplus."""
     raw = {key: value for key, value in DIRECT.items() if key not in ("shares", "quats")}
-    raw |= {"scales": softplus_inverse(DIRECT["scales"].double().exp()), "directions": torch.tensor([[0.0, 0, 1]]),
-            "times": torch.full((1, 1), 0.5), "betas": torch.tensor([[7.0, -3, -3, -3, 0]])}  # fmt: skip
+    raw |= {
+        "scales": softplus_inverse(DIRECT["scales"].double().exp()),
+        "directions": torch.tensor([[0.0, 0, 1]]),
+        "times": torch.full((1, 1), 0.5),
+        "betas": torch.tensor([[7.0, -3, -3, -3, 0]]),
+    }
     shift, factor = change(raw, "dbs")
     assert shift == pytest.approx([0.0115723] * 3, rel=1e-5)
     assert factor == pytest.approx(0.145891, rel=1e-5)

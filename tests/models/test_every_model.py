@@ -206,9 +206,12 @@ def test_a_slice_has_its_shapes(variant: str, count: int) -> None:
             continue
         by_kernels = single.slice(CameraTime.at(CAMERA.float(), time))
         drawn = (sliced.opacities > 1 / 200)[:, None]  # kernels do not colour what cannot be seen
-        for x, y in ((by_kernels.means, sliced.means), (by_kernels.opacities, sliced.opacities),
-                     (covariances(by_kernels), covariances(sliced)),
-                     (by_kernels.colors * drawn, sliced.colors * drawn)):  # fmt: skip
+        for x, y in (
+            (by_kernels.means, sliced.means),
+            (by_kernels.opacities, sliced.opacities),
+            (covariances(by_kernels), covariances(sliced)),
+            (by_kernels.colors * drawn, sliced.colors * drawn),
+        ):
             torch.testing.assert_close(x.double(), y, rtol=1e-3, atol=1e-4)
 
 

@@ -162,8 +162,9 @@ def test_time_goes_on_as_it_did_where_direction_is_frozen(variant: str) -> None:
     early, late = (CameraTime.at(CAMERA, time) for time in (0.35, 0.6))
     weights = torch.full((2, len(model)), 0.5, dtype=torch.float64)
     frozen = model.frozen(raw(model), [early, late], weights)["direction"]
-    before, after = (model.slice_geometry(x, late)[2] / model.slice_geometry(x, early)[2]
-                     for x in (raw(model), raw(model) | frozen))  # fmt: skip
+    before, after = (
+        model.slice_geometry(x, late)[2] / model.slice_geometry(x, early)[2] for x in (raw(model), raw(model) | frozen)
+    )
     assert (before - 1).abs().amax() > 0.1
     torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
 

@@ -12,11 +12,19 @@ from gsbench.models.cholesky import CholeskyModel
 from gsbench.train.rows import START_BINS, Rows
 
 # The raw parameter and the column that hold the size in time, and a number that makes this size tiny.
-IN_TIME = {"4dgs": ("scales", 3, -20.0), "dbs": ("precision", -1, 20.0), "dgs": ("precision", -1, 20.0),
-           **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ("durations", 0, -20.0)),
-           "ubs": ("scales", -1, -20.0)}  # fmt: skip
-TIMED = [name for name in NAMES if name in IN_TIME.keys() - {"ubs"} or ("time" in registry.find(name).observes
-         and issubclass(registry.find(name), CholeskyModel))]  # fmt: skip
+IN_TIME = {
+    "4dgs": ("scales", 3, -20.0),
+    "dbs": ("precision", -1, 20.0),
+    "dgs": ("precision", -1, 20.0),
+    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ("durations", 0, -20.0)),
+    "ubs": ("scales", -1, -20.0),
+}
+TIMED = [
+    name
+    for name in NAMES
+    if name in IN_TIME.keys() - {"ubs"}
+    or ("time" in registry.find(name).observes and issubclass(registry.find(name), CholeskyModel))
+]
 # Nothing else dims these: they are visible in the whole of their intervals.
 EXACT = ("7dgs_nodir", "freetime", "sharptime", "stg")
 LEAST = 0.04

@@ -61,12 +61,19 @@ def test_parameters_undo_a_factor(seed: int, letters: str, form: str) -> None:
     torch.testing.assert_close(layout.parameters(L @ Q), parameters, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("letters", "expected"), [
-    ("dddtppp", {"shape": "54 64 65", "motion": "40 41 42 43 50 51 52 53 60 61 62 63",
-                 "coupling": "10 20 21 30 31 32"}),
-    ("ppptddd", {"shape": "10 20 21", "motion": "30 31 32 40 41 42 50 51 52 60 61 62",
-                 "coupling": "43 53 54 63 64 65"}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("letters", "expected"),
+    [
+        (
+            "dddtppp",
+            {"shape": "54 64 65", "motion": "40 41 42 43 50 51 52 53 60 61 62 63", "coupling": "10 20 21 30 31 32"},
+        ),
+        (
+            "ppptddd",
+            {"shape": "10 20 21", "motion": "30 31 32 40 41 42 50 51 52 60 61 62", "coupling": "43 53 54 63 64 65"},
+        ),
+    ],
+)
 def test_kinds_of_entries(letters: str, expected: dict[str, str]) -> None:
     """Catches an entry of L_pp among the motions, or of L_td among the shapes: each has its unit and its rate."""
     layout, n = CholeskyLayout(letters, "raw"), len(letters)

@@ -62,9 +62,10 @@ def test_harmonics_of_another_degree(name: str, in_ply: int, in_model: int) -> N
     gaussians, opaque = trained(in_ply), torch.ones(N)
     shared = (min(in_ply, in_model) + 1) ** 2 - 1
     cut = TrainedGaussians(*list(vars(gaussians).values())[:5], gaussians.rest[:, :shared])
-    colors = [model.shade(dict(model.splats.items()), gaussians.means, opaque, QUERY)
-              for model in (started_from(gaussians, name, sh_degree=in_model),
-                            started_from(cut, "3dgs", sh_degree=in_model))]  # fmt: skip
+    colors = [
+        model.shade(dict(model.splats.items()), gaussians.means, opaque, QUERY)
+        for model in (started_from(gaussians, name, sh_degree=in_model), started_from(cut, "3dgs", sh_degree=in_model))
+    ]
     torch.testing.assert_close(*colors)
     assert colors[0].std() > 0.1
 

@@ -72,8 +72,9 @@ def only(case: Case, *subjects: str) -> Case:
     return replace(case, subjects=subjects)
 
 
-def _judged(audit: Audit, case: Case, judge: Callable[..., Iterable[Cell]], *arguments: object, **more: object) -> (
-        tuple[str, Step]):  # fmt: skip
+def _judged(
+    audit: Audit, case: Case, judge: Callable[..., Iterable[Cell]], *arguments: object, **more: object
+) -> tuple[str, Step]:
     return case.name, lambda: audit.cells.extend(judge(case, *arguments, **more))
 
 
@@ -117,8 +118,10 @@ def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -
         more = {"steps": trainings.LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
         steps.append(_judged(audit, case, trainings.judge, fastest, **more))
     drifts = other.submit(_drifts, fastest, long)
-    counts = {order: million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
-              for order in population.FACTOR_ORDERS}  # fmt: skip
+    counts = {
+        order: million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
+        for order in population.FACTOR_ORDERS
+    }
     return [
         *steps,
         *_hard_slices(audit, counts | dict.fromkeys(population.MOVING, min(million, MOVING))),

@@ -43,9 +43,19 @@ class _Splats(NamedTuple):
 
 
 def render(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, offsets2d: Tensor | None = None, background: Tensor | None = None, **options: Any,
-) -> Picture:  # fmt: skip
+    means: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    offsets2d: Tensor | None = None,
+    background: Tensor | None = None,
+    **options: Any,
+) -> Picture:
     """Render exact images from the arguments of `gsbench.raster.rasterize` in float64.
 
     `offsets2d` [C, N, 2] is added to the projected means, in pixels.
@@ -56,8 +66,9 @@ def render(
     touched, slack = torch.zeros(C, N, height * width, dtype=torch.bool), means.new_zeros(C, height * width)
     for c in range(C):
         moved = None if offsets2d is None else offsets2d[c]
-        splats = _project(means, factors, opacities, _colors_of(colors, c), viewmats[c], Ks[c], width, height, moved,
-                          **options)  # fmt: skip
+        splats = _project(
+            means, factors, opacities, _colors_of(colors, c), viewmats[c], Ks[c], width, height, moved, **options
+        )
         for at, pixels in _pixels(width, height, N):
             image[c, at], alpha[c, at], some, slack[c, at] = _blend(splats, pixels, background)
             touched[c, splats.order[:, None], at] = some
@@ -74,9 +85,18 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
     background = weight.new_zeros(weight.shape[-1]) if background is None else background
     for c in range(len(viewmats)):
         for at, pixels in _pixels(width, height, len(inputs["means"])):
-            splats = _project(inputs["means"], inputs["factors"], inputs["opacities"], _colors_of(inputs["colors"], c),
-                              viewmats[c], Ks[c], width, height,
-                              beta_exponents=inputs.get("beta_exponents"), **rest)  # fmt: skip
+            splats = _project(
+                inputs["means"],
+                inputs["factors"],
+                inputs["opacities"],
+                _colors_of(inputs["colors"], c),
+                viewmats[c],
+                Ks[c],
+                width,
+                height,
+                beta_exponents=inputs.get("beta_exponents"),
+                **rest,
+            )
             image, alpha, _, _ = _blend(splats, pixels, background)
             loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
             if loss.requires_grad:
@@ -95,10 +115,21 @@ def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def _project(
-    means: Tensor, factors: Tensor, opacities: Tensor, colors: Tensor, viewmat: Tensor, K: Tensor,
-    width: int, height: int, offsets: Tensor | None = None, near: float = 0.01, far: float = 1e10, eps2d: float = 0.3,
-    antialias: bool = False, beta_exponents: Tensor | None = None,
-) -> _Splats:  # fmt: skip
+    means: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    offsets: Tensor | None = None,
+    near: float = 0.01,
+    far: float = 1e10,
+    eps2d: float = 0.3,
+    antialias: bool = False,
+    beta_exponents: Tensor | None = None,
+) -> _Splats:
     R = viewmat[:3, :3]
     camera = means @ R.T + viewmat[:3, 3]
     order = torch.sort(camera[:, 2].detach(), stable=True).indices

@@ -84,9 +84,17 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
             bad = ~(got.isfinite().all(1) & gradient.isfinite().all(1))
             ms = fastest(partial(differentiate, inputs, backend, weight, COPIES))
             yield Cell(
-                case.area, case.name, model, "-", backend, worst((got - color).abs() / color.max().clamp(min=1)),
-                worst((gradient - slope).norm(dim=1) / slope.norm(dim=1)), float(bad.double().mean()), ms, case.bound,
-            )  # fmt: skip
+                case.area,
+                case.name,
+                model,
+                "-",
+                backend,
+                worst((got - color).abs() / color.max().clamp(min=1)),
+                worst((gradient - slope).norm(dim=1) / slope.norm(dim=1)),
+                float(bad.double().mean()),
+                ms,
+                case.bound,
+            )
 
 
 def truth(inputs: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:

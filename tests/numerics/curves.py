@@ -99,8 +99,9 @@ def safety(backends: list[str]) -> Iterator[SliceTime]:
         hard = population.draw(Generator().manual_seed(3), TIMED, order, 1.0)
         for scheme in SCHEMES:
             for backend in backends_with(scheme, "7dgs", backends):
-                model = build("7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme,
-                              backend=BACKENDS[backend])  # fmt: skip
+                model = build(
+                    "7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme, backend=BACKENDS[backend]
+                )
                 forward, backward = _passes(model.to(device_of(backend)), hard)
                 times = []
                 for _ in range(1 if backend == "reference" else REPEATS):

@@ -56,9 +56,15 @@ def evaluate(function: Function, at: Sequence[float]) -> Vector:
 
 
 def slice_triangular(
-    x: Vector, layout: Layout, center: Sequence[float], time: float | None, order: str, half: float,
-    log_lambda: dict[str, float], relative: bool = True,
-) -> Vector:  # fmt: skip
+    x: Vector,
+    layout: Layout,
+    center: Sequence[float],
+    time: float | None,
+    order: str,
+    half: float,
+    log_lambda: dict[str, float],
+    relative: bool = True,
+) -> Vector:
     """Compute the conditional 3D Gaussian of a 6DGS or 7DGS Gaussian (7DGS eq. 9 to 12).
 
     Args:
@@ -111,9 +117,7 @@ def slice_rotated(
     return [*mean, *cov, f_temp * _sigmoid(raw["opacities"][0]) if f_temp > TIME_OPACITY_FACTOR_MIN else mpf(0)]
 
 
-def slice_direct(
-    x: Vector, layout: Layout, center: Sequence[float], time: float, coupling: str = "text"
-) -> Vector:  # fmt: skip
+def slice_direct(x: Vector, layout: Layout, center: Sequence[float], time: float, coupling: str = "text") -> Vector:
     """Compute the 3D Gaussian of a dGS Gaussian, whose mean moves by `coupling`: `text`, `interpolated` or `none`."""
     raw = unpack(x, layout)
     delta = _minus(_direction(x[-3:], center), _unit(raw["directions"]))
@@ -177,9 +181,14 @@ def slice_universal(x: Vector, layout: Layout, center: Sequence[float], time: fl
 
 
 SLICES = {
-    "4dgs": slice_rotated, "6dgs": slice_triangular, "7dgs": slice_triangular, "dgs": slice_direct,
-    "dbs": slice_direct_beta, "freetime": slice_free_time, "ubs": slice_universal,
-}  # fmt: skip
+    "4dgs": slice_rotated,
+    "6dgs": slice_triangular,
+    "7dgs": slice_triangular,
+    "dgs": slice_direct,
+    "dbs": slice_direct_beta,
+    "freetime": slice_free_time,
+    "ubs": slice_universal,
+}
 
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
@@ -225,9 +234,11 @@ def _beta_fading(white: Vector, exponents: Vector) -> Any:
 
 def _rotation(quaternion: Vector) -> Matrix:
     w, x, y, z = _normalised(quaternion)
-    return [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]  # fmt: skip
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def _turn(skew: Vector) -> Matrix:
@@ -245,9 +256,13 @@ def _covariance(turn: Matrix, sizes: Vector) -> Vector:
 
 
 def alphas(
-    x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
-    pixels: Sequence[tuple[float, float]], eps2d: float,
-) -> Vector:  # fmt: skip
+    x: Vector,
+    viewmat: Sequence[Sequence[float]],
+    K: Sequence[Sequence[float]],
+    size: tuple[int, int],
+    pixels: Sequence[tuple[float, float]],
+    eps2d: float,
+) -> Vector:
     """Compute the alpha of one Gaussian at pixel centres, without the cut-offs of 3DGS at 0.999 and 1/255.
 
     Alpha is opacity exp(-r^2 / 2), with the r^2 and the arguments of `distances`; x goes on with the opacity. If x has
@@ -260,9 +275,13 @@ def alphas(
 
 
 def distances(
-    x: Vector, viewmat: Sequence[Sequence[float]], K: Sequence[Sequence[float]], size: tuple[int, int],
-    pixels: Sequence[tuple[float, float]], eps2d: float,
-) -> Vector:  # fmt: skip
+    x: Vector,
+    viewmat: Sequence[Sequence[float]],
+    K: Sequence[Sequence[float]],
+    size: tuple[int, int],
+    pixels: Sequence[tuple[float, float]],
+    eps2d: float,
+) -> Vector:
     """Compute r^2 = d^T S^-1 d at pixel centres, by EWA splatting (Zwicker et al. 2001 eq. 29).
 
     Here d is the offset of the pixel from the projected mean, and S the 2D covariance.
@@ -281,8 +300,10 @@ def distances(
     (fx, _, cx), (_, fy, cy) = ([mpf(v) for v in row] for row in K[:2])
     u, v = fx * px / pz + cx, fy * py / pz + cy
     # The Jacobian is taken at the mean, moved to at most 15 % of the image outside of it (3DGS).
-    tangents = [(min(max(at, -mpf(3) / 20 * extent), mpf(23) / 20 * extent) - c) / f
-                for at, extent, c, f in ((u, size[0], cx, fx), (v, size[1], cy, fy))]  # fmt: skip
+    tangents = [
+        (min(max(at, -mpf(3) / 20 * extent), mpf(23) / 20 * extent) - c) / f
+        for at, extent, c, f in ((u, size[0], cx, fx), (v, size[1], cy, fy))
+    ]
     J = [[fx / pz, mpf(0), -fx * tangents[0] / pz], [mpf(0), fy / pz, -fy * tangents[1] / pz]]
     M = [[mp.fsum(J[a][b] * W[b][c] * F[c][e] for b in range(3) for c in range(3)) for e in range(3)] for a in range(2)]
     xx, xy, yy = (mp.fdot(M[a], M[b]) + (mpf(eps2d) if a == b else 0) for a, b in ((0, 0), (0, 1), (1, 1)))
@@ -304,8 +325,11 @@ def colors(x: Vector, layout: Layout, center: Sequence[float], waves: int, time:
     """
     raw = unpack(x, layout)
     direction = _direction(raw["means"], center)
-    basis = [harmonic(degree, order, *direction) if any(direction) or degree == 0 else mpf(0)
-             for degree in range(4) for order in range(-degree, degree + 1)]  # fmt: skip
+    basis = [
+        harmonic(degree, order, *direction) if any(direction) or degree == 0 else mpf(0)
+        for degree in range(4)
+        for order in range(-degree, degree + 1)
+    ]
     cosines = [mp.cos(2 * mp.pi * n * (mpf(time) - raw["times"][0])) for n in range(waves)]
     Y = [c * y for c in cosines for y in basis]
     return [max(mpf(0), mp.fdot(Y, raw["sh"][channel::3]) + mpf(1) / 2) for channel in range(3)]

@@ -38,11 +38,15 @@ def page(audit: Audit) -> str:
     """Return the report of the audit as Markdown."""
     lines = ["# Stability audit", "", verdict(audit), "", *conditions(audit), ""]
     lines += [
-        "## Error against condition number", "", "![the error against the condition number](condition.png)", "",
+        "## Error against condition number",
+        "",
+        "![the error against the condition number](condition.png)",
+        "",
         "Relative error of the sliced covariance: 7DGS in float32 by torch, the factor in the paper's order, random "
         "factors whose diagonals go down to 10^-8. Solid: median, dashed: 99th percentile, both on the left axis. "
-        "Dotted, on the right axis: share of covariances that are indefinite or not finite.", "",
-    ]  # fmt: skip
+        "Dotted, on the right axis: share of covariances that are indefinite or not finite.",
+        "",
+    ]
     cases = ["## the cases", "", "| case | what it stresses, and where it was met |", "| --- | --- |"]
     cases += [f"| {case.name} | {case.stresses} |" for area in AREAS for case in of_area(area)]
     return "\n".join([*lines, table(audit), *cases, ""])
@@ -108,30 +112,39 @@ def _number(x: float) -> str:
 
 
 def _runs(audit: Audit) -> list[str]:
-    lines = ["## training", "", "| case | model | backend | result | not finite | s | what came out |",
-             "| --- | --- | --- | --- | ---: | ---: | --- |"]  # fmt: skip
+    lines = [
+        "## training",
+        "",
+        "| case | model | backend | result | not finite | s | what came out |",
+        "| --- | --- | --- | --- | ---: | ---: | --- |",
+    ]
     for cell in (cell for cell in audit.cells if cell.area in RUNS):
         result = f"{cell.forward:.4f} dB" if cell.area == "drift" else "as it should" if cell.forward == 0 else "failed"
-        lines.append(f"| {cell.case} | {cell.subject} | {cell.backend} | {'' if cell.holds else MARK}{result} | "
-                     f"{100 * cell.bad:.3g} % | {cell.ms / 1e3:.1f} | {cell.note} |")  # fmt: skip
+        lines.append(
+            f"| {cell.case} | {cell.subject} | {cell.backend} | {'' if cell.holds else MARK}{result} | "
+            f"{100 * cell.bad:.3g} % | {cell.ms / 1e3:.1f} | {cell.note} |"
+        )
     return [*lines, ""]
 
 
 def _costs(audit: Audit) -> list[str]:
     lines = [
-        "## what safety costs", "",
+        "## what safety costs",
+        "",
         "Milliseconds of slicing 100,000 7D Gaussians, medians of nine (torch: one). The kernel of `cholesky` does",
         "what one of `schur` would have to, solving where that inverts; `schur` runs in torch, as published code does.",
-        "The last column is forward and backward as multiples of `cholesky` in the same order on the same backend.", "",
+        "The last column is forward and backward as multiples of `cholesky` in the same order on the same backend.",
+        "",
         "| factor order | scheme | backend | forward | backward | multiples |",
         "| --- | --- | --- | ---: | ---: | ---: |",
-    ]  # fmt: skip
+    ]
     beside = {(cost.order, cost.backend): cost for cost in audit.safety if cost.scheme == "cholesky"}
     for cost in audit.safety:
         other = beside.get((cost.order, cost.backend))
         ratio = f"{cost.forward / other.forward:.2f} / {cost.backward / other.backward:.2f}" if other else "–"
-        lines.append(f"| {cost.order} | {cost.scheme} | {cost.backend} | {cost.forward:.1f} | {cost.backward:.1f} | "
-                     f"{ratio} |")  # fmt: skip
+        lines.append(
+            f"| {cost.order} | {cost.scheme} | {cost.backend} | {cost.forward:.1f} | {cost.backward:.1f} | {ratio} |"
+        )
     return [*lines, ""]
 
 

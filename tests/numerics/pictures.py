@@ -29,10 +29,15 @@ def intrinsics(fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: 
 def single(mean: Tensor, factor: Tensor) -> Arguments:
     """Return one Gaussian, and one camera at the origin that looks along z; tensors are float32."""
     return {
-        "means": mean.float()[None], "factors": factor.float()[None], "opacities": torch.tensor([0.9]),
-        "colors": torch.ones(1, 1), "viewmats": torch.eye(4)[None], "Ks": intrinsics(),
-        "width": WIDTH, "height": HEIGHT,
-    }  # fmt: skip
+        "means": mean.float()[None],
+        "factors": factor.float()[None],
+        "opacities": torch.tensor([0.9]),
+        "colors": torch.ones(1, 1),
+        "viewmats": torch.eye(4)[None],
+        "Ks": intrinsics(),
+        "width": WIDTH,
+        "height": HEIGHT,
+    }
 
 
 def on_a_pixel(size: float) -> Arguments:
@@ -52,11 +57,16 @@ def crowd(g: Generator, N: int, size: float) -> Arguments:
     spread = torch.tensor([1.0, 0.7, 1.0])
     means = (torch.rand(N, 3, generator=g) * 2 - 1) * spread + torch.tensor([0.0, 0.0, DEPTH])
     return {
-        "means": means, "factors": size * torch.randn(N, 3, 3, generator=g),
-        "opacities": 0.05 + 0.9 * torch.rand(N, generator=g), "colors": torch.rand(N, 3, generator=g),
-        "viewmats": torch.eye(4)[None], "Ks": intrinsics(), "width": WIDTH, "height": HEIGHT,
+        "means": means,
+        "factors": size * torch.randn(N, 3, 3, generator=g),
+        "opacities": 0.05 + 0.9 * torch.rand(N, generator=g),
+        "colors": torch.rand(N, 3, generator=g),
+        "viewmats": torch.eye(4)[None],
+        "Ks": intrinsics(),
+        "width": WIDTH,
+        "height": HEIGHT,
         "background": torch.tensor([0.2, 0.5, 0.8]),
-    }  # fmt: skip
+    }
 
 
 # ---- projection
@@ -178,8 +188,11 @@ def beta_at_the_rim(g: Generator, severity: float) -> list[Arguments]:
 def beta_opacity_at_its_limit(g: Generator, severity: float) -> list[Arguments]:
     """Use opacities within rounding error of 1/255, where the size of a Beta profile is a root of almost zero."""
     opacities = [1 / 255 * (1 + change * severity) for change in (-(2**-23), 0.0, 2**-22, 1e-3)]
-    return [on_a_pixel(10.0) | {"opacities": torch.tensor([opacity]), "beta_exponents": torch.tensor([shape])}
-            for opacity in opacities for shape in (1e-3, 0.5, 50.0)]  # fmt: skip
+    return [
+        on_a_pixel(10.0) | {"opacities": torch.tensor([opacity]), "beta_exponents": torch.tensor([shape])}
+        for opacity in opacities
+        for shape in (1e-3, 0.5, 50.0)
+    ]
 
 
 # ---- blending
@@ -230,8 +243,11 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
     inputs["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # constant over the image
     faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
     full = torch.tensor([0.999]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-23]) ** severity
-    return [inputs | _only(inputs, slice(i, i + 1)) | {"opacities": opacity[None]}
-            for opacities in (faint, full) for i, opacity in enumerate(opacities)]  # fmt: skip
+    return [
+        inputs | _only(inputs, slice(i, i + 1)) | {"opacities": opacity[None]}
+        for opacities in (faint, full)
+        for i, opacity in enumerate(opacities)
+    ]
 
 
 @case("blending", forward=1e-3, gradient=math.nan)
@@ -282,11 +298,18 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
         forward, gradient, bad = (torch.tensor(x, dtype=torch.float64) for x in zip(*errors, strict=True))
         drawn = sum(int((exact[1] > 0).any()) for exact in truths)
         yield Cell(
-            case.area, case.name, "-", "-", backend, worst(forward),
-            worst(gradient) if truths[0][3] else float("nan"), float(bad.mean()),
-            fastest(partial(_all, pictures, backend)), case.bound,
+            case.area,
+            case.name,
+            "-",
+            "-",
+            backend,
+            worst(forward),
+            worst(gradient) if truths[0][3] else float("nan"),
+            float(bad.mean()),
+            fastest(partial(_all, pictures, backend)),
+            case.bound,
             f"{drawn} of {len(pictures)} images not empty",
-        )  # fmt: skip
+        )
 
 
 def _all(pictures: list[Arguments], backend: str) -> None:
@@ -329,8 +352,12 @@ def alone(arguments: Arguments) -> ImageTruth:
     if not x[2] > torch.tensor(arguments.get("near", NEAR)).item():  # camera axes are world axes, so z is the depth
         none = torch.zeros(shape, dtype=torch.float64)
         return none, none, none[..., 0] == 0, {k: torch.zeros_like(arguments[k]).double() for k in inputs_of(arguments)}
-    view: Arguments = {"viewmat": arguments["viewmats"][0].tolist(), "K": arguments["Ks"][0].tolist(),
-                       "size": (width, height), "eps2d": float(torch.tensor(EPS2D))}  # fmt: skip
+    view: Arguments = {
+        "viewmat": arguments["viewmats"][0].tolist(),
+        "K": arguments["Ks"][0].tolist(),
+        "size": (width, height),
+        "eps2d": float(torch.tensor(EPS2D)),
+    }
     function = partial(oracle.alphas, **view)
     alphas = oracle.evaluate(partial(function, pixels=pixels), x)
     free = torch.tensor([float(v) for v in alphas], dtype=torch.float64).view(shape)

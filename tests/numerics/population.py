@@ -92,9 +92,21 @@ def hard_slices(order: str, N: int, backends: list[str]) -> tuple[list[Cell], fl
             start = time.perf_counter()
             errors = judge(hard.rows(slice(count)), exact, order, scheme, backend)
             ms = 1e3 * (time.perf_counter() - start)
-            cells.append(Cell("population", f"hard_slices_{order}", "7dgs", scheme, backend, percentile(errors.cov),
-                              percentile(errors.gradient), float(errors.bad.mean()), ms, Bound(),
-                              f"{count} slices"))  # fmt: skip
+            cells.append(
+                Cell(
+                    "population",
+                    f"hard_slices_{order}",
+                    "7dgs",
+                    scheme,
+                    backend,
+                    percentile(errors.cov),
+                    percentile(errors.gradient),
+                    float(errors.bad.mean()),
+                    ms,
+                    Bound(),
+                    f"{count} slices",
+                )
+            )
     return cells, verify(hard, order)
 
 
@@ -186,8 +198,16 @@ def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
 
 
 def _oracle(order: str) -> oracle.Function:
-    layout = {"log_diagonal": 7, "shape": 3, "motion": 12, "coupling": 6, "means": 3, "directions": 3, "times": 1,
-              "opacities": 1}  # fmt: skip
+    layout = {
+        "log_diagonal": 7,
+        "shape": 3,
+        "motion": 12,
+        "coupling": 6,
+        "means": 3,
+        "directions": 3,
+        "times": 1,
+        "opacities": 1,
+    }
     names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
     log_lambda = {"direction": NEVER, "time": NEVER}
     places = CholeskyLayout(names).places
@@ -212,8 +232,15 @@ def judge(hard: Hard, exact: PopulationTruth, order: str, scheme: str, backend: 
 
 def all_seen(order: str, scheme: str, backend: str) -> CholeskyModel:
     """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
-    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, factor_order=order, scheme=scheme, off_diagonal="raw",
-                  backend=BACKENDS[backend])  # fmt: skip
+    model = build(
+        "7dgs",
+        lambda_d=1.0,
+        lambda_t=1.0,
+        factor_order=order,
+        scheme=scheme,
+        off_diagonal="raw",
+        backend=BACKENDS[backend],
+    )
     for name in ("direction", "time"):
         model.log_lambda[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))
@@ -228,9 +255,14 @@ def at_the_origin(model: CholeskyModel, dtype: torch.dtype = torch.float32) -> C
 def raw_parameters(hard: Hard, model: CholeskyModel) -> dict[str, Tensor]:
     """Return the raw parameters of the given 7D Gaussians for a model made by `all_seen`."""
     directions, times = hard.offset.split([3, 1], 1)
-    return {"means": torch.zeros_like(directions), "directions": directions, "times": times,
-            "log_diagonal": hard.log_diagonal, **model.layout.split(hard.off_diagonal),
-            "opacities": torch.zeros_like(times[:, 0])}  # fmt: skip
+    return {
+        "means": torch.zeros_like(directions),
+        "directions": directions,
+        "times": times,
+        "log_diagonal": hard.log_diagonal,
+        **model.layout.split(hard.off_diagonal),
+        "opacities": torch.zeros_like(times[:, 0]),
+    }
 
 
 # ---- dGS, dBS, UBS and FreeTimeGS
@@ -249,8 +281,21 @@ def moving_slices(name: str, N: int, backends: list[str]) -> tuple[list[Cell], f
         errors = slices.compare(*slices.differentiate(model, raw, observed, exact.weights), exact)
         ms = 1e3 * (time.perf_counter() - start)
         forward, gradient = (percentile(x.numpy()) for x in (errors.forward, errors.gradient))
-        cells.append(Cell("population", "hard_slices", name, ONE_SCHEME, backend, forward, gradient,
-                          errors.bad.double().mean().item(), ms, Bound(), f"{N} slices"))  # fmt: skip
+        cells.append(
+            Cell(
+                "population",
+                "hard_slices",
+                name,
+                ONE_SCHEME,
+                backend,
+                forward,
+                gradient,
+                errors.bad.double().mean().item(),
+                ms,
+                Bound(),
+                f"{N} slices",
+            )
+        )
     return cells, verify_moving(observed)
 
 

@@ -526,9 +526,18 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES, cop
                 weights = exact.weights.repeat(copies, 1)
                 ms = fastest(functools.partial(differentiate, gaussians, raw, observed, weights))
                 yield Cell(
-                    case.area, case.name, model, scheme, backend, worst(errors.forward), worst(errors.gradient),
-                    bad.double().mean().item(), ms, case.bound, f"{int(errors.drawn.sum())} of {COUNT} drawn",
-                )  # fmt: skip
+                    case.area,
+                    case.name,
+                    model,
+                    scheme,
+                    backend,
+                    worst(errors.forward),
+                    worst(errors.gradient),
+                    bad.double().mean().item(),
+                    ms,
+                    case.bound,
+                    f"{int(errors.drawn.sum())} of {COUNT} drawn",
+                )
 
 
 def truth(observed: Observed) -> SliceTruth:

@@ -68,12 +68,18 @@ def cell(scheme: str, forward: float) -> Cell:
     return Cell("slicing", "static", "7dgs", scheme, "cpu", forward, 1e-6, 0.0, 1.0, Bound())
 
 
-@pytest.mark.parametrize(("scheme", "forward", "code"), [("square_root", 1e-6, 0), ("square_root", 1.0, 1),
-                                                         ("square_root", math.nan, 1), ("schur", 1.0, 0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scheme", "forward", "code"),
+    [("square_root", 1e-6, 0), ("square_root", 1.0, 1), ("square_root", math.nan, 1), ("schur", 1.0, 0)],
+)
 def test_page_and_exit_code(
-    scheme: str, forward: float, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    scheme: str,
+    forward: float,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a default over its bound, NaN included, that is not marked or ends in 0; others may break theirs.
 
     Also a short audit that does not say where to look, and a page without its table, figures or machine.

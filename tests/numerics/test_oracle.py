@@ -54,8 +54,11 @@ def test_harmonics() -> None:
     """Catches a sign or factor of a Y_lm: the models' table of constants is the general formula."""
     direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64), dim=0)
     with mp.workdps(30):
-        expected = [float(oracle.harmonic(degree, order, *map(mp.mpf, direction.tolist())))
-                    for degree in range(4) for order in range(-degree, degree + 1)]  # fmt: skip
+        expected = [
+            float(oracle.harmonic(degree, order, *map(mp.mpf, direction.tolist())))
+            for degree in range(4)
+            for order in range(-degree, degree + 1)
+        ]
     np.testing.assert_allclose(sh_basis(direction[None], 3)[0], expected, rtol=1e-14, atol=1e-15)
 
 

@@ -89,9 +89,16 @@ def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:
 @case("training", "7dgs", **ENDS)
 def reset_into_refinement(g: Generator, severity: float, model: str) -> Training:
     """Reset opacities just before AGR (neural refinement) starts, with 100 times the usual learning rate of AGR."""
-    config = compose(model, 2 * STEPS, "train.recipe_iterations=300", "train.densify.start=20",
-                     "train.densify.reset_every=100", "train.densify.stop=500",
-                     "train.refine_from=100", "train.batch_size=1")  # fmt: skip
+    config = compose(
+        model,
+        2 * STEPS,
+        "train.recipe_iterations=300",
+        "train.densify.start=20",
+        "train.densify.reset_every=100",
+        "train.densify.stop=500",
+        "train.refine_from=100",
+        "train.batch_size=1",
+    )
     config.model.lr["refinement"].start *= 100**severity
     return Training(model, config, moving_square())
 
@@ -115,8 +122,20 @@ def poisoned_photograph(g: Generator, severity: float, model: str) -> Training:
     return Training(model, compose(model, STEPS), scene, refused=True)
 
 
-@case("drift", *DRIFTING, "3dgs", "6dgs", "7dgs_nodir", "dgs", "ndgs", "dbs", "ubs", "freetime", forward=0.02,
-      gradient=math.nan)  # fmt: skip
+@case(
+    "drift",
+    *DRIFTING,
+    "3dgs",
+    "6dgs",
+    "7dgs_nodir",
+    "dgs",
+    "ndgs",
+    "dbs",
+    "ubs",
+    "freetime",
+    forward=0.02,
+    gradient=math.nan,
+)
 def single_against_double(
     g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS
 ) -> Training:
@@ -124,8 +143,15 @@ def single_against_double(
 
     Rounding may decide which Gaussians are split. The error is the difference in dB. `--long` trains 300 steps.
     """
-    config = compose(model, steps, "scene=suzanne", "scene.downscale=4", f"seed={run_seed}", "train.batch_size=1",
-                     f"train.densify.every={steps // 3}")  # fmt: skip
+    config = compose(
+        model,
+        steps,
+        "scene=suzanne",
+        "scene.downscale=4",
+        f"seed={run_seed}",
+        "train.batch_size=1",
+        f"train.densify.every={steps // 3}",
+    )
     points = random_points(DRIFT_POINTS, 1.0, generator(run_seed))
     return Training(model, config, replace(load_scene(config), points=points))
 
@@ -168,19 +194,34 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
             ms += 1e3 * (time.perf_counter() - start)
             bad = max(bad, share_not_finite(single.model))
             singles, exacts = [_on_test(single)], [_on_test(exact)]
-            notes.append(f"seed {seed}: {singles[0]:.4f} dB and {len(single.model)} Gaussians, in float64 "
-                         f"{exacts[0]:.4f} and {len(exact.model)}")  # fmt: skip
+            notes.append(
+                f"seed {seed}: {singles[0]:.4f} dB and {len(single.model)} Gaussians, in float64 "
+                f"{exacts[0]:.4f} and {len(exact.model)}"
+            )
             bound = case.bound.forward
             if not abs(singles[0] - exacts[0]) <= bound:
                 singles += [_on_test(fit(training, backend, shake)) for shake in SHAKEN]
                 exacts += [_on_test(fit(doubled, "reference", shake)) for shake in SHAKEN]
                 bound = max(bound, _by_chance(singles, exacts, CHANCE / len(seeds)))
-                notes.append(f"with start values changed by {SHAKE / U:.0f} roundings, {_listed(singles[1:])} dB, "
-                             f"in float64 {_listed(exacts[1:])}")  # fmt: skip
+                notes.append(
+                    f"with start values changed by {SHAKE / U:.0f} roundings, {_listed(singles[1:])} dB, "
+                    f"in float64 {_listed(exacts[1:])}"
+                )
             drifts.append((abs(fmean(singles) - fmean(exacts)), bound))
         error, bound = max(drifts, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0] / pair[1])
-        yield Cell(case.area, case.name, name, "-", backend, error, float("nan"), bad, ms,
-                   replace(case.bound, forward=bound), "; ".join(notes))  # fmt: skip
+        yield Cell(
+            case.area,
+            case.name,
+            name,
+            "-",
+            backend,
+            error,
+            float("nan"),
+            bad,
+            ms,
+            replace(case.bound, forward=bound),
+            "; ".join(notes),
+        )
 
 
 def _by_chance(a: Sequence[float], b: Sequence[float], p: float) -> float:

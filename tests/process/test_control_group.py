@@ -7,8 +7,10 @@ import pytest
 from gsbench.process import memory
 
 V2 = "30 20 0:26 {} /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw\n"
-V1 = ("41 30 0:36 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n"
-      "40 30 0:35 {} /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n")  # fmt: skip
+V1 = (
+    "41 30 0:36 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n"
+    "40 30 0:35 {} /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n"
+)
 
 
 def tree(root: Path, groups: str, mounts: str, files: dict[str, str]) -> Path:
@@ -33,29 +35,59 @@ def limited(limit: int, current: int, stat: str = "", folder: str = "") -> dict[
     ("groups", "mounts", "files", "left"),
     [
         # A batch job, whose limit is not read where that of the root is not set.
-        ("0::/slurm/job 7\n", V2.format("/"), {"slurm/max": "max\n", "slurm/current": "9\n"}
-         | limited(1000, 600, "anon 500\ninactive_file 50\n", "slurm/job 7"), 450),
+        (
+            "0::/slurm/job 7\n",
+            V2.format("/"),
+            {"slurm/max": "max\n", "slurm/current": "9\n"}
+            | limited(1000, 600, "anon 500\ninactive_file 50\n", "slurm/job 7"),
+            450,
+        ),
         # A group above leaves less than the group of the process.
         ("0::/a/b\n", V2.format("/"), limited(1000, 1200, "inactive_file 50\n", "a") | limited(5000, 20, "", "a/b"), 0),
         # A container has its group at the top of its mount, under the path of the host.
-        *[(f"0::{path}\n", V2.format("/docker/abc"), limited(100, 40), 60)
-          for path in ("/docker/abc/job", "/docker/abc/../../job", "/elsewhere")],
+        *[
+            (f"0::{path}\n", V2.format("/docker/abc"), limited(100, 40), 60)
+            for path in ("/docker/abc/job", "/docker/abc/../../job", "/elsewhere")
+        ],
         # Version 1 has other names of files, and each controller has its own mount.
-        ("5:cpu:/jobs\n4:hugetlb,memory:/jobs/3\n0::/\n", V2.format("/") + V1.format("/"),
-         {"memory/limit_in_bytes": "9223372036854771712", "memory/usage_in_bytes": "10",
-          "memory/stat": "inactive_file 5\ntotal_inactive_file 9\n",
-          "memory/jobs/3/limit_in_bytes": "2000", "memory/jobs/3/usage_in_bytes": "500",
-          "memory/jobs/3/stat": "inactive_file 5\ntotal_inactive_file 100\n"}, 1600),
+        (
+            "5:cpu:/jobs\n4:hugetlb,memory:/jobs/3\n0::/\n",
+            V2.format("/") + V1.format("/"),
+            {
+                "memory/limit_in_bytes": "9223372036854771712",
+                "memory/usage_in_bytes": "10",
+                "memory/stat": "inactive_file 5\ntotal_inactive_file 9\n",
+                "memory/jobs/3/limit_in_bytes": "2000",
+                "memory/jobs/3/usage_in_bytes": "500",
+                "memory/jobs/3/stat": "inactive_file 5\ntotal_inactive_file 100\n",
+            },
+            1600,
+        ),
     ],
     ids=["nested", "above", "container", "outside", "elsewhere", "version 1"],
-)  # fmt: skip
+)
 def test_the_group_that_leaves_least_decides(groups, mounts, files, left, tmp_path):
     """Catches a limit of a batch job or a container that is not read, and memory of files counted as used."""
     assert memory.left_by_control_groups(tree(tmp_path, groups, mounts, files)) == left
 
 
-@pytest.mark.parametrize("text", ["", "\n", "0", "0::", ":::::\n", "x\0y", "4:memory\n", "9" * 5000, "- - - - - -\n",
-                                  "1 2 3 - cgroup2\n", "a - cgroup\n", " - \n"])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "\n",
+        "0",
+        "0::",
+        ":::::\n",
+        "x\0y",
+        "4:memory\n",
+        "9" * 5000,
+        "- - - - - -\n",
+        "1 2 3 - cgroup2\n",
+        "a - cgroup\n",
+        " - \n",
+    ],
+)
 def test_files_that_are_something_else_limit_nothing(text, tmp_path):
     """Catches a run that ends because a system writes these files in another way."""
     assert memory.left_by_control_groups(tree(tmp_path, text, V2.format("/") + V1.format("/"), {})) is None

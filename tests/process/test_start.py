@@ -57,8 +57,14 @@ GLIBC = pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason
 def printed(imports: str, program: str, **variables: str) -> str:
     """What a program prints that first imports some modules, with these variables of the environment."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith(SETTLED)}
-    done = subprocess.run([sys.executable, "-c", f"import {imports}\n{program}"], capture_output=True, text=True,
-                          cwd=ROOT, env=plain | variables, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {imports}\n{program}"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=plain | variables,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -101,8 +107,7 @@ def test_vectors_are_chosen_as_gsbench_is_imported(imports, capability, code, va
 
 
 @pytest.mark.parametrize(
-    ("flags", "wanted"),
-    [("fpu avx2 avx512f avx512bw", "avx2"), ("fpu avx2 fma", None), ("", None)],
+    ("flags", "wanted"), [("fpu avx2 avx512f avx512bw", "avx2"), ("fpu avx2 fma", None), ("", None)]
 )
 def test_nothing_is_set_without_avx512(flags, wanted, monkeypatch, tmp_path):
     """Catches AVX2 asked of a processor that may not have it, where torch would end by a signal."""

@@ -15,8 +15,15 @@ from gsbench.kernels.backends import AUTO, REFERENCE, resolve
 from gsbench.process import memory
 from gsbench.raster import native, rasterize
 
-TENSORS = {"means": (40, 3), "factors": (40, 3, 3), "opacities": (40,), "colors": (40, 3),
-           "viewmats": (1, 4, 4), "Ks": (1, 3, 3), "background": (3,)}  # fmt: skip
+TENSORS = {
+    "means": (40, 3),
+    "factors": (40, 3, 3),
+    "opacities": (40,),
+    "colors": (40, 3),
+    "viewmats": (1, 4, 4),
+    "Ks": (1, 3, 3),
+    "background": (3,),
+}
 NAN, INF = float("nan"), float("inf")
 SHAPES = torch.ones(40).double()
 
@@ -77,12 +84,14 @@ def test_shapes_types_and_values_of_tensors(name: str) -> None:
 def test_kinds_of_tensors(backend: str) -> None:
     """Catches half precision, sparse and complex tensors that fail in the depths or are drawn in too few digits."""
     kinds = {
-        "got float16: convert it by .to(torch.float32)": Tensor.half, "got bfloat16": Tensor.bfloat16,
-        "got complex64": lambda x: x.to(torch.complex64), "got int64": Tensor.long,
+        "got float16: convert it by .to(torch.float32)": Tensor.half,
+        "got bfloat16": Tensor.bfloat16,
+        "got complex64": lambda x: x.to(torch.complex64),
+        "got int64": Tensor.long,
         "expected a dense tensor, got a sparse_coo one": Tensor.to_sparse,
         "expected a tensor, got ndarray": Tensor.numpy,
         "on the meta device": lambda x: x.to("meta"),
-    }  # fmt: skip
+    }
     arguments = scene(torch.float32) | {"backend": backend}
     for message, change in kinds.items():
         for name in TENSORS:
@@ -92,10 +101,24 @@ def test_kinds_of_tensors(backend: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        *[({key: value}, f"{key}={value!r}") for key, value in (
-            ("width", 0), ("height", -3), ("width", 8.5), ("width", "8"), ("width", True), ("near", None),
-            ("near", 0.0), ("near", -1.0), ("near", NAN), ("far", NAN), ("eps2d", -0.1), ("eps2d", NAN),
-            ("eps2d", INF))],
+        *[
+            ({key: value}, f"{key}={value!r}")
+            for key, value in (
+                ("width", 0),
+                ("height", -3),
+                ("width", 8.5),
+                ("width", "8"),
+                ("width", True),
+                ("near", None),
+                ("near", 0.0),
+                ("near", -1.0),
+                ("near", NAN),
+                ("far", NAN),
+                ("eps2d", -0.1),
+                ("eps2d", NAN),
+                ("eps2d", INF),
+            )
+        ],
         ({"near": 2.0, "far": 2.0}, "far=2.0"),
         ({"antialias": "no"}, "antialias"),
         ({"backend": 3}, "backend"),
@@ -119,11 +142,17 @@ def test_kinds_of_tensors(backend: str) -> None:
         ({"beta_exponents": SHAPES.float()}, "beta_exponents: expected torch.float64 as means are, got torch.float32"),
         ({"beta_exponents": SHAPES.int()}, "beta_exponents: expected float32 or float64, got int32"),
         ({"beta_exponents": SHAPES.to("meta")}, "beta_exponents: expected a tensor with values"),
-        *[({"beta_exponents": torch.where(torch.arange(40) == 7, bad, SHAPES)}, f"beta_exponents: expected {message}")
-          for bad, message in ((0.0, "exponents above 0, got 0.0"), (-1.0, "exponents above 0, got -1.0"),
-                               (NAN, "finite"), (INF, "finite"))],
+        *[
+            ({"beta_exponents": torch.where(torch.arange(40) == 7, bad, SHAPES)}, f"beta_exponents: expected {message}")
+            for bad, message in (
+                (0.0, "exponents above 0, got 0.0"),
+                (-1.0, "exponents above 0, got -1.0"),
+                (NAN, "finite"),
+                (INF, "finite"),
+            )
+        ],
     ],
-)  # fmt: skip
+)
 def test_values(changes: dict[str, Any], message: str) -> None:
     """Catches a number out of its range, or numbers of rows that do not agree, that would draw an empty or a wrong
     picture without a word."""
@@ -141,8 +170,10 @@ def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch)
     """Catches more splats than int32 numbers because there are several cameras: 40 Gaussians in 2 are 80."""
     single = scene(torch.float32) | {"backend": "cpu"}
     monkeypatch.setattr(native, "MAX_PAIRS", 79)
-    refused(single | {name: single[name].repeat(2, 1, 1) for name in ("viewmats", "Ks")},
-            "at most 79 Gaussians times cameras, got 80")  # fmt: skip
+    refused(
+        single | {name: single[name].repeat(2, 1, 1) for name in ("viewmats", "Ks")},
+        "at most 79 Gaussians times cameras, got 80",
+    )
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -157,9 +188,12 @@ def test_memory_is_asked_for(backend: str, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(
     ("built", "has_kernels", "device", "message"),
-    [(True, True, "cpu", "no CUDA device was found"), (False, True, "cuda", "the CUDA kernels are not built"),
-     (False, False, "cpu", "kernels are not built .* is slow; reinstall with a C\\+\\+20 compiler")],
-)  # fmt: skip
+    [
+        (True, True, "cpu", "no CUDA device was found"),
+        (False, True, "cuda", "the CUDA kernels are not built"),
+        (False, False, "cpu", "kernels are not built .* is slow; reinstall with a C\\+\\+20 compiler"),
+    ],
+)
 def test_auto_warns_once_that_it_is_slow(
     built: bool, has_kernels: bool, device: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,9 +215,12 @@ def test_auto_warns_once_that_it_is_slow(
 
 @pytest.mark.parametrize(
     ("built", "device", "message"),
-    [(False, False, "it is not built here"), (True, False, "no CUDA device was found"),
-     (True, True, "does not render on device 'cpu': use device=cuda")],
-)  # fmt: skip
+    [
+        (False, False, "it is not built here"),
+        (True, False, "no CUDA device was found"),
+        (True, True, "does not render on device 'cpu': use device=cuda"),
+    ],
+)
 def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(
     built: bool, device: bool, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

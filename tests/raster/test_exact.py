@@ -34,8 +34,10 @@ def images(arguments: dict[str, Any], noise: float = 0.0, seed: int = 0) -> tupl
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
     single = tuple(arguments.get(name) for name in NAMES)
     g = torch.Generator().manual_seed(seed)
-    exact = [None if x is None else x.double() * (1 + noise * (2 * torch.rand(x.shape, generator=g).double() - 1))
-             for x in single]  # fmt: skip
+    exact = [
+        None if x is None else x.double() * (1 + noise * (2 * torch.rand(x.shape, generator=g).double() - 1))
+        for x in single
+    ]
     exact[2] = exact[2].clamp(0, 1)
     cameras = viewmats, Ks, width, height
     image = rasterize(*single[:4], *cameras, beta_exponents=single[4], backend="cpu", **rest).image[0]

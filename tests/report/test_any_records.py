@@ -38,20 +38,33 @@ def records(draw: st.DrawFn) -> list[Record]:
     def run(model: str, scene: str, seed: int, length: int) -> Record:
         took, ms = draw(st.sampled_from(seconds)), draw(st.sampled_from((5.0, 5.0, 0.0, 1e6)))
         record = but(
-            make("7dgs", scene, seed), model=model, dataset=dataset, effects=ANY_EFFECTS[model],
+            make("7dgs", scene, seed),
+            model=model,
+            dataset=dataset,
+            effects=ANY_EFFECTS[model],
             variant="" if length == max(LENGTHS) else f"iterations={length}",
             overrides=often(["+exp=mini", f"model={model}", f"scene={scene}", f"seed={seed}"], []),
-            provenance={"device": often("Invented CPU", "another CPU"), "git_commit": often("0" * 40, None),
-                        "config": often({"train": {"iterations": length}}, {})},
+            provenance={
+                "device": often("Invented CPU", "another CPU"),
+                "git_commit": often("0" * 40, None),
+                "config": often({"train": {"iterations": length}}, {}),
+            },
             metrics={"psnr": draw(psnr), "ssim": None, "lpips_alex": None, "psnr_best_on_val": None},
             missing=dict.fromkeys(("psnr", "ssim", "lpips_alex", "psnr_best_on_val"), "not measured"),
             per_view=often([ViewScore(f"test/r_{i}", draw(psnr)) for i in range(2)], []),
-            cost={"train_s": took, "stage_s": often({"raster": took}, {}), "render_ms": RenderTimes(ms, ms, ms),
-                  "fps": 1000 / ms if ms else 0.0, "bytes": often(10**6, 0), "load": often(3.0, None),
-                  "train_cpu_s": often(took, None)},
+            cost={
+                "train_s": took,
+                "stage_s": often({"raster": took}, {}),
+                "render_ms": RenderTimes(ms, ms, ms),
+                "fps": 1000 / ms if ms else 0.0,
+                "bytes": often(10**6, 0),
+                "load": often(3.0, None),
+                "train_cpu_s": often(took, None),
+            },
             curve=often([Point(i, took * i / length, draw(psnr)) for i in sorted({1, (length + 1) // 2, length})], []),
-            length_choice=often(None, LengthChoice(length, [])), stop=often(None, Stop(length, 1)),
-        )  # fmt: skip
+            length_choice=often(None, LengthChoice(length, [])),
+            stop=often(None, Stop(length, 1)),
+        )
         measured = {name: why for name, why in record.missing.items() if (record.metrics or {})[name] is None}
         screen = TimeScreen(
             draw(st.sampled_from(("on", "off", "undecided"))), "why", often(0.001, None), None, None, 0.1
@@ -62,9 +75,15 @@ def records(draw: st.DrawFn) -> list[Record]:
         status = draw(st.sampled_from(("failed", "diverged")))
         return often(record, lost(record, f"{status} in step 1", status))
 
-    protocol = {"name": "gsbench", "background": "black", "resize": None, "quantise": False, "paper_dataset": "D-NeRF",
-                "eval_split": draw(st.sampled_from(("test", "test", "val"))),
-                "resolution": draw(st.sampled_from(("400x400", "400x400", "100x100")))}  # fmt: skip
+    protocol = {
+        "name": "gsbench",
+        "background": "black",
+        "resize": None,
+        "quantise": False,
+        "paper_dataset": "D-NeRF",
+        "eval_split": draw(st.sampled_from(("test", "test", "val"))),
+        "resolution": draw(st.sampled_from(("400x400", "400x400", "100x100"))),
+    }
     psnr, seconds = st.sampled_from(some(PSNR, 2)), some(SECONDS, 2)  # equal runs and missing numbers are common
     dataset = draw(st.sampled_from(("D-NeRF", "mini")))
     names = (sorted(ANY_EFFECTS), ("trex", "lego", "suzanne"), (0, 1, 2), LENGTHS)

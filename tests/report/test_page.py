@@ -227,8 +227,9 @@ def test_strips_are_cut_back_to_their_images(tmp_path):
 def test_the_gallery_has_every_model_on_the_same_view_with_its_score(tmp_path):
     """Catches a view without a model, names and scores of other views, and regions that are not there."""
     runs = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
-    scored = [dataclasses.replace(view, psnr_moving=None if i == 3 else 20.0 + i)
-              for i, view in enumerate(runs[1].per_view)]  # fmt: skip
+    scored = [
+        dataclasses.replace(view, psnr_moving=None if i == 3 else 20.0 + i) for i, view in enumerate(runs[1].per_view)
+    ]
     runs[1] = but(runs[1], per_view=scored, regions={"moving": Region("masks", 9, 0.1, "0" * 64)})
     views = shown_views(write_all(runs, tmp_path, pictures=3))
     assert [view.name for view in views] == ["test/r_000", "test/r_003", "test/r_006"]
@@ -262,8 +263,9 @@ def test_text_from_a_record_cannot_break_a_form(tmp_path):
     """Catches a reason with a pipe, a newline or a command that breaks Markdown, LaTeX or a terminal, a formula that a
     spreadsheet computes, a negative number that is made a text, and a CSV that rounds."""
     nasty = "=a | b\nc <script> \x1b[31m \\input{/etc/passwd} % $x_1^2$ & #~"
-    of = results(make(dataset=nasty, metrics=make().metrics | {"psnr": -1.5000000001}),
-                 lost(make(seed=1, dataset=nasty), nasty))  # fmt: skip
+    of = results(
+        make(dataset=nasty, metrics=make().metrics | {"psnr": -1.5000000001}), lost(make(seed=1, dataset=nasty), nasty)
+    )
     shown = output.tables(of)
     markdown = text.markdown(shown)
     assert "<script" not in markdown

@@ -24,8 +24,13 @@ def test_every_average_matches_its_rows(dataset, model):
 def test_rows_by_hand():
     """Would catch columns read in another order: three rows read off the paper."""
     assert average("D-NeRF", ["trex"], "7dgs").to_dict() == {
-        "psnr_db": 30.72, "ssim": 0.980, "lpips_alex": 0.018, "train_min": 63.4, "fps": 156.5, "gaussians": 67994,
-    }  # fmt: skip
+        "psnr_db": 30.72,
+        "ssim": 0.980,
+        "lpips_alex": 0.018,
+        "train_min": 63.4,
+        "fps": 156.5,
+        "gaussians": 67994,
+    }
     assert average("Technicolor", ["Train", "Painter"], "4dgs").psnr_db == pytest.approx((32.58 + 35.09) / 2)
     assert math.isnan(average("7DGS-PBR", ["suzanne"], "7dgs_noagr").train_min)
     for key in (("mini", ["suzanne"], "7dgs"), ("D-NeRF", ["trex", "x"], "7dgs"), ("D-NeRF", [], "7dgs")):

@@ -40,8 +40,10 @@ def shown(*runs: Record, name: str = "table1") -> str:
 
 def all_scenes(model: str) -> list[Record]:
     """A run of each scene of D-NeRF, of 30, 31 .. 37 dB."""
-    return [at_paper(model, scene, psnr=30.0 + i, eval_split="val" if scene == "lego" else "test")
-            for i, scene in enumerate(D_NERF)]  # fmt: skip
+    return [
+        at_paper(model, scene, psnr=30.0 + i, eval_split="val" if scene == "lego" else "test")
+        for i, scene in enumerate(D_NERF)
+    ]
 
 
 def test_the_difference_is_of_like_with_like():
@@ -51,8 +53,14 @@ def test_the_difference_is_of_like_with_like():
     """
     runs = [at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0)]
     line = first_table(*runs).iloc[0]
-    expected = {"psnr_db": 30.5, "psnr_db ±": 12.7062 * 0.5, "psnr_db paper": 30.72, "psnr_db difference": -0.22,
-                "psnr_best_on_test_db difference": 31.0 - 30.72, "train_min paper": 63.4}  # fmt: skip
+    expected = {
+        "psnr_db": 30.5,
+        "psnr_db ±": 12.7062 * 0.5,
+        "psnr_db paper": 30.72,
+        "psnr_db difference": -0.22,
+        "psnr_best_on_test_db difference": 31.0 - 30.72,
+        "train_min paper": 63.4,
+    }
     assert {name: line[name] for name in expected} == pytest.approx(expected, abs=1e-3)
     assert pd.isna(line["train_min difference"])
     assert "| difference | -0.22 | 0.28 |" in shown(*runs)
@@ -96,8 +104,10 @@ def test_no_other_protocol_beside_the_papers_row(change, named):
 def test_each_data_set_has_its_own_protocol():
     """Would catch half resolution asked of Technicolor, 800x800 of heart1, test of lego, batches of 4 everywhere."""
     train = {"dataset": "Technicolor", "scene": "Train", "resolution": "2048x1088", "batch_size": 1}
-    right = [at_paper(dataset="7DGS-PBR", scene=scene, resolution=size)
-             for scene, size in (("heart1", "500x500"), ("heart2", "800x800"))]  # fmt: skip
+    right = [
+        at_paper(dataset="7DGS-PBR", scene=scene, resolution=size)
+        for scene, size in (("heart1", "500x500"), ("heart2", "800x800"))
+    ]
     right += [at_paper(scene="lego", eval_split="val"), at_paper(**train, frames=[151, 200])]
     assert [departure(run) for run in right] == [""] * 4
     assert departure(at_paper(**train, frames=[151, 199])) == "frames"
@@ -114,8 +124,11 @@ def test_finished_seeds_are_counted():
 def test_a_row_is_of_one_recipe_and_protocol():
     """Would catch the paper's learning rates averaged with gsbench's, images of another filter as more seeds of a row,
     one training counted as two seeds, and runs left out without a word."""
-    recipes = [at_paper(psnr=30.0), at_paper(psnr=20.0, variant="recipe=paper"),
-               at_paper(psnr=30.0, variant="best_on_test=true")]  # fmt: skip
+    recipes = [
+        at_paper(psnr=30.0),
+        at_paper(psnr=20.0, variant="recipe=paper"),
+        at_paper(psnr=30.0, variant="best_on_test=true"),
+    ]
     lines = first_table(*recipes)
     assert lines[["recipe", "seeds", "psnr_db"]].values.tolist() == [["", 1, 30.0], ["recipe=paper", 1, 20.0]]
     runs = [at_paper(seed=0), at_paper(seed=1, **BY_DGS), at_paper(seed=2, batch_size=1)]
@@ -123,7 +136,10 @@ def test_a_row_is_of_one_recipe_and_protocol():
     assert first_table(*runs)[["table", "seeds"]].values.tolist() == [["paper", 1], ["other protocol", 2]]
     of = pools(of_the_paper(results(*runs))).table
     assert of[["filter", "runs", "differs in", "shown"]].values.tolist() == [
-        ["", 1, "", True], ["", 2, "batch size", True], ["pillow", 1, "filter, quantisation", False]]  # fmt: skip
+        ["", 1, "", True],
+        ["", 2, "batch size", True],
+        ["pillow", 1, "filter, quantisation", False],
+    ]
 
 
 def test_a_row_names_its_experiment_where_a_table_has_two():
@@ -216,17 +232,19 @@ def test_a_row_of_a_successor_has_one_protocol_and_names_it():
 
     Also images of one size kept apart, because one folder has them at twice that size.
     """
-    rows = successors(results(
-        at_paper("dgs", seed=0, psnr=30.0),
-        at_paper("dgs", seed=6, psnr=30.0, downscale=1, variant="device=cuda,downscale=1"),
-        at_paper("dgs", seed=1, psnr=31.0, **BY_DGS),
-        at_paper("dgs", seed=2, psnr=32.0, quantise=True),
-        at_paper("dgs", seed=3, psnr=33.0, batch_size=1, variant="recipe=mcmc,batch_size=1"),
-        at_paper("dgs", seed=4, psnr=34.0, downscale=8, resolution="100x100", iterations=500),
-        at_paper("dgs", seed=5, psnr=35.0, eval_split="val"),
-        at_paper("3dgs", psnr=20.0),
-        at_paper("dgs", psnr=21.0, dataset="mini"),
-    ))  # fmt: skip
+    rows = successors(
+        results(
+            at_paper("dgs", seed=0, psnr=30.0),
+            at_paper("dgs", seed=6, psnr=30.0, downscale=1, variant="device=cuda,downscale=1"),
+            at_paper("dgs", seed=1, psnr=31.0, **BY_DGS),
+            at_paper("dgs", seed=2, psnr=32.0, quantise=True),
+            at_paper("dgs", seed=3, psnr=33.0, batch_size=1, variant="recipe=mcmc,batch_size=1"),
+            at_paper("dgs", seed=4, psnr=34.0, downscale=8, resolution="100x100", iterations=500),
+            at_paper("dgs", seed=5, psnr=35.0, eval_split="val"),
+            at_paper("3dgs", psnr=20.0),
+            at_paper("dgs", psnr=21.0, dataset="mini"),
+        )
+    )
     measured = rows[rows.row == "measured"].sort_values("psnr_db")
     assert measured[["recipe", "protocol", "seeds", "psnr_db"]].values.tolist() == [
         ["", "gsbench, 1, 30,000 x 4", 2, 30.0],

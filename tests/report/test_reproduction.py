@@ -10,16 +10,7 @@ from records import but, frontier, lost, on_demand, results, write_all
 
 from gsbench.measure.machine import Hardware
 from gsbench.report.__main__ import main
-from gsbench.report.reproduction import (
-    AGREES,
-    DIFFERS,
-    LIMITS,
-    UNDECIDED,
-    compare,
-    reasons,
-    sections,
-    summary,
-)
+from gsbench.report.reproduction import AGREES, DIFFERS, LIMITS, UNDECIDED, compare, reasons, sections, summary
 
 SEEDS = (0, 1, 2)
 WIDE = "the interval is too wide: more seeds are needed"
@@ -62,37 +53,48 @@ def reason(of, quantity):
     return text
 
 
+def late(r):
+    return moved(apart(r), 0.001 * r.seed)
+
+
+def better(r):
+    return moved(NOISY(r), 0.7)
+
+
 NOISY = by(0.6, -0.7, 0.1)
-CASES = {  # new runs, reference runs; verdict on PSNR, runs that are bit-equal, of how many; why undecided
-    "equal": (runs(0), runs(*SEEDS), AGREES, (10, 10), {}),
+THREE = runs(*SEEDS)
+ONE_NOISY = runs(*SEEDS, change=of_one(by(1.0, -2.0, 1.5)))
+ONE_LOST = runs(*SEEDS, change=lambda r: lost(r) if r.model == "7dgs" else r)
+SHORTER = runs(*SEEDS, change=lambda r: but(r, provenance={"config": {"train": {"iterations": 5}}}))
+OTHER_DATA = runs(*SEEDS, change=lambda r: but(r, provenance={"data_hash": "77"}))
+ROUNDED = runs(*SEEDS, change=lambda r: but(r, protocol={"quantise": True}))
+OTHERWISE = "measured otherwise: quantise True instead of False"
+OTHER_LENGTH = "another training: train.iterations"
+OTHER_LENGTHS = {REFERENCE_ONLY: 10} | {f"{OTHER_LENGTH} {n} instead of 1000": 10 for n in (250, 500)}
+APART = {REFERENCE_ONLY: 2, "only the new folder has it": 2}
+NOISY_THREE = runs(*SEEDS, change=NOISY)
+# New runs, reference runs; verdict on PSNR, runs that are bit-equal, of how many; why undecided.
+CASES = {
+    "equal": (runs(0), THREE, AGREES, (10, 10), {}),
     "equal bits whatever the spread": (runs(0, change=apart), runs(*SEEDS, change=apart), AGREES, (10, 10), {}),
     "a seed on one side": (runs(*SEEDS, change=apart), runs(0, 1, change=apart), AGREES, (20, 20), {}),
-    "equal bits of a few runs": (runs(0, 1, change=lambda r: moved(apart(r), 0.001 * r.seed)),
-                                 runs(*SEEDS, change=apart), UNDECIDED, (10, 20), {WIDE: 10}),
+    "equal bits of a few runs": (runs(0, 1, change=late), runs(*SEEDS, change=apart), UNDECIDED, (10, 20), {WIDE: 10}),
     "other seeds": (runs(0), runs(1, 2, 3), AGREES, (0, 0), {}),
-    "a run where another seed would lie": (runs(0, change=by(0.7)), runs(*SEEDS, change=NOISY), AGREES, (0, 10), {}),
-    "a run far off": (runs(0, change=by(-5.0)), runs(*SEEDS, change=NOISY), DIFFERS, (0, 10), {}),
-    "a mean of two, whose interval is wide": (runs(0, 1, change=lambda r: moved(NOISY(r), 0.7)),
-                                              runs(*SEEDS, change=NOISY), UNDECIDED, (0, 20), {WIDE: 10}),
+    "a run where another seed would lie": (runs(0, change=by(0.7)), NOISY_THREE, AGREES, (0, 10), {}),
+    "a run far off": (runs(0, change=by(-5.0)), NOISY_THREE, DIFFERS, (0, 10), {}),
+    "a mean of two, whose interval is wide": (runs(0, 1, change=better), NOISY_THREE, UNDECIDED, (0, 20), {WIDE: 10}),
     "one run on each side": (runs(0, change=by(0.3)), runs(0), UNDECIDED, (0, 10), {SINGLE: 10}),
     "one equal run on each side": (runs(0), runs(0), AGREES, (10, 10), {}),
-    "one model better": (runs(0, change=of_one(by(1.5))), runs(*SEEDS), DIFFERS, (9, 10), {}),
-    "one model worse": (runs(0, change=of_one(by(-1.5))), runs(*SEEDS), DIFFERS, (9, 10), {}),
-    "a noisy model by its spread": (runs(0, change=of_one(by(-3.0))), runs(*SEEDS, change=of_one(by(1.0, -2.0, 1.5))),
-                                    UNDECIDED, (9, 10), {WIDE: 1}),
-    "another training": (runs(*SEEDS, change=lambda r: but(r, provenance={"config": {"train": {"iterations": 5}}})),
-                         runs(*SEEDS), UNDECIDED, (0, 0), {"another training: train.iterations 5 instead of 1000": 10}),
-    "other data": (runs(*SEEDS, change=lambda r: but(r, provenance={"data_hash": "77"})), runs(*SEEDS), UNDECIDED,
-                   (0, 0), {"other data": 10}),
-    "renders through 8 bits": (runs(*SEEDS, change=lambda r: but(r, protocol={"quantise": True})), runs(*SEEDS),
-                               UNDECIDED, (0, 0), {"measured otherwise: quantise True instead of False": 10}),
-    "other lengths": (runs(0, lengths=(250, 500)), runs(*SEEDS), UNDECIDED, (0, 0), {REFERENCE_ONLY: 10} | {
-                      f"another training: train.iterations {n} instead of 1000": 10 for n in (250, 500)}),
-    "not finished": (runs(*SEEDS, change=lambda r: lost(r) if r.model == "7dgs" else r), runs(*SEEDS), UNDECIDED,
-                     (24, 24), {"no new run finished": 2}),
-    "nothing in common": (runs(0, models=("3dgs",)), runs(0, models=("7dgs",)), UNDECIDED, (0, 0),
-                          {REFERENCE_ONLY: 2, "only the new folder has it": 2}),
-}  # fmt: skip
+    "one model better": (runs(0, change=of_one(by(1.5))), THREE, DIFFERS, (9, 10), {}),
+    "one model worse": (runs(0, change=of_one(by(-1.5))), THREE, DIFFERS, (9, 10), {}),
+    "a noisy model by its spread": (runs(0, change=of_one(by(-3.0))), ONE_NOISY, UNDECIDED, (9, 10), {WIDE: 1}),
+    "another training": (SHORTER, THREE, UNDECIDED, (0, 0), {f"{OTHER_LENGTH} 5 instead of 1000": 10}),
+    "other data": (OTHER_DATA, THREE, UNDECIDED, (0, 0), {"other data": 10}),
+    "renders through 8 bits": (ROUNDED, THREE, UNDECIDED, (0, 0), {OTHERWISE: 10}),
+    "other lengths": (runs(0, lengths=(250, 500)), THREE, UNDECIDED, (0, 0), OTHER_LENGTHS),
+    "not finished": (ONE_LOST, THREE, UNDECIDED, (24, 24), {"no new run finished": 2}),
+    "nothing in common": (runs(0, models=("3dgs",)), runs(0, models=("7dgs",)), UNDECIDED, (0, 0), APART),
+}
 
 
 @pytest.mark.parametrize(("new", "reference", "verdict", "bit_equal", "why"), CASES.values(), ids=CASES)
@@ -135,8 +137,15 @@ def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
         def change(r):
             by = factors[r.seed] * (1 + 0.02 * len(r.model))
             times = dataclasses.replace(r.cost.render_ms, p50=by * r.cost.render_ms.p50)
-            return but(r, cost={"num_gaussians": round(4000 * by), "bytes": round(by * r.cost.bytes),
-                                "train_s": by * r.cost.train_s, "render_ms": times})  # fmt: skip
+            return but(
+                r,
+                cost={
+                    "num_gaussians": round(4000 * by),
+                    "bytes": round(by * r.cost.bytes),
+                    "train_s": by * r.cost.train_s,
+                    "render_ms": times,
+                },
+            )
 
         return runs(*SEEDS, change=change)
 
@@ -171,8 +180,13 @@ def test_the_numbers_of_any_two_folders_add_up(seed):
 
     def folder():
         kept = [pool[i] for i in random.permutation(len(pool))[: random.integers(1, len(pool))]]
-        changed = [lambda r: moved(r, random.normal()), lost, lambda r: r, lambda r: but(r, cost={"num_gaussians": 9}),
-                   lambda r: but(r, provenance={"data_hash": "7"})]  # fmt: skip
+        changed = [
+            lambda r: moved(r, random.normal()),
+            lost,
+            lambda r: r,
+            lambda r: but(r, cost={"num_gaussians": 9}),
+            lambda r: but(r, provenance={"data_hash": "7"}),
+        ]
         return [changed[random.integers(len(changed))](r) for r in kept]
 
     new, reference = folder(), folder()

@@ -39,8 +39,11 @@ DB = {"3dgs": 20.0, "4dgs": 24.0, "6dgs": 21.0, "7dgs_noagr": 27.0, "7dgs": 29.0
 
 def with_effects(*names):
     """Three seeds of models of DB with their effects."""
-    return [but(run(name, seed, (DB[name] + seed / 100, DB[name] + 1)), effects=EFFECTS[name])
-            for name in names for seed in range(3)]  # fmt: skip
+    return [
+        but(run(name, seed, (DB[name] + seed / 100, DB[name] + 1)), effects=EFFECTS[name])
+        for name in names
+        for seed in range(3)
+    ]
 
 
 def at(model, *, views=1, **changes):
@@ -123,9 +126,9 @@ def test_an_effect_is_priced_from_published_models():
     published = with_effects("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
     section = sections(*published, *(but(r, model="3dgs_new") for r in with_effects("3dgs")))["effects"]
     priced = dict(zip(section.table.effect, section.table.dB, strict=True))
-    assert priced == pytest.approx({
-        "time alone": 4.0, "time, with direction": 6.0, "direction alone": 1.0, "direction, with time": 3.0,
-        "AGR, with time and direction": 2.0, "time × direction": 2.0})  # fmt: skip
+    expected = {"time alone": 4.0, "time, with direction": 6.0, "direction alone": 1.0, "direction, with time": 3.0}
+    expected |= {"AGR, with time and direction": 2.0, "time × direction": 2.0}
+    assert priced == pytest.approx(expected)
     assert section.table["computed from"].iloc[-1] == "3dgs + 7dgs_noagr − 4dgs − 6dgs"
     for part in ("3 of 8 combinations", "3dgs_new"):
         assert any(part in note for note in section.notes)
@@ -170,8 +173,10 @@ def test_a_choice_counts_what_is_undecided():
 
 def test_a_run_beside_other_work_is_counted():
     """Catches a load that is compared without the CPU-seconds of the run itself."""
-    runs = [but(run(seed=s), cost={"load": load, "train_s": 100.0, "train_cpu_s": 150.0})
-            for s, load in ((0, 1.9), (1, 2.1))]  # fmt: skip
+    runs = [
+        but(run(seed=s), cost={"load": load, "train_s": 100.0, "train_cpu_s": 150.0})
+        for s, load in ((0, 1.9), (1, 2.1))
+    ]
     assert is_beside_others(chapter(*runs).runs).tolist() == [False, True]
 
 
@@ -186,8 +191,13 @@ def test_seconds_of_another_machine_are_nowhere():
             gates=[dataclasses.replace(g, frame_ms_before=7777.0, frame_ms=7777.0) for g in r.on_demand.gates],
             screen=dataclasses.replace(r.on_demand.screen, seconds=7777.0),
         )
-        slow = {"train_s": 77777.0, "stage_s": {"slice": 77777.0}, "render_ms": RenderTimes(7777.0, 7777.0, 7777.0),
-                "train_cpu_s": 77777.0, "load": 777.0}  # fmt: skip
+        slow = {
+            "train_s": 77777.0,
+            "stage_s": {"slice": 77777.0},
+            "render_ms": RenderTimes(7777.0, 7777.0, 7777.0),
+            "train_cpu_s": 77777.0,
+            "load": 777.0,
+        }
         curve = [Point(p.iteration, 77777.0, p.psnr_val) for p in r.curve]
         return but(r, provenance={"device": "another CPU"}, cost=slow, curve=curve, on_demand=chosen)
 
@@ -232,8 +242,7 @@ def test_targets_are_as_far_apart_as_gives_three(low, high, expected):
 
 
 @pytest.mark.parametrize(
-    ("dataset", "size", "expected"),
-    [("D-NeRF", "400x400", [30.72]), ("mini", "400x400", []), ("D-NeRF", "80x80", [])],
+    ("dataset", "size", "expected"), [("D-NeRF", "400x400", [30.72]), ("mini", "400x400", []), ("D-NeRF", "80x80", [])]
 )
 def test_the_papers_number_is_a_target_only_on_its_own_images(dataset, size, expected):
     """Catches the paper's 30.72 dB of trex as a target of a stand-in of that name, and of images of another size."""
@@ -272,10 +281,14 @@ def test_the_kept_length_is_the_one_before_val_falls():
     """Catches the length that is best on test, or the last one tried."""
     psnr = {500: (20.0, 20.0), 1000: (21.0, 22.0), 2000: (23.0, 21.0), 4000: (24.0, 30.0)}  # test, val
     runs = [
-        but(run("a", 0, (test,)), variant="" if n == 1000 else f"iterations={n}", curve=[Point(n, 9.0, val)],
-            provenance={"config": {"train": {"iterations": n}}})
+        but(
+            run("a", 0, (test,)),
+            variant="" if n == 1000 else f"iterations={n}",
+            curve=[Point(n, 9.0, val)],
+            provenance={"config": {"train": {"iterations": n}}},
+        )
         for n, (test, val) in psnr.items()
-    ]  # fmt: skip
+    ]
     (row,) = by_length(chapter(*runs).runs).to_dict("records")
     assert (row["kept"], row["tried"]) == (21.0, 3500)
     assert sections(*runs)["lengths"].table["4,000 rank"].tolist() == [1]
@@ -307,8 +320,12 @@ def test_every_run_is_listed_with_its_command():
 
 def test_averages_are_over_the_scenes_that_all_models_finished():
     """Catches a mean of other scenes than those of the model beside it."""
-    runs = [run("a", scene="x", views=(20.0,)), run("a", scene="y", views=(30.0,)), run("b", scene="x", views=(21.0,)),
-            lost(run("b", scene="y"))]  # fmt: skip
+    runs = [
+        run("a", scene="x", views=(20.0,)),
+        run("a", scene="y", views=(30.0,)),
+        run("b", scene="x", views=(21.0,)),
+        lost(run("b", scene="y")),
+    ]
     rows = table(chapter(*runs), []).table
     average = rows[rows.scene == "average over 1 of 2 scenes"]
     assert average.psnr_db.tolist() == [20.0, 21.0]

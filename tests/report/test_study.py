@@ -15,8 +15,10 @@ from gsbench.measure.record import LengthChoice, OnDemand, Record, Region, Stop,
 from gsbench.report import frame, study
 from gsbench.report.output import publish
 
-TEXTS = ("", "1", "1e5", "1.0 ", "true", "null", "NaN", "[1", '"', "=1+1", "-2", "+3", "@x", " a,b\n\t", "ü\u202e",
-         HOSTILE)  # fmt: skip
+TEXTS = (
+    *("", "1", "1e5", "1.0 ", "true", "null", "NaN", "[1", '"'),
+    *("=1+1", "-2", "+3", "@x", " a,b\n\t", "ü\u202e", HOSTILE),
+)
 
 
 def hard() -> list[Record]:
@@ -26,11 +28,17 @@ def hard() -> list[Record]:
     odd = but(
         make("4dgs", seed=2, missing={"psnr_train": "=cmd", "lpips_vgg": ""}),
         per_view=[ViewScore(text, 0.1 + 0.2, lpips_alex=None) for text in TEXTS],
-        curve=[Point(1, 0.1, None), Point(2, 1 / 3, 20.0)], stop=Stop(2, 1), on_demand=OnDemand(gates=gates()),
-        length_choice=LengthChoice(10, []), regions={"moving": Region("masks", 1, 0.1, "d")}, exact=["a"],
-        dataset=HOSTILE, overrides=list(TEXTS), metrics={"psnr_train": None, "lpips_vgg": None},
+        curve=[Point(1, 0.1, None), Point(2, 1 / 3, 20.0)],
+        stop=Stop(2, 1),
+        on_demand=OnDemand(gates=gates()),
+        length_choice=LengthChoice(10, []),
+        regions={"moving": Region("masks", 1, 0.1, "d")},
+        exact=["a"],
+        dataset=HOSTILE,
+        overrides=list(TEXTS),
+        metrics={"psnr_train": None, "lpips_vgg": None},
         provenance={"config": config, "data_notes": ["\x1b[31m"], "git_commit": "12e4567"},
-    )  # fmt: skip
+    )
     rendered = but(elsewhere(make(), "other", bytes=12_345_678), parts={"score": {"dssim1": 1 / 3}})
     return [make(), rendered, odd, lost(make(seed=1), "=out"), *frontier(("3dgs",), ("suzanne",), 2, views=3)]
 

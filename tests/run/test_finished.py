@@ -91,24 +91,40 @@ QUANTISED = "what is measured is another (protocol.quantise True instead of Fals
     ("words", "change", "reason", "trains"),
     [
         ((), lambda _: None, f"{KEPT}.* on this machine; ", False),
-        ((), lambda run: run.change(device="another CPU", hardware=None, time="2026-01-02T"),
-         "measured 2026-01-02 on another CPU, {threads}; ", False),
+        (
+            (),
+            lambda run: run.change(device="another CPU", hardware=None, time="2026-01-02T"),
+            "measured 2026-01-02 on another CPU, {threads}; ",
+            False,
+        ),
         (("train.checkpoint_minutes=9", "data.root={moved}"), Finished.lose_checkpoint, KEPT, False),
         (("protocol.quantise=true",), lambda _: None, rf"{QUANTISED}measured again", False),
-        (("protocol.quantise=true",), Finished.lose_checkpoint, f"{QUANTISED}its checkpoint is gone: running again",
-         True),
-        ((), Finished.of_older_config,
-         r"the training is another (train.iterations 4 instead of 1000): running again", True),
+        (
+            ("protocol.quantise=true",),
+            Finished.lose_checkpoint,
+            f"{QUANTISED}its checkpoint is gone: running again",
+            True,
+        ),
+        (
+            (),
+            Finished.of_older_config,
+            r"the training is another (train.iterations 4 instead of 1000): running again",
+            True,
+        ),
         ((), lambda run: run.change(data_hash="0" * 64), "the scene's data has changed: running again", False),
     ],
     ids=["kept", "elsewhere", "moved", "measured", "no checkpoint", "training", "data"],
     indirect=["trains"],
-)  # fmt: skip
+)
 @pytest.mark.usefixtures("trains")
 def test_what_differs_is_named_and_nothing_else_is_done(
-    words: tuple[str, ...], change: Callable[[Finished], None], reason: str, run: Finished, tmp_path: Path,
+    words: tuple[str, ...],
+    change: Callable[[Finished], None],
+    reason: str,
+    run: Finished,
+    tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a training of hours that is announced as a measurement, repeated because data were moved, or done for no
     reason that is said, and a stranger who takes a kept record's seconds for his own machine's."""
     (tmp_path / "moved").symlink_to(run.data)

@@ -38,10 +38,12 @@ def named(*words: str) -> RunSpec:
         (["model=auto", "effects.gate=off"], "auto,gate=off"),
         (["model=auto", "effects.compare=true"], "auto,compare=true"),
         (["model=auto", "effects.gate=off", "effects.compare=true"], "auto,gate=off,compare=true"),
-        (["model=auto", "effects.compare=true", "model.compared.moving_4dgs.options.time_degree=1"],
-         "auto,compared.moving_4dgs.options.time_degree=1,compare=true"),
+        (
+            ["model=auto", "effects.compare=true", "model.compared.moving_4dgs.options.time_degree=1"],
+            "auto,compared.moving_4dgs.options.time_degree=1,compare=true",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder: str) -> None:
     """Catches two runs in one folder, and a folder named after what the experiment does anyway."""
     run = named(*words)
@@ -50,13 +52,14 @@ def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder:
 
 
 MEASURING = (
-    "protocol.pictures=1", "protocol.quantise=true", "protocol.renders=60", "data.published=there", "data.root=/x",
-    "train.checkpoint_minutes=9", "protocol.lpips_alex=weights.npz", "results=elsewhere", "resume=false", "log=wandb",
-)  # fmt: skip
+    *("protocol.pictures=1", "protocol.quantise=true", "protocol.renders=60", "protocol.lpips_alex=weights.npz"),
+    *("data.published=there", "data.root=/x", "train.checkpoint_minutes=9"),
+    *("results=elsewhere", "resume=false", "log=wandb"),
+)
 TRAINING = (
-    "seed=1", "train.iterations=9", "model.lr.means.end=1e-5", "scene.eval_split=val", "protocol.best_on_test=true",
-    "data.initial_points=9", "raster.backend=reference", "scene.resize=pillow",
-)  # fmt: skip
+    *("seed=1", "train.iterations=9", "model.lr.means.end=1e-5", "data.initial_points=9", "raster.backend=reference"),
+    *("scene.eval_split=val", "scene.resize=pillow", "protocol.best_on_test=true"),
+)
 
 
 @pytest.mark.parametrize("word", [*MEASURING, *TRAINING])
@@ -102,12 +105,14 @@ def test_a_comparison_is_training_and_its_candidates_count_only_with_it() -> Non
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("model=6dgs ~model.options.directional_half",
-         r"'model\.options\.directional_half': expected a value, it was deleted"),
+        (
+            "model=6dgs ~model.options.directional_half",
+            r"'model\.options\.directional_half': expected a value, it was deleted",
+        ),
         ("experiment=published", "another name than 'published'"),
         ("scene.name=published", "another name than 'published'"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_name_a_run_is_refused(words: str, message: str) -> None:
     """Catches another training in the folder of the default, as a class has other defaults than YAML, and a run whose
     record every table passes by, as it lies among those that are published."""

@@ -53,8 +53,12 @@ def trainer(*points: tuple[int, float, float], step: int | None = None) -> Any:
 
 def run_in(folder: Path, log: str | None = None) -> Any:
     scene = SimpleNamespace(eval_split="test")
-    return SimpleNamespace(folder=folder, name="square 7dgs seed0", plain={"train": {"iterations": 30}},
-                           config=SimpleNamespace(scene=scene, log=log, experiment="mini", resume=True))  # fmt: skip
+    return SimpleNamespace(
+        folder=folder,
+        name="square 7dgs seed0",
+        plain={"train": {"iterations": 30}},
+        config=SimpleNamespace(scene=scene, log=log, experiment="mini", resume=True),
+    )
 
 
 # ---- curve.jsonl

@@ -42,9 +42,13 @@ def test_the_best_iteration_is_chosen_on_val(
 
 @pytest.mark.parametrize(
     ("last", "sentence"),
-    [(24.5, "PSNR on val was 0.50 dB higher at iteration 600: a shorter training may be better"), (24.95, None),
-     (25.2, None), (None, None)],
-)  # fmt: skip
+    [
+        (24.5, "PSNR on val was 0.50 dB higher at iteration 600: a shorter training may be better"),
+        (24.95, None),
+        (25.2, None),
+        (None, None),
+    ],
+)
 def test_a_training_that_was_better_earlier_says_so(last: float | None, sentence: str | None) -> None:
     """Catches a training that overfits in silence, and one that is called too long for less than seeds differ by."""
     record = replace(make(), curve=[Point(300, 1.0, 24.0), Point(600, 2.0, 25.0), Point(900, 3.0, last)])

@@ -45,13 +45,15 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("3dgs", "train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
         ("3dgs", "train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
         ("3dgs", "train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
-        *((model, "train.penalties.strain.weight=0.1", "train.penalties.strain: expected a model that observes time")
-          for model in ("3dgs", "6dgs")),
+        *(
+            (model, "train.penalties.strain.weight=0.1", "train.penalties.strain: expected a model that observes time")
+            for model in ("3dgs", "6dgs")
+        ),
         ("3dgs", "train.coarse=[[2,3000],[4,15000]]", PAIRS),
         *(("3dgs", f"train.coarse={pairs}", PAIRS) for pairs in ("[[1,3000]]", "[[]]", "[[4,3000,1]]")),
         ("3dgs", "train.coarse=[[2,3000]]", "train.coarse, after the factor 2: expected images of at least 11 pixels"),
     ],
-)  # fmt: skip
+)
 def test_settings_are_refused_before_the_first_step(model: str, words: str, message: str | None) -> None:
     """Catches a key that does nothing, a typo that trains by another rule than was asked for, a training of no step,
     and results on the views by which a choice was made."""

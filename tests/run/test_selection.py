@@ -50,15 +50,27 @@ SLOW = "model.candidates.moving.lr.opacities.start=1e-4"  # so that another cand
 MODELS = Choice(
     ("model=auto", "effects.compare=true", SLOW, *OF_MODELS),
     ("model=4dgs", "effects.gate=both", *OF_MODELS),
-    ("7dgs", "4dgs", "7dgs_noagr", "6dgs"), "4dgs", 21, 30, 3 * 21 + 30, {"midway": 17, "chosen": 4 * 21 + 1},
-    failing=("4dgs", "6dgs"), then="7dgs_noagr",
-)  # fmt: skip
+    ("7dgs", "4dgs", "7dgs_noagr", "6dgs"),
+    "4dgs",
+    21,
+    30,
+    3 * 21 + 30,
+    {"midway": 17, "chosen": 4 * 21 + 1},
+    failing=("4dgs", "6dgs"),
+    then="7dgs_noagr",
+)
 LENGTHS = Choice(
     (*OF_LENGTHS, "train.iterations=80", "train.lengths=4"),
     (*OF_LENGTHS, "train.iterations=20"),
-    ("iterations=10", "iterations=20", "iterations=40"), "iterations=20", 20, 20, 10 + 20 + 40,
-    {"midway": 7, "chosen": 71}, failing=("iterations=10", "iterations=40"), then="iterations=20",
-)  # fmt: skip
+    ("iterations=10", "iterations=20", "iterations=40"),
+    "iterations=20",
+    20,
+    20,
+    10 + 20 + 40,
+    {"midway": 7, "chosen": 71},
+    failing=("iterations=10", "iterations=40"),
+    then="iterations=20",
+)
 LOSS = {40: 30.0}  # dB that val loses at a length, as if 40 steps learnt the training views by heart
 
 
@@ -264,9 +276,11 @@ def test_candidates_are_those_of_the_settings() -> None:
     """Catches AGR in a candidate that has none, equal candidates twice, and names that hide one another."""
     by_label = candidates(compose("auto", 10, "effects.compare=true"))
     assert {label: (config.model.name, config.agr, config.model.gate) for label, config in by_label.items()} == {
-        "7dgs": ("7dgs", True, "both"), "4dgs": ("4dgs", False, "both"), "7dgs_noagr": ("7dgs", False, "both"),
+        "7dgs": ("7dgs", True, "both"),
+        "4dgs": ("4dgs", False, "both"),
+        "7dgs_noagr": ("7dgs", False, "both"),
         "6dgs": ("6dgs", False, "both"),
-    }  # fmt: skip
+    }
     assert list(candidates(compose("auto", 10, "agr=false"))) == ["7dgs_noagr", "4dgs", "6dgs"]
     changed = compose("auto", 10, "agr=false", "model.compared.moving_noagr.lr.means.start=1")
     with pytest.raises(InputError, match="two are '7dgs_noagr'"):
@@ -281,8 +295,9 @@ def test_candidates_are_those_of_the_settings() -> None:
 
 def test_each_length_is_twice_the_one_before() -> None:
     """Catches a last length that is not the one which was asked for, and odd numbers that are not halved."""
-    assert [(each.train.iterations, each.train.lengths) for each in lengths(compose("7dgs", 75, "train.lengths=3"))
-            .values()] == [(18, None), (37, None), (75, None)]  # fmt: skip
+    assert [
+        (each.train.iterations, each.train.lengths) for each in lengths(compose("7dgs", 75, "train.lengths=3")).values()
+    ] == [(18, None), (37, None), (75, None)]
 
 
 def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

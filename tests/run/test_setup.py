@@ -79,8 +79,8 @@ def test_the_record_names_a_replaced_image(tmp_path: Path) -> None:
     for frame in (3, 4):
         for camera in range(COUNT):
             assert cv2.imwrite(str(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png"), image)
-    words = ["+exp=technicolor", "model=3dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=Tiny",
-             "data.initial_points=20", "train.iterations=1", "protocol.pictures=0", f"results={tmp_path}"]  # fmt: skip
+    words = ["+exp=technicolor", "model=3dgs", "scene=custom", "scene.name=Tiny", "data.initial_points=20"]
+    words += ["train.iterations=1", "protocol.pictures=0", f"data.root={tmp_path}", f"results={tmp_path}"]
     assert "repaired" not in run_here(*words)[0].protocol
     damage(folder, "Tiny_undist_00004_09")
     assert "data.repair=[Tiny_undist_00004_09]" in (run_here(*words)[0].reason or "")
@@ -135,9 +135,14 @@ def test_a_run_starts_from_a_ply(model: str, words: list[str], tmp_path: Path) -
     ],
 )
 def test_a_ply_that_cannot_be_the_start_is_refused(
-    count: int, away: int, more: str, reason: str | None, words: list[str], tmp_path: Path,
+    count: int,
+    away: int,
+    more: str,
+    reason: str | None,
+    words: list[str],
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a refusal without a record, a hash that nothing is compared with, a training of black images, and one of
     a few Gaussians in sight without a line."""
     write_trained(tmp_path / "a.ply", count, away)

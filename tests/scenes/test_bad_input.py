@@ -104,11 +104,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png with too few rows": (write(IMAGE, png(8, 6, bytes(33))), IMAGE, "cannot decode"),
     "png of 10 GB": (lambda root: os.truncate(root / IMAGE, 10**10), IMAGE, "at most"),
     "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "3 bits"),
-    "png of interlacing 9": (
-        write(IMAGE, png(8, 6, bytes(6 * 33), interlacing=9)),
-        IMAGE,
-        "interlacing is unknown",
-    ),
+    "png of interlacing 9": (write(IMAGE, png(8, 6, bytes(6 * 33), interlacing=9)), IMAGE, "interlacing is unknown"),
     "png is grey": (write(IMAGE, png(8, 6, bytes(9 * 6), color=0)), IMAGE, "RGB or RGBA"),
     "png of another size": (paint(IMAGE, 6, 9, 4), IMAGE, "9x6"),
     "png of another size in test": (paint("test/r_0.png", 3, 8, 4), "test/r_0.png", "8x3"),
@@ -269,17 +265,28 @@ def test_a_damaged_png_is_refused(at: int, flip: int) -> None:
 
 BOMB = zlib.compress(bytes(10**8))
 CHUNKS = [
-    (b"PLTE", bytes(768)), (b"PLTE", b"\0"), (b"tRNS", bytes(6)), (b"gAMA", bytes(4)), (b"iCCP", b"a\0\0" + BOMB),
-    (b"zTXt", b"a\0\0" + BOMB), (b"iTXt", b"a\0\1\0\0\0" + BOMB), (b"eXIf", b"MM\0*" + bytes(20)),
-    (b"IDAT", b"\xff" * 20), (b"acTL", struct.pack(">II", 2**31 - 1, 0)), (b"ABCD", bytes(8)), (b"abCd", bytes(8)),
-]  # fmt: skip
+    (b"PLTE", bytes(768)),
+    (b"PLTE", b"\0"),
+    (b"tRNS", bytes(6)),
+    (b"gAMA", bytes(4)),
+    (b"iCCP", b"a\0\0" + BOMB),
+    (b"zTXt", b"a\0\0" + BOMB),
+    (b"iTXt", b"a\0\1\0\0\0" + BOMB),
+    (b"eXIf", b"MM\0*" + bytes(20)),
+    (b"IDAT", b"\xff" * 20),
+    (b"acTL", struct.pack(">II", 2**31 - 1, 0)),
+    (b"ABCD", bytes(8)),
+    (b"abCd", bytes(8)),
+]
 
 
 @given(
     st.sampled_from([(8, 6), (1, 1), (4096, 1), (0, 6), (65_536, 8), (2**31 - 1, 1), (2**32 - 1, 2**32 - 1)]),
-    st.sampled_from([2, 6, 3, 0, 4, 7]), st.sampled_from([8, 16, 1, 3, 255]),
-    st.none() | st.sampled_from(CHUNKS), st.integers(0, 500),
-)  # fmt: skip
+    st.sampled_from([2, 6, 3, 0, 4, 7]),
+    st.sampled_from([8, 16, 1, 3, 255]),
+    st.none() | st.sampled_from(CHUNKS),
+    st.integers(0, 500),
+)
 @example((8, 6), 6, 8, None, 6 * 33)
 def test_a_png_of_any_header_is_an_image_or_refused(
     size: tuple[int, int], color: int, depth: int, extra: tuple[bytes, bytes] | None, zeros: int

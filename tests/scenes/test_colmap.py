@@ -75,10 +75,9 @@ def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
     """Catches a scene that the loader accepts and a run does not, cameras that do not belong to the images, and a
     choice that is printed and then forgotten."""
     write_embedded(tmp_path / "own", blender, "bin")
-    assert not main_here(
-        "+exp=colmap", "model=4dgs", f"data.root={tmp_path}", "scene=custom", "scene.name=own", "scene.downscale=4",
-        "train.iterations=50", "train.curve_points=1", f"results={tmp_path / 'results'}",
-    )  # fmt: skip
+    words = ["+exp=colmap", "model=4dgs", "scene=custom", "scene.name=own", "scene.downscale=4"]
+    words += ["train.iterations=50", "train.curve_points=1"]
+    assert not main_here(*words, f"data.root={tmp_path}", f"results={tmp_path / 'results'}")
     (loaded,) = map(record.read, record.find(tmp_path / "results"))
     assert loaded.dataset == "colmap"
     assert loaded.metrics["psnr"] > 12.6  # 13.4; 11.8 where cameras have the images of others
@@ -166,7 +165,7 @@ NAMINGS: dict[str, tuple[Callable[[int], str], Callable[[int], float], str]] = {
     "JPEGs of a camera": (lambda i: f"cam9/take2_{100 - 10 * i}.jpg", lambda i: 1 - i / 8, "number 3 of 3 in"),
     "a rig, frames first": (lambda i: f"frame_{i // 3:04d}/cam{i % 3}.png", lambda i: i // 3 / 2, "number 1 of 2 in"),
     "with spaces": (lambda i: f"my shot {i}.png", lambda i: i / 8, "the number in each name, 0 to 8"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("naming", NAMINGS)
@@ -264,8 +263,13 @@ def test_up_is_level_to_the_cameras_and_turns_with_the_world(turn: np.ndarray) -
     """Catches the mean of up vectors, which leans by 25 degrees on an arc of 120 from which cameras look down, z taken
     for up in a world whose axes are arbitrary, down for up, and a division by zero where cameras stand every way."""
     for degrees, pitch, roll, most in (
-        (360, 30, 0, 0.1), (120, 30, 0, 1), (60, 40, 0, 6), (120, 30, 2, 2), (360, 30, 5, 4), (0, 0, 0, 0.1),
-    ):  # fmt: skip
+        (360, 30, 0, 0.1),
+        (120, 30, 0, 1),
+        (60, 40, 0, 6),
+        (120, 30, 2, 2),
+        (360, 30, 5, 4),
+        (0, 0, 0, 0.1),
+    ):
         viewmats = arc(degrees, pitch, roll)
         viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
         assert lean(up_of(torch.from_numpy(viewmats)), turn @ [0, 0, 1]) < most
@@ -352,7 +356,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "time NaN": (table("name,time\nframe_000.png,nan\n"), "line 2: expected a time"),
     "time missing": (table("name,time\nframe_000.png,1\n"), "got none of 'frame_001.png'"),
     "table is binary": (lambda taken: (taken / "times.csv").write_bytes(b"\xff\x00"), "expected a table"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -17,10 +17,12 @@ from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of, read_trained, 
 from gsbench.scenes.scene import Camera
 
 N = 5
-NEEDED = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-          "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
-BEFORE = [PlyElement.describe(np.full(3, 7, [("view_px", "f4"), ("frame", "u1")]), "camera"),
-          PlyElement.describe(np.full(2, 9, [("id", "i4")]), "shot")]  # fmt: skip
+NEEDED = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+NEEDED += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+BEFORE = [
+    PlyElement.describe(np.full(3, 7, [("view_px", "f4"), ("frame", "u1")]), "camera"),
+    PlyElement.describe(np.full(2, 9, [("id", "i4")]), "shot"),
+]
 
 
 def rows(degree: int = 0, *more: str, without: str = "", kind: str = "f4", **values: Any) -> np.ndarray:
@@ -66,8 +68,14 @@ def test_files_as_programs_write_them(
     read = read_trained(write(path, table, *before, **form))
     K = (degree + 1) ** 2
     rest = [f"f_rest_{channel * (K - 1) + k}" for k in range(K - 1) for channel in range(3)]
-    fields = {"means": NEEDED[:3], "dc": NEEDED[3:6], "logits": NEEDED[6:7], "log_scales": NEEDED[7:10],
-              "quats": NEEDED[10:], "rest": rest}  # fmt: skip
+    fields = {
+        "means": NEEDED[:3],
+        "dc": NEEDED[3:6],
+        "logits": NEEDED[6:7],
+        "log_scales": NEEDED[7:10],
+        "quats": NEEDED[10:],
+        "rest": rest,
+    }
     for field, names in fields.items():
         expected = torch.tensor(np.stack([table[name] for name in names], 1) if names else np.zeros((N, 0)))
         torch.testing.assert_close(getattr(read, field).reshape(N, -1), expected.float())
@@ -186,8 +194,9 @@ def test_the_filter_of_mip_splatting_is_fused(path: Path, capsys: pytest.Capture
     colors = torch.rand(N, 3, generator=torch.Generator().manual_seed(0)).double()
 
     def image(factors: torch.Tensor, alphas: torch.Tensor) -> torch.Tensor:
-        return rasterize(torch.tensor(means), factors, alphas, colors, viewmat[None], K[None], 48, 32,
-                         backend="reference").image  # fmt: skip
+        return rasterize(
+            torch.tensor(means), factors, alphas, colors, viewmat[None], K[None], 48, 32, backend="reference"
+        ).image
 
     expected = image(torch.linalg.cholesky(filtered), opacities)
     torch.testing.assert_close(image(fused, torch.sigmoid(read.logits.double())), expected, rtol=0, atol=1e-6)
@@ -231,19 +240,27 @@ def test_the_share_of_gaussians_that_a_camera_sees() -> None:
     eye = torch.eye(4)
     ahead = Camera(eye, torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 60)
     aside = Camera(torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]), ahead.K, 100, 60)
-    means = torch.tensor([
-        [0.0, 0, 4],  # in the middle
-        [0, 0, -4],  # behind
-        [0, 1.5, 4],  # below the image, whose height is 60 and not 100
-        [0, 1.5, 4],  # reaches into it
-        [0, 0, 4],  # too transparent
-        [0, 0, 4],  # smaller than a pixel
-        [4, 0, 0],  # the other camera sees it
-    ])  # fmt: skip
+    means = torch.tensor(
+        [
+            [0.0, 0, 4],  # in the middle
+            [0, 0, -4],  # behind
+            [0, 1.5, 4],  # below the image, whose height is 60 and not 100
+            [0, 1.5, 4],  # reaches into it
+            [0, 0, 4],  # too transparent
+            [0, 0, 4],  # smaller than a pixel
+            [4, 0, 0],  # the other camera sees it
+        ]
+    )
     sizes = torch.tensor([0.1, 0.1, 0.1, 0.5, 0.1, 0.001, 0.1])
     logits = torch.tensor([0.0, 0, 0, 0, -7, 0, 0])
-    flat = TrainedGaussians(means, sizes.log()[:, None].repeat(1, 3) - torch.tensor([0.0, 9, 9]),
-                            torch.ones(7, 4), logits, torch.zeros(7, 3), torch.zeros(7, 0, 3))  # fmt: skip
+    flat = TrainedGaussians(
+        means,
+        sizes.log()[:, None].repeat(1, 3) - torch.tensor([0.0, 9, 9]),
+        torch.ones(7, 4),
+        logits,
+        torch.zeros(7, 3),
+        torch.zeros(7, 0, 3),
+    )
     assert share_seen(flat, [ahead], 1) == pytest.approx(2 / 7)
     assert share_seen(flat, [ahead, aside], 1) == pytest.approx(3 / 7)
     assert share_seen(flat, [ahead, aside], 0.1) == pytest.approx(2 / 7)  # enough

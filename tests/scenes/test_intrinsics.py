@@ -75,7 +75,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 } | {
     f"model {model}": ({}, {"camera_model": model}, r"frames\[1\]: camera_model: expected a pinhole camera .*undistort")
     for model in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOGRAPHIC", "fisheye", "THIN_PRISM_FISHEYE", "FOV", 3)
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", REFUSED)
@@ -113,13 +113,23 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("image", "camera", "fits"),
     [
-        ((8, 6), (16, 12), True), ((8, 6), (15, 11), True), ((8, 6), (32, 24), True), ((8, 6), (12, 9), True),
-        ((8, 6), (4, 3), True), ((65, 49), (33, 25), True),
-        ((33, 25), (65, 49), True), ((32, 24), (65, 49), True), ((1600, 1037), (5187, 3361), True),
-        ((8, 6), (16, 16), False), ((8, 6), (8, 7), False), ((8, 6), (4, 4), False), ((640, 470), (640, 480), False),
-        ((638, 478), (640, 480), False), ((24, 24), (65, 49), False),
+        ((8, 6), (16, 12), True),
+        ((8, 6), (15, 11), True),
+        ((8, 6), (32, 24), True),
+        ((8, 6), (12, 9), True),
+        ((8, 6), (4, 3), True),
+        ((65, 49), (33, 25), True),
+        ((33, 25), (65, 49), True),
+        ((32, 24), (65, 49), True),
+        ((1600, 1037), (5187, 3361), True),
+        ((8, 6), (16, 16), False),
+        ((8, 6), (8, 7), False),
+        ((8, 6), (4, 4), False),
+        ((640, 470), (640, 480), False),
+        ((638, 478), (640, 480), False),
+        ((24, 24), (65, 49), False),
     ],
-)  # fmt: skip
+)
 def test_one_ratio(image: tuple[int, int], camera: tuple[int, int], fits: bool) -> None:
     """Catches a cropped image taken for a reduced one, and rounded sizes refused."""
     lens = Lens(*camera, np.eye(3), (0, 0, 0, 0)).resized(*image)

@@ -225,7 +225,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (lambda root: [(root / "cam02.mp4").unlink(), (root / "cam02").mkdir()], "a PNG or JPEG for each frame"),
     (lambda root: [(root / f"{name}.mp4").unlink() for name in CAMERAS[1:]], "cam00, the test camera, and others"),
     (lambda root: (root / n3v.DECODED).write_bytes(b""), "a scene's folder in which decoded can be written"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)

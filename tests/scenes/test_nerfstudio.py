@@ -17,9 +17,12 @@ from gsbench.errors import InputError
 
 COUNT = 17
 PLY = "ply\nformat ascii 1.0\nelement vertex 2\n{}end_header\n0 0 1 255 0 0\n1 2 3 0 255 51\n".format(
-    "".join(f"property {kind} {name}\n" for kind, names in (("float", "xyz"), ("uchar", ("red", "green", "blue")))
-            for name in names)
-)  # fmt: skip
+    "".join(
+        f"property {kind} {name}\n"
+        for kind, names in (("float", "xyz"), ("uchar", ("red", "green", "blue")))
+        for name in names
+    )
+)
 
 
 @pytest.fixture
@@ -31,11 +34,10 @@ def root(tmp_path: Path) -> Path:
         matrix = (np.linalg.inv(viewmat) @ np.diag([1, -1, -1, 1])).tolist()
         frames.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix, "colmap_im_id": i})
     order = np.random.default_rng(0).permutation(COUNT)
-    content = {
-        "w": 8, "h": 6, "fl_x": 9.0, "fl_y": 9.5, "cx": 4.25, "cy": 3.0, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
-        "camera_model": "OPENCV", "frames": [frames[i] for i in order],
-        "applied_transform": np.eye(4)[:3].tolist(), "ply_file_path": "sparse_pc.ply",
-    }  # fmt: skip
+    content = {"w": 8, "h": 6, "fl_x": 9.0, "fl_y": 9.5, "cx": 4.25, "cy": 3.0, "camera_model": "OPENCV"}
+    content |= dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    content |= {"frames": [frames[i] for i in order], "applied_transform": np.eye(4)[:3].tolist()}
+    content["ply_file_path"] = "sparse_pc.ply"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     (tmp_path / "sparse_pc.ply").write_text(PLY)
     return tmp_path

@@ -130,7 +130,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (points(data=np.full((4, 7), 200.0)), r"expected colours in \[0, 1\], got 200"),
     (points(data=np.array([{}])), "expected an archive"),
     (lambda root: (root / "init_pt_cld.npz").write_bytes(b"PK\3\4"), "expected an archive"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)

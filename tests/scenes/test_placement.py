@@ -35,9 +35,13 @@ MOVES = {
 
 
 def write_capture(
-    root: Path, scale: float = 1.0, offset: tuple[float, ...] = (0, 0, 0), *, viewmats: np.ndarray | None = None,
+    root: Path,
+    scale: float = 1.0,
+    offset: tuple[float, ...] = (0, 0, 0),
+    *,
+    viewmats: np.ndarray | None = None,
     points: np.ndarray | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a capture of cameras on a circle, all of which is scaled and then moved."""
     viewmats = circle(COUNT) if viewmats is None else viewmats
     points = np.random.default_rng(0).normal(0, 0.5, (200, 3)) if points is None else points

@@ -120,14 +120,17 @@ def test_bad_ply(tmp_path: Path, fault: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-TRAINED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
-           *(f"rot_{i}" for i in range(4)), *(f"f_rest_{i}" for i in range(9)))  # fmt: skip
+TRAINED = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *(f"{name}_{i}" for name, count in (("scale", 3), ("rot", 4), ("f_rest", 9)) for i in range(count)),
+)
 LINES = [
-    "property list uchar int vertex_indices", "property float x", "property half nx", "property", "property uchar y",
-    "element face 1000000000000", "element vertex 0", "element vertex -1", "element vertex 1e3", "element vertex 2",
-    f"element vertex {'9' * 18}", f"element vertex {'9' * 30}", "comment " + "x" * 70_000, "comment \xff\x80",
-    "format ascii 1.0", "format binary_big_endian 1.0", "end_header", "",
-]  # fmt: skip
+    *("property list uchar int vertex_indices", "property float x", "property half nx", "property", "property uchar y"),
+    "element face 1000000000000",
+    *(f"element vertex {count}" for count in ("0", "-1", "1e3", "2", "9" * 18, "9" * 30)),
+    *("comment " + "x" * 70_000, "comment \xff\x80"),
+    *("format ascii 1.0", "format binary_big_endian 1.0", "end_header", ""),
+]
 NUMBERS = ("nan", "inf", "-inf", "1e39", "1e400", "-1", "256", "0x10", "1_0", "9" * 400, "\xff", "1 1", "")
 
 

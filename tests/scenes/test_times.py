@@ -149,21 +149,33 @@ def stereo(count: int) -> np.ndarray:
 
 
 REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
-    "a camera's number alone": ([f"cam{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.repeat(circle(4), 2, 0),
-                                "'cam0_a.png' and 'cam0_b.png'.*expected different times"),
-    "equal": ([f"{i // 2}_{'ab'[i % 2]}.png" for i in range(8)], np.tile(circle(1), (8, 1, 1)),
-              "'0_a.png' and '0_b.png'.*expected different times"),
-    "constant": ([f"{'abcd'[i]}_1080p.png" for i in range(4)], np.tile(circle(1), (4, 1, 1)),
-                 "expected different times"),
-    "two that contradict": ([f"{i}_{(3 * i) % 7}.png" for i in range(7)], circle(7),
-                            "one number that is the time, got 0, 0"),
+    "a camera's number alone": (
+        [f"cam{i // 2}_{'ab'[i % 2]}.png" for i in range(8)],
+        np.repeat(circle(4), 2, 0),
+        "'cam0_a.png' and 'cam0_b.png'.*expected different times",
+    ),
+    "equal": (
+        [f"{i // 2}_{'ab'[i % 2]}.png" for i in range(8)],
+        np.tile(circle(1), (8, 1, 1)),
+        "'0_a.png' and '0_b.png'.*expected different times",
+    ),
+    "constant": (
+        [f"{'abcd'[i]}_1080p.png" for i in range(4)],
+        np.tile(circle(1), (4, 1, 1)),
+        "expected different times",
+    ),
+    "two that contradict": (
+        [f"{i}_{(3 * i) % 7}.png" for i in range(7)],
+        circle(7),
+        "one number that is the time, got 0, 0",
+    ),
     "of takes": ([f"{i // 5}_{i % 5}.png" for i in range(10)], np.tile(circle(1), (10, 1, 1)), "one number that is"),
     "chapters": ([f"part{1 + i // 10}/frame_{i % 10:03d}.png" for i in range(20)], circle(40)[:20], "got 0, 1, which"),
     "a stereo rig that drives": ([f"image_0{2 + i % 2}/{i // 2:06d}.png" for i in range(24)], stereo(12), "got 2, 0"),
     "some without": (["a.png", "b_1.png"], circle(2), "'a.png': expected a number in its name"),
     "of two forms": (["IMG_20230501_123059.jpg", "IMG_20230501_123059_1.jpg"], circle(2), "expected names of one form"),
     "endless": (["9" * 5000, "1"], circle(2), "expected a time"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", REFUSED)

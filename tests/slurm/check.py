@@ -32,8 +32,13 @@ from gsbench.run.progress import read as read_progress
 ROOT = Path(__file__).resolve().parents[2]
 SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1")
 # Runs of some ten seconds; a job that is killed loses at most one or two of them.
-TINY = ("+exp=mini", "scene.downscale=4", "data.initial_points=1000", "train.curve_points=5",
-        "train.checkpoint_minutes=0.02")  # fmt: skip
+TINY = (
+    "+exp=mini",
+    "scene.downscale=4",
+    "data.initial_points=1000",
+    "train.curve_points=5",
+    "train.checkpoint_minutes=0.02",
+)
 STEPS = 1500
 SHORT = (*TINY, f"train.iterations={STEPS}")
 ALL = (*SHORT, f"scene={','.join(SCENES)}", f"model={','.join(MODELS)}", f"seed={','.join(SEEDS)}")
@@ -133,8 +138,12 @@ class Check:
         """Say whether every run of a sweep is done and equals that of this machine."""
         states = sweep.states()
         differing = differences(self.reference, sweep.results)
-        self.say(name, f"{runs} of {runs} done, equal to this machine's", states == ["done"] * runs and not differing,
-                 differing or f"{states.count('done')} done")  # fmt: skip
+        self.say(
+            name,
+            f"{runs} of {runs} done, equal to this machine's",
+            states == ["done"] * runs and not differing,
+            differing or f"{states.count('done')} done",
+        )
 
 
 def killed_jobs_and_nodes(check: Check) -> None:
@@ -145,23 +154,35 @@ def killed_jobs_and_nodes(check: Check) -> None:
     send(killed.pid, signal.SIGKILL)
     wait_until("the killed run is lost", lambda: sweep.broken() != [], 60)
     reasons = sweep.broken()
-    check.say("SIGKILL of a job's process", "named with its job and its end",
-              len(reasons) == 1 and f"job {killed.job} ended: FAILED" in reasons[0], reasons[0])  # fmt: skip
+    check.say(
+        "SIGKILL of a job's process",
+        "named with its job and its end",
+        len(reasons) == 1 and f"job {killed.job} ended: FAILED" in reasons[0],
+        reasons[0],
+    )
 
     job = str(sweep.one_training().job)
     check.cluster.run("scontrol", "requeue", job)
     in_queue = ("squeue", "-h", "--array", "-o", "%T", "-j", job)
     wait_until("the requeued run waits", lambda: "PENDING" in check.cluster.run(*in_queue), 60)
     requeued = [run for run in sweep.status() if run["job"] == job]
-    check.say("requeue of a running job", "queued, not lost", [run["state"] for run in requeued] == ["queued"],
-              f"{requeued[0]['state']} at step {requeued[0]['step']}: {requeued[0]['reason']}")  # fmt: skip
+    check.say(
+        "requeue of a running job",
+        "queued, not lost",
+        [run["state"] for run in requeued] == ["queued"],
+        f"{requeued[0]['state']} at step {requeued[0]['step']}: {requeued[0]['reason']}",
+    )
 
     sweep.one_training("n2")
     check.cluster.kill_node("n2")
     wait_until("n2 is down", lambda: check.cluster.states()["n2"].startswith("down"), 120)
     check.cluster.start_node("n2")
-    check.say("SIGKILL of a slurmd and its jobs", "only the first injection is lost", len(sweep.broken()) == 1,
-              ", ".join(sweep.states()))  # fmt: skip
+    check.say(
+        "SIGKILL of a slurmd and its jobs",
+        "only the first injection is lost",
+        len(sweep.broken()) == 1,
+        ", ".join(sweep.states()),
+    )
 
     sweep.wait(400)
     check.say("the other seven", "done", sweep.states() == ["done"] * 7 + ["lost"], ", ".join(sweep.states()))
@@ -182,8 +203,12 @@ def time_limit(check: Check) -> None:
     do_here(check.reference, long)  # beside the job, which can only become longer by it
     sweep.wait(600)
     log = "".join(path.read_text() for path in sweep.results.rglob("*.log"))
-    check.say("time limit", "saved and requeued at Slurm's signal", "continues from step" in log,
-              f"{log.count('continues from step')} times")  # fmt: skip
+    check.say(
+        "time limit",
+        "saved and requeued at Slurm's signal",
+        "continues from step" in log,
+        f"{log.count('continues from step')} times",
+    )
     check.completed("time limit", sweep, 1)
 
 
@@ -205,8 +230,9 @@ def differences(reference: Path, results: Path) -> list[str]:
     differing = []
     for run in (path.parent.relative_to(results) for path in sorted(results.rglob("record.json"))):
         records = [json.loads((root / run / "record.json").read_text()) for root in (reference, results)]
-        here, there = ([record["status"], record["metrics"], [point[::2] for point in record["curve"] or []]]
-                       for record in records)  # fmt: skip
+        here, there = (
+            [record["status"], record["metrics"], [point[::2] for point in record["curve"] or []]] for record in records
+        )
         try:
             assert_same_bits(here, there, "record")
             assert_same_bits(bits(reference / run), bits(results / run))
@@ -217,8 +243,8 @@ def differences(reference: Path, results: Path) -> list[str]:
 
 def do_here(folder: Path, overrides: tuple[str, ...]) -> None:
     """Do runs on this machine, without Slurm, two at a time."""
-    command = [sys.executable, "-m", "gsbench", "-m", "+launch=parallel", "launch.at_once=2", *overrides,
-               f"results={folder}"]  # fmt: skip
+    command = [sys.executable, "-m", "gsbench", "-m", "+launch=parallel", "launch.at_once=2", *overrides]
+    command.append(f"results={folder}")
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 

@@ -80,8 +80,7 @@ def missing() -> str | None:
     """Why no Slurm can be brought up here, or None."""
     absent = [name for name in PROGRAMS if shutil.which(name, path=PATH) is None]
     if absent:
-        return (f"needs {', '.join(absent)}: "
-                "apt-get install --no-install-recommends slurm-wlm slurmdbd mariadb-server")  # fmt: skip
+        return f"needs {', '.join(absent)}: apt-get install --no-install-recommends slurm-wlm slurmdbd mariadb-server"
     if os.geteuid() != 0:
         return f"slurmd runs as root, this is {getpass.getuser()}"
     return None
@@ -118,9 +117,14 @@ class Cluster:
         """Start a daemon in the foreground of a process group of its own; its output goes to NAME.out."""
         with (self.folder / f"{name}.out").open("ab") as out:
             self.daemons[name] = subprocess.Popen(
-                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
-                start_new_session=True, preexec_fn=end_with_parent,
-            )  # fmt: skip
+                command,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                start_new_session=True,
+                preexec_fn=end_with_parent,
+            )
 
     def start_node(self, node: str) -> None:
         """Start the slurmd of a node."""
@@ -178,8 +182,12 @@ class Cluster:
     def _configure(self) -> None:
         (self.folder / "ctld").mkdir(parents=True)
         names = ("ctld_port", "dbd_port", "sql_port", "n1_port", "n2_port")
-        values = {"folder": str(self.folder), "host": socket.gethostname(), "password": secrets.token_hex(8),
-                  **dict(zip(names, free_ports(len(names)), strict=True))}  # fmt: skip
+        values = {
+            "folder": str(self.folder),
+            "host": socket.gethostname(),
+            "password": secrets.token_hex(8),
+            **dict(zip(names, free_ports(len(names)), strict=True)),
+        }
         self.sql = values
         for name, text in (("slurm.conf", SLURM_CONF), ("slurmdbd.conf", SLURMDBD_CONF)):
             path = self.folder / name
@@ -188,11 +196,26 @@ class Cluster:
 
     def _database(self) -> None:
         data, sock = self.folder / "sql", self.folder / "sql.socket"
-        self.run("mariadb-install-db", "--no-defaults", "--user=root", f"--datadir={data}",
-                 "--auth-root-authentication-method=socket")  # fmt: skip
-        self.start("mariadbd", "mariadbd", "--no-defaults", "--user=root", f"--datadir={data}", f"--socket={sock}",
-                   "--bind-address=127.0.0.1", f"--port={self.sql['sql_port']}", f"--pid-file={self.folder}/sql.pid",
-                   "--innodb-buffer-pool-size=64M", "--innodb-lock-wait-timeout=900")  # fmt: skip
+        self.run(
+            "mariadb-install-db",
+            "--no-defaults",
+            "--user=root",
+            f"--datadir={data}",
+            "--auth-root-authentication-method=socket",
+        )
+        self.start(
+            "mariadbd",
+            "mariadbd",
+            "--no-defaults",
+            "--user=root",
+            f"--datadir={data}",
+            f"--socket={sock}",
+            "--bind-address=127.0.0.1",
+            f"--port={self.sql['sql_port']}",
+            f"--pid-file={self.folder}/sql.pid",
+            "--innodb-buffer-pool-size=64M",
+            "--innodb-lock-wait-timeout=900",
+        )
         grant = f"GRANT ALL ON *.* TO slurm@localhost IDENTIFIED BY '{self.sql['password']}'"
         self._until("MariaDB answers", lambda: self.ok("mariadb", "--no-defaults", f"--socket={sock}", "-e", grant))
 

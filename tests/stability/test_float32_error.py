@@ -40,9 +40,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_ply(path: Path) -> Path:
     """A PLY of ten Gaussians around the origin."""
     g = torch.Generator().manual_seed(0)
-    fields = {"means": torch.randn(10, 3, generator=g), "log_scales": torch.full((10, 3), -1.0),
-              "quats": torch.randn(10, 4, generator=g), "logits": torch.zeros(10),
-              "dc": torch.randn(10, 3, generator=g), "rest": torch.zeros(10, 15, 3)}  # fmt: skip
+    fields = {
+        "means": torch.randn(10, 3, generator=g),
+        "log_scales": torch.full((10, 3), -1.0),
+        "quats": torch.randn(10, 4, generator=g),
+        "logits": torch.zeros(10),
+        "dc": torch.randn(10, 3, generator=g),
+        "rest": torch.zeros(10, 15, 3),
+    }
     path.write_bytes(ply_of(TrainedGaussians(**fields)))
     return path
 
@@ -234,7 +239,8 @@ def test_equal_images_have_no_change() -> None:
     """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped."""
     model = small_model()
     double = float32_error.float64_model(model)
-    rendered = [float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).image
-                for view in VIEWS]  # fmt: skip
+    rendered = [
+        float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).image for view in VIEWS
+    ]
     equal = [replace(view, pixels=image) for view, image in zip(VIEWS, rendered, strict=True)]
     assert psnr_float32(model, equal) == (0.0, "")

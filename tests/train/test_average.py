@@ -19,10 +19,13 @@ def average_from(start: int) -> Average:
     model = torch.nn.ParameterDict({"a": torch.zeros(3), "b": torch.zeros(())})
     train = SimpleNamespace(average_from=start, iterations=100)
     training: Any = SimpleNamespace(
-        model=model, config=SimpleNamespace(train=train, scene=SimpleNamespace(eval_split="test")),
-        schedule=SimpleNamespace(scaled=int), scene=SimpleNamespace(val=[None]), report=lambda _: None,
+        model=model,
+        config=SimpleNamespace(train=train, scene=SimpleNamespace(eval_split="test")),
+        schedule=SimpleNamespace(scaled=int),
+        scene=SimpleNamespace(val=[None]),
+        report=lambda _: None,
         psnr=lambda _: -float(model["a"].detach()[0]),
-    )  # fmt: skip
+    )
     return Average(training)
 
 
@@ -72,8 +75,14 @@ def test_a_checkpoint_has_it() -> None:
     resumed.load_state_dict(whole.state_dict())
     assert resumed.kept == 50  # so that the record of a finished training, measured later, says the same
     means = state["means"]
-    for wrong in ({"count": 0}, {"count": -1}, {"kept": "all"}, {"first": -1}, {"means": means | {"2": torch.zeros(3)}},
-                  {"means": means | {"0": torch.zeros(4)}}):  # fmt: skip
+    for wrong in (
+        {"count": 0},
+        {"count": -1},
+        {"kept": "all"},
+        {"first": -1},
+        {"means": means | {"2": torch.zeros(3)}},
+        {"means": means | {"0": torch.zeros(4)}},
+    ):
         with pytest.raises(InputError):
             resumed.load_state_dict(state | wrong)
 

@@ -161,9 +161,13 @@ def test_what_is_long_in_time_is_split_along_its_path_near_the_clip() -> None:
 
 @pytest.mark.parametrize(
     ("number", "side", "initial", "most"),
-    [(120, 80, 1_000, 12_000), (120, 80, 10_000, 40_000), (100, 800, 100_000, 1_000_000),
-     (800, 2_000, 400_000, 2_000_000)],
-)  # fmt: skip
+    [
+        (120, 80, 1_000, 12_000),
+        (120, 80, 10_000, 40_000),
+        (100, 800, 100_000, 1_000_000),
+        (800, 2_000, 400_000, 2_000_000),
+    ],
+)
 def test_the_limit_follows_from_the_training_pixels(number: int, side: int, initial: int, most: int) -> None:
     """Catches a limit of the views' number or of one view, one that many initial points exceed, and one without end."""
     views: list[Any] = [SimpleNamespace(camera=SimpleNamespace(width=side, height=side))] * number

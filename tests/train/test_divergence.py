@@ -27,13 +27,15 @@ def parameter(gradient: list[float] | None) -> nn.Parameter:
 @pytest.mark.parametrize(
     ("loss", "gradient", "message"),
     [
-        *((0.5, [0.0, bad], r"step 3: the gradient of 'refinement' is not finite \(loss 0.5\)")
-          for bad in (math.nan, math.inf, -math.inf)),
+        *(
+            (0.5, [0.0, bad], r"step 3: the gradient of 'refinement' is not finite \(loss 0.5\)")
+            for bad in (math.nan, math.inf, -math.inf)
+        ),
         (math.nan, [0.0, 1.0], "step 3: the loss is nan"),
         (0.5, [3e38, 3e38], None),  # finite, and its sum is not
         (0.5, None, None),
     ],
-)  # fmt: skip
+)
 def test_the_parameter_is_named_at_its_step(loss: float, gradient: list[float] | None, message: str | None) -> None:
     """Catches a bad gradient that reaches its parameter, or is blamed on another parameter or step, a check of the sum
     alone, and a parameter without a gradient taken for a fault."""

@@ -11,8 +11,10 @@ from gsbench.gates.hook import Gating
 from gsbench.train.hooks.early_stop import EarlyStop
 from gsbench.train.loop import Trainer
 
-PATIENT = ("train.curve_points=20", "train.patience=0.2", "train.densify.every=5", "train.densify.reset_every=1000000",
-           "effects.gate=end", "train.sh_every=1", "train.refine_from=1")  # fmt: skip
+PATIENT = (
+    *("train.curve_points=20", "train.patience=0.2", "train.sh_every=1", "train.refine_from=1"),
+    *("train.densify.every=5", "train.densify.reset_every=1000000", "effects.gate=end"),
+)
 
 
 def with_val(psnr: dict[int, float], *more: str) -> Trainer:

@@ -14,8 +14,15 @@ from gsbench.train.batches import generator
 from gsbench.train.density.mcmc import MCMCDensification, drawn, relocated
 from gsbench.train.rows import Rows
 
-OPTIONS = {"3dgs": {}, "4dgs": {}, "6dgs": {"lambda_d": 0.35}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
-         "ndgs": {"lambda_t": 0.5, "lambda_d": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip
+OPTIONS = {
+    "3dgs": {},
+    "4dgs": {},
+    "6dgs": {"lambda_d": 0.35},
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+    "ndgs": {"lambda_t": 0.5, "lambda_d": 0.5},
+    "dgs": {},
+    "freetime": {},
+}
 
 
 class Moments:
@@ -49,8 +56,11 @@ def test_many_copies_do_not_cancel(o: float) -> None:
     """Catches alternating sums that lose their digits at 51 copies: against the paper's double sum by fractions."""
     new, c = (float(x[0]) for x in relocated(torch.tensor([o], dtype=torch.float64), torch.tensor([51])))
     exact = Fraction(new)
-    total = sum(Fraction(math.comb(i - 1, k)) * (-1) ** k * exact ** (k + 1) / Fraction(math.sqrt(k + 1))
-                for i in range(1, 52) for k in range(i))  # fmt: skip
+    total = sum(
+        Fraction(math.comb(i - 1, k)) * (-1) ** k * exact ** (k + 1) / Fraction(math.sqrt(k + 1))
+        for i in range(1, 52)
+        for k in range(i)
+    )
     assert c == pytest.approx(o / float(total), rel=1e-9)
 
 

@@ -25,9 +25,11 @@ from gsbench.train.rows import Rows
 
 GREY = torch.tensor([0.2, 0.3, 0.4])
 NAMES = ("3dgs", "4dgs", "6dgs", "7dgs", "dgs", "freetime")
-ROUNDS = ("train.densify.kind=multiview", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10",
-          "train.densify.grad_threshold=1e-6", "train.iterations=60", "train.recipe_iterations=60",
-          "train.refine_from=0")  # fmt: skip
+ROUNDS = (
+    *("train.densify.kind=multiview", "train.densify.grad_threshold=1e-6"),
+    *("train.densify.start=0", "train.densify.stop=50", "train.densify.every=10"),
+    *("train.iterations=60", "train.recipe_iterations=60", "train.refine_from=0"),
+)
 
 
 def four_gaussians() -> GaussianModel:
@@ -85,8 +87,9 @@ def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
     """Catches a division by the range of errors that are all equal, and the least of no numbers: all Gaussians of a
     training may have been pruned."""
     model = four_gaussians()
-    exact = [replace(view, pixels=render(model, view.camera, view.time, GREY).detach())
-             for view in moving_square().train[:2]]  # fmt: skip
+    exact = [
+        replace(view, pixels=render(model, view.camera, view.time, GREY).detach()) for view in moving_square().train[:2]
+    ]
     importance, badness = scores_of(model, exact)(generator(0))
     assert not importance.any()
     assert not badness.any()

@@ -23,8 +23,13 @@ QUERY = CameraTime.at(torch.tensor([0.0, 0.0, -4.0], dtype=torch.float64), 0.5)
 VIEWMAT = torch.eye(4, dtype=torch.float64)
 VIEWMAT[2, 3] = 4.0
 VIEW = View("of QUERY", Camera(VIEWMAT, torch.eye(3, dtype=torch.float64), 16, 16), 0.5, torch.zeros(16, 16, 3))
-TIMED: dict[str, dict[str, Any]] = {"4dgs": {}, "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
-                                    "7dgs_nodir": {"lambda_t": 0.5}, "dgs": {}, "freetime": {}}  # fmt: skip
+TIMED: dict[str, dict[str, Any]] = {
+    "4dgs": {},
+    "7dgs": {"lambda_t": 0.5, "lambda_d": 0.3},
+    "7dgs_nodir": {"lambda_t": 0.5},
+    "dgs": {},
+    "freetime": {},
+}
 WEIGHT = ("train.penalties.strain.weight=1.0", "train.batch_size=2")
 
 
@@ -141,8 +146,10 @@ def test_what_is_culled_later_does_not_count() -> None:
 def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
     """Catches draws from a generator that threads share, and the same draw for all views."""
     model = lively("freetime", True)
-    values = [float(prepared(model, step, seed)(QUERY, index).detach())
-              for seed, step, index in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, 0))]  # fmt: skip
+    values = [
+        float(prepared(model, step, seed)(QUERY, index).detach())
+        for seed, step, index in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, 0))
+    ]
     assert values[0] == values[4]
     assert len(set(values)) == 4
 

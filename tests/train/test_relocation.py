@@ -14,8 +14,10 @@ from gsbench.train.density.mcmc import opacities_of, relocated
 from gsbench.train.density.relocation import RelocationDensification, score
 from gsbench.train.rows import Rows
 
-ROUNDS = ("train.densify.kind=relocation", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10",
-          "train.iterations=60", "train.recipe_iterations=60", "model.min_opacity=0.09")  # fmt: skip
+ROUNDS = (
+    *("train.densify.kind=relocation", "train.densify.start=0", "train.densify.stop=50", "train.densify.every=10"),
+    *("train.iterations=60", "train.recipe_iterations=60", "model.min_opacity=0.09"),
+)
 
 
 def test_the_score_of_freetimegs() -> None:

@@ -26,8 +26,22 @@ WITHOUT_AVX512 = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "OPENBLAS_CORETYPE": "Zen",
 }
-SLOW = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "deformable_narrow", "dgs", "freetime", "freetime_plus",
-        "ndgs", "sharptime", "stg", "ubs")  # fmt: skip
+SLOW = (
+    "3dgs",
+    "4dgs",
+    "6dgs",
+    "7dgs_noagr",
+    "auto",
+    "dbs",
+    "deformable_narrow",
+    "dgs",
+    "freetime",
+    "freetime_plus",
+    "ndgs",
+    "sharptime",
+    "stg",
+    "ubs",
+)
 
 
 @pytest.mark.parametrize("model", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
@@ -38,8 +52,9 @@ def test_a_training_has_the_same_bits_without_avx512(model: str, tmp_path: Path)
     wanted = ["+exp=mini", "scene=suzanne", f"model={model}", "train.iterations=200"]
     plain = {name: value for name, value in environment().items() if name not in WITHOUT_AVX512}
     for folder, more in (("with", {}), ("without", WITHOUT_AVX512)):
-        done = subprocess.run(command(*wanted, f"results={tmp_path / folder}"), env=plain | more,
-                              capture_output=True, text=True)  # fmt: skip
+        done = subprocess.run(
+            command(*wanted, f"results={tmp_path / folder}"), env=plain | more, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stderr
     assert_same_bits(comparable_state(tmp_path / "with"), comparable_state(tmp_path / "without"))
 

@@ -78,8 +78,10 @@ def test_curve_has_its_points_and_ends_at_the_last_step(iterations: int, points:
     assert len(steps) == min(points, iterations)
 
 
-@pytest.mark.parametrize(("points", "stop", "after"), [(20, 15_000, 700), (10, 15_000, 700), (3, 15_000, 1000),
-                                                       (1, 15_000, 1000), (20, 25_000, 850)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("points", "stop", "after"),
+    [(20, 15_000, 700), (10, 15_000, 700), (3, 15_000, 1000), (1, 15_000, 1000), (20, 25_000, 850)],
+)
 def test_models_are_compared_at_a_point_of_the_curve_after_densification(points: int, stop: int, after: int) -> None:
     """Catches a comparison before 70 % of the steps, where PSNR is not measured, or of models that still grow."""
     config = TrainConfig(iterations=1000, curve_points=points, densify=DensifyConfig(stop=stop))

@@ -163,9 +163,13 @@ def test_a_frame_appears_when_it_is_whole(folder: Path, tmp_path: Path, monkeypa
 @pytest.mark.parametrize("is_there", [True, False])
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt(), None])
 def test_a_clip_that_fails_leaves_nothing(
-    failure: BaseException | None, is_there: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    failure: BaseException | None,
+    is_there: bool,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a short clip that looks like a whole one, a folder of the user's that is removed, and a time not named.
 
     Without a failure of the disk the model fades out at the end.
@@ -245,9 +249,14 @@ def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("size", "expected"),
-    [((100, 100), (720, 720)), ((800, 800), (800, 800)), ((1357, 761), (1356, 760)), ((201, 101), (1432, 720)),
-     ((80, 160), (720, 1440))],
-)  # fmt: skip
+    [
+        ((100, 100), (720, 720)),
+        ((800, 800), (800, 800)),
+        ((1357, 761), (1356, 760)),
+        ((201, 101), (1432, 720)),
+        ((80, 160), (720, 1440)),
+    ],
+)
 def test_a_video_is_large_enough_to_be_looked_at(
     size: tuple[int, int], expected: tuple[int, int], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,8 +266,13 @@ def test_a_video_is_large_enough_to_be_looked_at(
     written: dict[str, set[tuple[int, int]]] = {}
     monkeypatch.setattr(video, "frames", lambda _, shots, __: iter(shots))
     for name in ("write_video", "write_images"):
-        monkeypatch.setattr(video, name, lambda images, path, *_: written.update(
-            {str(path): {(camera.width, camera.height) for camera, _ in images}}))  # fmt: skip
+        monkeypatch.setattr(
+            video,
+            name,
+            lambda images, path, *_: written.update(
+                {str(path): {(camera.width, camera.height) for camera, _ in images}}
+            ),
+        )
     monkeypatch.setattr("gsbench.export.closing", nullcontext)
     assert exports(folder, "--video", "a.mp4", "--images", "a", *FOUR)
     assert written == {"a.mp4": {expected}, "a": {size}}
@@ -271,9 +285,12 @@ def test_another_size_shows_the_same(folder: Path) -> None:
     plain, fine, wide, averaged = (
         torch.from_numpy(next(video.frames(run, [(sized, 0.5)], n))).double() / 255
         for sized, n in (
-            (camera, 1), (video.resized(camera, 48, 48), 1), (video.resized(camera, 16, 8), 1), (camera, 3)
+            (camera, 1),
+            (video.resized(camera, 48, 48), 1),
+            (video.resized(camera, 16, 8), 1),
+            (camera, 3),
         )
-    )  # fmt: skip
+    )
     blocks = fine.reshape(16, 3, 16, 3, 3).mean((1, 3))
     assert (plain - plain.mean((0, 1))).abs().mean() > 0.02
     torch.testing.assert_close(averaged, blocks, rtol=0, atol=1 / 255)
@@ -405,9 +422,12 @@ def test_a_disk_that_refuses_a_video_is_named(
 
 @pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4"), ("--images", "a")])
 def test_memory_that_runs_out_ends_in_one_line(
-    words: tuple[str, ...], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Catches a traceback for an allocation that fails, a file that it leaves, and a mistake of gsbench called so."""
     errors = [
         RuntimeError("expected a tensor of another shape"),

@@ -31,15 +31,19 @@ def other(other_folder: Path) -> LoadedRun:
         (["r/mini/s/7dgs/seed0"], ["7dgs"]),
         (["r/mini/s/7dgs,iterations=200/seed0"], ["7dgs"]),
         (["r/mini/s/7dgs/seed0", "r/mini/s/7dgs/seed1"], ["7dgs seed0", "7dgs seed1"]),
-        (["r/mini/s/7dgs/seed0", "r/mini/s/7dgs,sh_degree=1,iterations=9/seed0"],
-         ["7dgs", "7dgs sh_degree=1 iterations=9"]),
-        (["r/mini/s/7dgs,sh_degree=1,iterations=9/seed0", "r/mini/s/7dgs,iterations=9/seed1"],
-         ["7dgs sh_degree=1", "7dgs"]),
+        (
+            ["r/mini/s/7dgs/seed0", "r/mini/s/7dgs,sh_degree=1,iterations=9/seed0"],
+            ["7dgs", "7dgs sh_degree=1 iterations=9"],
+        ),
+        (
+            ["r/mini/s/7dgs,sh_degree=1,iterations=9/seed0", "r/mini/s/7dgs,iterations=9/seed1"],
+            ["7dgs sh_degree=1", "7dgs"],
+        ),
         (["r/mini/s/7dgs/seed0", "r/frontier/s/7dgs/seed0"], ["7dgs mini", "7dgs frontier"]),
         (["r/a", "r/b"], ["7dgs a", "7dgs b"]),
         (["r/a", "r/a"], ["r/a", "r/a"]),
     ],
-)  # fmt: skip
+)
 def test_names_are_what_distinguishes_runs(
     folders: list[str], names: list[str], run: LoadedRun, other: LoadedRun
 ) -> None:
@@ -55,8 +59,11 @@ def test_a_label_says_what_was_measured(run: LoadedRun, tmp_path: Path) -> None:
     kept = record.read(run.folder / record.FILE_NAME)
     assert kept.metrics is not None
     assert kept.cost is not None
-    rows = (f"{kept.metrics['psnr']:.2f} dB PSNR on test", f"{kept.cost.num_gaussians:,} Gaussians",
-            f"{kept.cost.bytes / 1e6:.2f} MB")  # fmt: skip
+    rows = (
+        f"{kept.metrics['psnr']:.2f} dB PSNR on test",
+        f"{kept.cost.num_gaussians:,} Gaussians",
+        f"{kept.cost.bytes / 1e6:.2f} MB",
+    )
     assert measurements(run) == (*rows, "20 iterations")
     interrupted = replace(run, step=7, folder=tmp_path)
     assert measurements(interrupted) == ("no PSNR on test yet", *rows[1:], "7 of 20 iterations")
@@ -93,6 +100,8 @@ def test_labels_are_cut_at_the_border_and_keep_their_size_on_the_screen() -> Non
     """Catches an index out of the image, and labels that jump when the resolution falls."""
     for height, width, edge in ((300, 600, 0), (300, 600, 600), (300, 600, 20), (5, 5, 2), (1, 1, 1), (900, 2, 1)):
         assert labelled(np.zeros((height, width, 3), np.uint8), edge, ROWS, ROWS).shape == (height, width, 3)
-    tall = [float((labelled(np.full((n, 2 * n, 3), 255, np.uint8), n, ROWS, ROWS) != 255).any((1, 2)).sum()) / n
-            for n in (300, 600, 1200)]  # fmt: skip
+    tall = [
+        float((labelled(np.full((n, 2 * n, 3), 255, np.uint8), n, ROWS, ROWS) != 255).any((1, 2)).sum()) / n
+        for n in (300, 600, 1200)
+    ]
     assert tall == pytest.approx([tall[0]] * 3, rel=0.05)

@@ -71,8 +71,14 @@ def test_the_legend_of_float32_says_what_is_known_of_each_model() -> None:
     error = Float32Error(np.zeros((30, 40, 3), np.uint8), 0.71, 0.00043, 0.0125, 2.04)
     text = legend(images, 1.0, {"a": error, "b": "no <bound>", "d": "hidden"})
     assert "1e-06" in text
-    assert rows(text) == {"": ["a"], "largest bound": ["0.71"], "median bound": ["0.00043"],
-                          "undecided pixels": ["1.2 %"], "pixels": ["40 x 30"], "seconds": ["2.0"]}  # fmt: skip
+    assert rows(text) == {
+        "": ["a"],
+        "largest bound": ["0.71"],
+        "median bound": ["0.00043"],
+        "undecided pixels": ["1.2 %"],
+        "pixels": ["40 x 30"],
+        "seconds": ["2.0"],
+    }
     assert "<b>b</b>: no &lt;bound&gt;" in text
     assert "<b>c</b>: this is the image; its bound follows when nothing moves" in text
     assert "hidden" not in text

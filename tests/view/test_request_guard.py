@@ -52,13 +52,13 @@ OWN_PAGES = [
     ("localhost:8080", None),  # no browser
 ]
 FOREIGN_PAGES = [
-    *(("localhost:8080", origin) for origin in ("http://localhost:3000", "http://127.0.0.1:8080", "http://evil.example",
-                                                "http://localhost:8080.evil.example", "null", "")),
+    *(("localhost:8080", f"http://{page}") for page in ("localhost:3000", "127.0.0.1:8080", "evil.example")),
+    *(("localhost:8080", origin) for origin in ("http://localhost:8080.evil.example", "null", "")),
     ("evil.example:8080", "http://evil.example:8080"),  # DNS rebinding
     ("evil.example@localhost", "http://evil.example@localhost"),
     ("192.0.2.1:8080", "http://192.0.2.1:8080"),
     *((host, None) for host in ("evil.example", "localhost.evil.example", "localhost@evil.example", "[::1", "")),
-]  # fmt: skip
+]
 
 
 def test_only_its_own_page_is_admitted() -> None:
@@ -115,17 +115,26 @@ def test_the_page_is_opened_with_all_pixels_of_the_screen(viewer: Viewer) -> Non
 
 
 BAD_CAMERAS: list[dict[str, Any]] = [
-    {"fov": 0}, {"fov": NAN}, {"fov": 4}, {"fov": 1e-300}, {"fov": "x"}, {"fov": None}, {"position": [1]},
-    {"position": [NAN, 0, 0]}, {"position": [INF, 0, 0]}, {"position": [1e38, 0, 0]}, {"wxyz": [0, 0, 0, 0]},
-    {"wxyz": [1, 0, 0]}, {"wxyz": [NAN, 0, 0, 0]}, {"image_width": -1}, {"image_height": 10**9}, {"look_at": "abc"},
-    {"more": 1}, {"type": "Nothing"}, {"type": ["x"]},
-]  # fmt: skip
+    *({"fov": fov} for fov in (0, NAN, 4, 1e-300, "x", None)),
+    *({"position": position} for position in ([1], [NAN, 0, 0], [INF, 0, 0], [1e38, 0, 0])),
+    *({"wxyz": quaternion} for quaternion in ([0, 0, 0, 0], [1, 0, 0], [NAN, 0, 0, 0])),
+    *({"image_width": -1}, {"image_height": 10**9}, {"look_at": "abc"}),
+    *({"more": 1}, {"type": "Nothing"}, {"type": ["x"]}),
+]
 OTHERS: list[object] = [
-    "text", b"", b"\xc1", b"\x91" * 3000, packed({"type": "ShareUrlRequest"}), packed({"type": "ShareUrlDisconnect"}),
-    packed({"type": "GuiFormDirtyMessage", "uuid": "x"}), packed({"type": "RunJavascriptMessage", "source": "x"}),
-    *(packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": updates})
-      for updates in ({"update_cb": 1}, [], *({"value": value} for value in (NAN, [1], [1, 2, 3, 4], [1, 2, NAN])))),
-]  # fmt: skip
+    "text",
+    b"",
+    b"\xc1",
+    b"\x91" * 3000,
+    packed({"type": "ShareUrlRequest"}),
+    packed({"type": "ShareUrlDisconnect"}),
+    packed({"type": "GuiFormDirtyMessage", "uuid": "x"}),
+    packed({"type": "RunJavascriptMessage", "source": "x"}),
+    *(
+        packed({"type": "GuiUpdateMessage", "uuid": "x", "updates": updates})
+        for updates in ({"update_cb": 1}, [], *({"value": value} for value in (NAN, [1], [1, 2, 3, 4], [1, 2, NAN])))
+    ),
+]
 
 
 def test_what_the_page_never_sends_is_not_known() -> None:
@@ -160,8 +169,15 @@ def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, cap
             browser.send(packed(CAMERA, **changed))
         for message in OTHERS:
             browser.send(message)  # type: ignore[arg-type]
-        for control in (shown.controls.time, shown.controls.mode, shown.controls.degree, shown.controls.wipe,
-                        shown.controls.play, shown.controls.background, *shown.controls._choices[0]):  # fmt: skip
+        for control in (
+            shown.controls.time,
+            shown.controls.mode,
+            shown.controls.degree,
+            shown.controls.wipe,
+            shown.controls.play,
+            shown.controls.background,
+            *shown.controls._choices[0],
+        ):
             for value in ("x" * 100, "1e9", "1" * 100, -(2**60), INF, [0, 300, -1], [2**60, 0, 0], False):
                 browser.send(update(control, value))
         browser.send(packed(CAMERA, position=[0, 0, -5], image_width=32))

@@ -21,8 +21,10 @@ from gsbench.view.slice_ply import decompose, trained_of
 
 SIZE = 48
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
-COLUMNS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45)),
-           "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+COLUMNS = [
+    *("x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))),
+    *("opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))),
+]
 
 
 def camera(x: float, y: float, z: float) -> Camera:
@@ -43,19 +45,34 @@ def drawn(data: bytes, view: Camera) -> torch.Tensor:
     """Draw a PLY by plyfile, numpy and the rasterizer: the conventions of 3DGS, written a second time."""
     rows = PlyData.read(io.BytesIO(data))["vertex"].data
     assert rows.dtype.names == tuple(COLUMNS)
-    take = {name: np.stack([rows[name + end] for end in ends], 1).astype(np.float64) for name, ends in
-            (("f_dc_", "012"), ("scale_", "012"), ("rot_", "0123"), ("", "xyz"))}  # fmt: skip
+    take = {
+        name: np.stack([rows[name + end] for end in ends], 1).astype(np.float64)
+        for name, ends in (("f_dc_", "012"), ("scale_", "012"), ("rot_", "0123"), ("", "xyz"))
+    }
     R = Rotation.from_quat(np.roll(take["rot_"], -1, axis=1)).as_matrix()
     directions = take[""] - view.center.double().numpy()
     a, b, c = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
     xx, yy, zz = a * a, b * b, c * c
-    basis = np.stack([
-        -0.4886025 * b, 0.4886025 * c, -0.4886025 * a,
-        1.0925484 * a * b, -1.0925484 * b * c, 0.3153916 * (2 * zz - xx - yy), -1.0925484 * a * c,
-        0.5462742 * (xx - yy), -0.5900436 * b * (3 * xx - yy), 2.8906114 * a * b * c,
-        -0.4570458 * b * (4 * zz - xx - yy), 0.3731763 * c * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570458 * a * (4 * zz - xx - yy), 1.4453057 * c * (xx - yy), -0.5900436 * a * (xx - 3 * yy),
-    ], 1)  # fmt: skip
+    basis = np.stack(
+        [
+            -0.4886025 * b,
+            0.4886025 * c,
+            -0.4886025 * a,
+            1.0925484 * a * b,
+            -1.0925484 * b * c,
+            0.3153916 * (2 * zz - xx - yy),
+            -1.0925484 * a * c,
+            0.5462742 * (xx - yy),
+            -0.5900436 * b * (3 * xx - yy),
+            2.8906114 * a * b * c,
+            -0.4570458 * b * (4 * zz - xx - yy),
+            0.3731763 * c * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570458 * a * (4 * zz - xx - yy),
+            1.4453057 * c * (xx - yy),
+            -0.5900436 * a * (xx - 3 * yy),
+        ],
+        1,
+    )
     rest = np.stack([rows[f"f_rest_{i}"] for i in range(45)], 1).reshape(-1, 3, 15)
     colors = np.clip(0.5 + 0.28209479 * take["f_dc_"] + np.einsum("nck,nk->nc", rest, basis), 0, None)
     opacities = 1 / (1 + np.exp(-rows["opacity"].astype(np.float64)))

@@ -141,8 +141,11 @@ def test_a_wrong_command_is_answered_in_one_line(
 ) -> None:
     """Catches a stack trace, a server that serves nothing, a wait for a port without end, and "" open to everybody."""
     hosts = ("no.such.host.invalid", "", "\0", "a" * 300, "192.0.2.1", "\x1b[31m", "1.2.3.4.5", "é..x")
-    wrong = [([str(tmp_path)], f"{tmp_path}: expected the folder of a run"), ([str(folder), "--port", "0"], "--port"),
-             *(([str(folder), "--host", host], "--host") for host in hosts)]  # fmt: skip
+    wrong = [
+        ([str(tmp_path)], f"{tmp_path}: expected the folder of a run"),
+        ([str(folder), "--port", "0"], "--port"),
+        *(([str(folder), "--host", host], "--host") for host in hosts),
+    ]
     for words, text in wrong:
         assert main(words) == 2
         (line,) = capsys.readouterr().err.splitlines()

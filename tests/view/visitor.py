@@ -14,9 +14,17 @@ from websockets.sync.client import ClientConnection, connect
 from gsbench.view.viewer import Browser, Viewer
 
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, -4], "fov": 0.7, "near": 0.1, "far": 100,
-    "image_height": 64, "image_width": 64, "look_at": [0, 0, 0], "up_direction": [0, 0, 1],
-}  # fmt: skip
+    "type": "ViewerCameraMessage",
+    "wxyz": [1, 0, 0, 0],
+    "position": [0, 0, -4],
+    "fov": 0.7,
+    "near": 0.1,
+    "far": 100,
+    "image_height": 64,
+    "image_width": 64,
+    "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1],
+}
 
 
 def free_port() -> int:
