@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ROUNDING_SCALE, STEPS, to_bytes
-from gsbench.stability.float32_error import PERCENTILES, Exactness, ViewExactness
+from gsbench.stability.float32_error import FLAT, MOVED, OPAQUE, PERCENTILES, Exactness, ViewExactness
 
 ROUNDING = 1 / math.sqrt(12)  # RMS error of rounding to 8 bits, in steps
 VIEW_TITLES = (
@@ -29,10 +29,10 @@ VIEW_TITLES = (
     "at most",
 )
 MEANINGS = {
-    "flat": "its shortest axis is below 1/1000 of its longest",
-    "far": "rounding of world coordinates moves its mean by more than 1/1000 pixel",
+    "flat": f"its shortest axis is below 1/{1 / FLAT:.0f} of its longest",
+    "far": f"rounding of world coordinates moves its mean by more than 1/{1 / MOVED:.0f} pixel",
     "huge": "it covers more than the image",
-    "opaque": "its opacity is above 0.99",
+    "opaque": f"its opacity is above {OPAQUE}",
     "indefinite": "the papers' formula makes its covariance indefinite in float32",
     "skipped": "rounding may decide whether its alpha reaches 1/255, in the pixels with most of its share",
     "stopped": "rounding may decide whether a pixel ends before it",

@@ -96,12 +96,15 @@ def raw(answer: str) -> str:
 
 @pytest.mark.parametrize("path", ["/file.bin", moved("/file.bin")])
 def test_a_file_arrives_whole_and_once(path: str, address: str, tmp_path: Path) -> None:
-    """Catches a redirect that is taken for the file, a file that is fetched twice, and one that is called there."""
+    """Catches a redirect that is taken for the file, a file that is fetched twice, and another file taken for it."""
     weights = source(address + path, tmp_path, hashlib.sha256(PAYLOAD).hexdigest()[:8])
     assert fetch(weights) == f"file: {tmp_path}/file.bin fetched"
     assert fetch(weights) == f"file: {tmp_path}/file.bin is there: nothing fetched"
     assert Handler.asked.count(path) == 1
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [PAYLOAD]
+    (tmp_path / "file.bin").write_bytes(b"another")
+    with pytest.raises(InputError, match="remove it and fetch again"):
+        fetch(weights)
 
 
 NO_FILE: list[tuple[str, str | None, str]] = [  # an address, the SHA-256 that is expected, words of the error

@@ -19,7 +19,7 @@ from gsbench.gates import permutation_test, static_fit_residuals
 from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import LEAST_FREE, screen_time
 from gsbench.models.gaussian_batch import Gaussians3D
-from gsbench.scenes.scene import Scene
+from gsbench.scenes.scene import Camera, Scene, View
 
 EMBEDDED = Path(__file__).resolve().parents[2] / "gsbench/scenes/sample"
 SHUFFLED = torch.randperm(48, generator=torch.Generator().manual_seed(5)) / 47
@@ -76,6 +76,16 @@ def test_a_scene_without_views_is_refused() -> None:
     """Catches a stack trace where a split is empty."""
     with pytest.raises(InputError, match="expected training views"):
         screen_time(replace(timeless(), train=[]))
+
+
+def test_directions_of_cameras_side_by_side() -> None:
+    """By hand: two cameras 2 apart that look along z, seen from 3 in front. Catches a point behind them or beside."""
+    poses = [torch.eye(4), torch.eye(4)]
+    poses[0][0, 3], poses[1][0, 3] = 1, -1  # at x = -1 and x = 1
+    views = [View("a", Camera(pose, torch.eye(3), 1, 1), 0.0, torch.zeros(1, 1, 3)) for pose in poses]
+    basis = static_fit_residuals.camera_basis(views)
+    expected = 0.48860251 / np.sqrt(10) * np.array([[0, -3, 1], [0, -3, -1]])  # -y, z, -x of the unit vectors
+    np.testing.assert_allclose(basis[:, 1:4], expected, atol=1e-7)
 
 
 def test_imports_are_no_seconds_of_the_screen() -> None:

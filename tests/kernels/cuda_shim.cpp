@@ -203,10 +203,15 @@ void run(dim3 grid, dim3 size, const std::function<void()>& body) {
 
 }  // namespace shim
 
-size_t scratch_bytes(int64_t) { return 0; }
+size_t scratch_bytes(int64_t n) { return static_cast<size_t>(n); }
 
-void sort_pairs(void*, size_t, const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values,
+void need_scratch(size_t bytes, int64_t n) {  // as cub refuses
+    if (bytes < scratch_bytes(n)) throw std::runtime_error("too little scratch memory");
+}
+
+void sort_pairs(void*, size_t bytes, const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values,
                 uint32_t* sorted_values, int64_t n, int bits, Stream) {
+    need_scratch(bytes, n);
     const uint32_t mask = bits < 32 ? (1u << bits) - 1 : ~0u;
     std::vector<size_t> order(static_cast<size_t>(n));
     std::iota(order.begin(), order.end(), size_t{0});
@@ -218,6 +223,9 @@ void sort_pairs(void*, size_t, const uint32_t* keys, uint32_t* sorted_keys, cons
     }
 }
 
-void running_sum(void*, size_t, int64_t* values, int64_t n, Stream) { std::partial_sum(values, values + n, values); }
+void running_sum(void*, size_t bytes, int64_t* values, int64_t n, Stream) {
+    need_scratch(bytes, n);
+    std::partial_sum(values, values + n, values);
+}
 
 }  // namespace gsb::cuda
