@@ -34,8 +34,8 @@ def assert_same_images(first: GaussianModel, second: GaussianModel, atol: float)
 
 @pytest.mark.parametrize("name", OPTIONS)
 def test_more_budget_buys_more(name: str) -> None:
-    """Catches a gate that changes an image though its budget is zero, a price of error with the wrong sign, and a sum
-    of errors that is not held."""
+    """Catches a gate that changes an image though its budget is zero, a price of error with the wrong sign, a sum of
+    errors that is not held, and numbers of what is frozen that stay as they were."""
     before, free = gated(name, 0.0)
     assert len(free) <= N
     assert_same_images(before, free, atol=2e-6)
@@ -44,6 +44,10 @@ def test_more_budget_buys_more(name: str) -> None:
     sizes = [gated(name, share)[1].stored_bytes() for share in shares]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 0.8 * sizes[0]
+    after = gated(name, 1.0)[1]
+    for key, used in after.used_entries(after.effect_sets).items():
+        unused = after.splats[key].masked_fill(used, after.constant(key))
+        assert key == "right_quats" or (unused == after.constant(key)).all(), key  # which are left ones' partners
 
 
 def test_a_static_gaussian_changes_with_nothing() -> None:

@@ -1,5 +1,6 @@
 """How a command ends whose output cannot be written: one line and an exit status, no stack trace."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +13,9 @@ PRINTS = "from gsbench.process.ending import end_with; end_with('gsbench.x', lam
 
 
 def ended(code: list[str], **options: object) -> subprocess.CompletedProcess[str]:
-    """Run Python code in a process of its own, as it ends."""
-    return subprocess.run([sys.executable, *code], stderr=subprocess.PIPE, text=True, cwd=ROOT, **options)  # type: ignore[call-overload,no-any-return]
+    """Run Python code in a process of its own, as it ends; its output is buffered, whatever the shell says."""
+    plain = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    return subprocess.run([sys.executable, *code], stderr=subprocess.PIPE, text=True, cwd=ROOT, env=plain, **options)  # type: ignore[call-overload,no-any-return]
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")

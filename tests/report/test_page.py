@@ -107,7 +107,8 @@ def test_equal_records_give_equal_pages_and_ids_are_unique(small):
 
 
 def test_every_colour_is_defined():
-    """Catches a part of a bar that is black, as there are more stages than colours, and a chart without its table."""
+    """Catches a part of a bar that is black, as there are more stages than colours, and a chart without its table or
+    of columns that its data lack, such as the order of the parts of a bar."""
     runs = frontier(**SMALL)
     runs = [*runs, *on_demand(runs)]
     stages = {"stage_s": dict.fromkeys([*STAGES, "foreign"], 1.0), "train_s": 20.0}
@@ -118,6 +119,9 @@ def test_every_colour_is_defined():
     keys = {"frontier", "pairs", "effects", "quality", "curves", "on_demand", "stages"}
     assert {key.split("-")[1] for key in drawn} == keys
     assert all(len(section.table) for section in sections(*runs).values() if section.key != "gallery")
+    for key, chart in drawn.items():
+        columns = {name for rows in chart["datasets"].values() for row in rows for name in row}
+        assert set(re.findall(r'"field": "([^"]+)"', json.dumps(chart))) <= columns, key
 
 
 def test_charts_hold_the_numbers_of_their_tables():

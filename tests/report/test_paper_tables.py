@@ -156,7 +156,7 @@ def test_only_the_pool_nearest_to_the_paper_is_shown():
     assert "# OTHER PROTOCOL, D-NeRF: experiment e7000, 100x100, 7,000 iterations" in page
     assert page.count("# OTHER PROTOCOL") == 1
     assert dict(zip(of.iterations, of.shown, strict=True)) == {1000: False, 500: False, 7000: True}
-    sizes = {"heart1": "250x250", "dust": "400x400"}
+    sizes = {"heart1": "250x250", "dust": "400x400", "cloud": "400x400"}
     runs = [at_paper(dataset="7DGS-PBR", scene=s, resolution=size, downscale=4) for s, size in sizes.items()]
     assert "7DGS-PBR: experiment dnerf, 250x250, 400x400, 30,000 iterations" in shown(*runs)
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from forked import Forked
@@ -72,6 +73,20 @@ def test_a_signal_is_noted_while_a_run_lasts(number: int, monkeypatch: pytest.Mo
             assert request.signal is None
     finally:
         signal.signal(number, before)
+
+
+def test_a_run_reports_once_an_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that never reports after its start, which looks dead, and one that reports after each step."""
+    clock = SimpleNamespace(monotonic=lambda: now, time=time.time)
+    monkeypatch.setattr(progress, "time", clock)
+    now = 5.0
+    report = progress.Reporter(tmp_path, [], 100)
+    for step in (10, 20):
+        assert not report.is_due()
+        now += progress.EVERY
+        assert report.is_due()
+        report(step, 1.0, None)
+        assert progress.read(tmp_path / progress.FILE_NAME).step == step
 
 
 def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path) -> None:

@@ -184,13 +184,14 @@ def test_repair_is_of_this_layout(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
 def test_points_of_colmap(root: Path, kind: str) -> None:
-    """Catches points of a reconstruction that are left out, or not moved with the cameras."""
+    """Catches points of a reconstruction that are left out, not moved with the cameras, or said to be left out."""
     means = np.array([(0.5, -0.25, 4.0), (1.5, 2.0, 5.0)])
     capture = Capture("PINHOLE", WIDTH, HEIGHT, (1, 1, 1, 1), [], np.empty((0, 4, 4)), means)
     capture.write(root, kind)
     scene = scenes.load(root)
     torch.testing.assert_close(scene.placement.to_user(scene.points.means).numpy(), means, rtol=0, atol=1e-6)
     torch.testing.assert_close(scene.points.colors, (torch.tensor([COLOR]) / 255).expand(2, 3))
+    assert not any("and not sparse" in note for note in scene.notes)
 
 
 def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:

@@ -121,9 +121,9 @@ def test_a_slider_changes_the_picture_which_is_saved_as_it_is_shown(visit, viewe
     assert np.abs(inside.astype(int) - shown).mean() < 2  # of JPEG
 
 
-def test_a_sharp_screen_gets_all_its_pixels(browser, viewer):
-    """Catches an image of half the pixels of the screen, and an address whose words are lost or mean nothing."""
-    context = browser.new_context(viewport={"width": 900, "height": 500}, device_scale_factor=2)
+def test_a_sharp_screen_gets_two_pixels_a_side(browser, viewer):
+    """Catches an image of half or of all the pixels of a phone, and an address whose words are lost or mean nothing."""
+    context = browser.new_context(viewport={"width": 900, "height": 500}, device_scale_factor=3)
     page = context.new_page()
     page.goto(f"http://localhost:{viewer.server.get_port()}/?initialCameraFov=0.5")
     page.wait_for_selector("text=x 1000", timeout=60_000)
