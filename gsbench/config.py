@@ -163,6 +163,9 @@ class EffectsConfig:
     budget_db: float = key(
         0.05, "val PSNR that removal at the end may cost", unit="dB", low=0, high=10, needs="effects.gate"
     )
+    static_above: float | None = key(
+        None, "lifetime above which Gaussians become static after densification, as in 3D-4DGS", unit="clips", low=0
+    )
     compare: bool = key(False, "choose for model=auto by val PSNR, after 70 % of the steps", absent=False)
 
 

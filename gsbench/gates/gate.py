@@ -8,7 +8,7 @@ images' squared error (gsbench.gates.sensitivity). lambda is the same for all Ga
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,7 @@ from gsbench.models import GaussianModel
 from gsbench.models.appearance import MOST_PACKED, at_most, order_of
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import GatedModel
-from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC
+from gsbench.models.simplifications import CONDITIONED, LIVE, REMOVED, STATIC, Simplification
 
 # Nanoseconds that a Gaussian adds to a frame, as measured on an EPYC Zen 4 (AVX-512, one thread, 5,300 Gaussians at
 # 80 x 80). They are constants, so that the same seed chooses the same Gaussians on every machine.
@@ -81,7 +81,7 @@ def gate_within(
             continue
         gated = copy.deepcopy(model)
         choice = choose(sensitivity, gated, share)
-        rows, changed = apply(gated, sensitivity, choice, intervals)
+        rows, changed = apply(gated, sensitivity.simplifications, choice, intervals)
         loss = before - measure(gated)
         if loss <= budget_db and len(gated):
             counts = gated.count_by_effects() | {"removed": len(model) - len(gated)}
@@ -193,7 +193,7 @@ def effect_sets_of(model: GaussianModel) -> EffectSets:
 @torch.no_grad()
 def apply(
     model: GatedModel,
-    sensitivity: Sensitivity,
+    simplifications: Sequence[Simplification],
     choice: ChosenSimplifications,
     intervals: Tensor | None = None,  # [N, 2]
 ) -> tuple[Tensor, Tensor]:
@@ -201,7 +201,7 @@ def apply(
 
     Args:
         model: the model, which is changed in place.
-        sensitivity: the parameters of each simplified Gaussian.
+        simplifications: the parameters of each simplified Gaussian.
         choice: the simplification of each Gaussian, from `choose`.
         intervals: the first and the last time at which AGR changes each Gaussian.
 
@@ -210,7 +210,7 @@ def apply(
     """
     now = effect_sets_of(model)
     assert now.orders is not None
-    for way in sensitivity.simplifications:
+    for way in simplifications:
         if way.raw is None:
             continue
         rows = (

@@ -58,7 +58,7 @@ def test_a_static_gaussian_changes_with_nothing() -> None:
     after = copy.deepcopy(model)
     everything = choose(sensitivity, after, 0.0)
     all_rows = {key: torch.full((N,), key == "static") for key in everything.geometry}
-    apply(after, sensitivity, replace(everything, geometry=all_rows))
+    apply(after, sensitivity.simplifications, replace(everything, geometry=all_rows))
     assert after.count_by_effects()["static"] == len(after) == N
     for other in (later, beside):
         for a, b in zip(after.slice(here)[:3], after.slice(other)[:3], strict=True):
@@ -85,7 +85,7 @@ def test_a_gated_model_is_gated_again(name: str) -> None:
     assert_same_images(after, plain, atol=1e-5)
     views = views_of(after, 1)[:10]
     sensitivity = probe(after, views, BLACK)
-    remaining, _ = apply(again, sensitivity, choose(sensitivity, again, 0.0))
+    remaining, _ = apply(again, sensitivity.simplifications, choose(sensitivity, again, 0.0))
     assert again.count_by_effects()["refined"] <= rows["refined"]
     assert len(remaining) <= len(after)
     assert_same_images(after, again, atol=1e-5)

@@ -14,6 +14,7 @@ from interrupted import assert_same_bits
 from tiny_run import gsbench, overrides
 from tiny_training import compose, moving_square
 
+from gsbench.errors import InputError
 from gsbench.gates import __main__ as command
 from gsbench.gates import hook
 from gsbench.gates.hook import (
@@ -27,6 +28,7 @@ from gsbench.gates.hook import (
 )
 from gsbench.measure import record
 from gsbench.measure.record import Gate
+from gsbench.models import CameraTime
 from gsbench.run.load import load_run
 from gsbench.scenes.scene import Scene, View
 from gsbench.schedule import Schedule
@@ -72,6 +74,29 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
     assert second.model.effect_sets is not None
     assert second.hook(Gating).gates == first.hook(Gating).gates
     assert_same_bits(end(second), expected)
+
+
+@pytest.mark.parametrize("model", ["4dgs", "7dgs", "stg"])
+def test_long_lived_gaussians_become_static(model: str) -> None:
+    """Catches a rule that acts at another step, on short lives or anew, and a checkpoint that lacks what it did."""
+    words = ("effects.static_above=0.3",)
+    first = trainer(*words, model=model)
+    first.run(lambda _: None, "test", lambda: first.step < 59)
+    assert first.model.effect_sets is None
+    long_lived = int((first.model.lifetimes()[1] > 0.3).sum())
+    states: list[dict[str, object]] = []
+    first.run(lambda state: states.append(copy.deepcopy(state)), "test", lambda: first.step < 75)
+    static = first.model.count_by_effects()["static"]
+    assert 0 < static < len(first.model)
+    assert abs(static - long_lived) < 0.2 * static  # one more step and one round of densification
+    early, late = (first.model.slice(CameraTime.at(torch.tensor([0.0, 0, -4]), time)) for time in (0.1, 0.9))
+    assert torch.equal(early.means[-static:], late.means[-static:])
+    assert not torch.equal(early.opacities[:-static], late.opacities[:-static])
+    second = trainer(*words, model=model)
+    second.load_state_dict(states[-1])
+    assert_same_bits(end(second), end(first))
+    with pytest.raises(InputError, match=r"effects\.static_above: .* of 3dgs have none"):
+        trainer(*words, model="3dgs")
 
 
 def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:

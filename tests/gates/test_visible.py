@@ -68,8 +68,8 @@ def test_agr_rests_unseen() -> None:
     sensitivity = probe(model, views, BLACK)
     gated, resting = copy.deepcopy(model), copy.deepcopy(model)
     choice = choose(sensitivity, model, 0.0)
-    rows, _ = apply(gated, sensitivity, choice)
-    again, _ = apply(resting, sensitivity, choice, intervals)
+    rows, _ = apply(gated, sensitivity.simplifications, choice)
+    again, _ = apply(resting, sensitivity.simplifications, choice, intervals)
     assert sorted(rows.tolist()) == sorted(again.tolist())
     assert torch.equal(resting.effect_sets.intervals, intervals[again[: resting.effect_sets.refined]])
     assert not (again < 5).any(), "Gaussians that are never seen cost nothing to remove"
@@ -96,5 +96,5 @@ def test_what_no_view_shows_is_removed(most: int) -> None:
     assert (errors[hidden] == 0).all()
     after = copy.deepcopy(model)
     sensitivity = probe(model, views, BLACK, most=most, hidden=hidden)
-    rows, _ = apply(after, sensitivity, choose(sensitivity, model, 0.0))
+    rows, _ = apply(after, sensitivity.simplifications, choose(sensitivity, model, 0.0))
     assert not hidden[rows].any()

@@ -201,5 +201,5 @@ def gated(name: str, share: float) -> tuple[GaussianModel, GaussianModel]:
     """A model before and after a gate; no test may change them."""
     model, sensitivity = probed(name)
     after = copy.deepcopy(model)
-    apply(after, sensitivity, choose(sensitivity, after, share))
+    apply(after, sensitivity.simplifications, choose(sensitivity, after, share))
     return model, after

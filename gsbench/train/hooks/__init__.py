@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # A weight, and the term [] of a view of the batch by its index.
 LossTerm = tuple[float, "Callable[[CameraTime, int], Tensor]"]
 H = TypeVar("H", bound="Hook")
-ELSEWHERE = ("gsbench.gates.hook",)  # modules of hooks outside of this folder, which act last
+ELSEWHERE = ("gsbench.gates.long_lived", "gsbench.gates.hook")  # hooks outside of this folder, which act last
 
 
 class Training(Protocol):
