@@ -19,7 +19,12 @@ from gsbench.train.loop import Trainer
 SIZE = 16  # pixels a side
 VIEWS = 12
 POINTS = 80
-NARROW = {"deformable": ["model.options.width=24"]}  # networks small enough for a test
+NARROW = {
+    "deformable": ["model.options.width=24"],
+    "hexplane": [
+        f"model.options.{option}" for option in ("resolution=8", "time_resolution=6", "channels=4", "width=8")
+    ],
+}  # networks small enough for a test
 
 
 def compose(model: str, steps: int, *overrides: str) -> Config:

@@ -25,10 +25,19 @@ def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
         sums[key] = gradient
 
 
+def collect_gradients(x: Tensor) -> Tensor:
+    """Return `x`, such as the output of a network, for which a tape adds up all gradients before autograd runs.
+
+    Without this, autograd runs through the network once for each input of a kernel that is computed from `x`.
+    """
+    tape: Tape | None = getattr(active, "tape", None)
+    return x if tape is None or x.grad_fn is None else tape.collect(x)
+
+
 class _Call(NamedTuple):
     """A recorded call of an operation."""
 
-    operation: Operation
+    operation: Operation | None  # None: `collect`, whose output is its input
     tensors: list[Tensor]
     wanted: list[bool]
     slots: Slots
@@ -63,6 +72,12 @@ class Tape:
                     x.requires_grad_()  # so that autograd records what torch computes from this output
             self._calls.append(_Call(operation, tensors, wanted, slots, outputs))
         return outputs
+
+    def collect(self, x: Tensor) -> Tensor:
+        """Return a tensor that shares the memory of `x` but not its `grad_fn`, see `collect_gradients`."""
+        leaf = x.detach().requires_grad_()
+        self._calls.append(_Call(None, [x], [True], {}, [leaf]))
+        return leaf
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Compute the gradients of `loss` with respect to the tensors `sources`, and add them to `sums`.
@@ -111,6 +126,11 @@ class _Gradients:
         """Run the backward kernel of one recorded call, if one of its outputs has a gradient."""
         upstream = [self.by_id.get(id(x)) for x in call.outputs]
         if all(g is None for g in upstream):
+            return
+        if call.operation is None:
+            for x, gradient in zip(call.tensors, upstream, strict=True):
+                if gradient is not None:
+                    self.propagate(x, gradient)
             return
         # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
         whole, sums = {}, {}

@@ -6,7 +6,6 @@ neural refinement).
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -107,12 +106,12 @@ class GaussianModel(nn.Module, ABC):
         """Return the raw parameters in which clones of Gaussians differ from these; by default none."""
         return {}
 
-    def penalties(self) -> Sequence[tuple[float, Callable[[CameraTime, int], Tensor]]]:
-        """Return terms of the loss of every view: a weight, and a function of the view and its index in the batch.
+    def penalty(self) -> Tensor | None:
+        """Return a term of the loss that depends on the parameters alone, [], or None.
 
-        Each function returns a tensor []. Threads call it for several views at the same time.
+        A step adds its gradient once to the mean of those of the views.
         """
-        return ()
+        return None
 
     def scales(self) -> Tensor:
         """Return the largest spatial standard deviation of each Gaussian, [N], world units, without a gradient."""

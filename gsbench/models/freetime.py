@@ -5,7 +5,6 @@ FreeTimeGS++; "SharpTimeGS", arXiv 2602.02989v2.
 """
 
 import math
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -96,12 +95,10 @@ class FreeTimePlusModel(FreeTimeModel, gates=True):
         G = permanent_share(raw)
         return shift, G + (1 - G) * passing
 
-    def penalties(self) -> Sequence[tuple[float, Callable[[CameraTime, int], Tensor]]]:
-        return [(PERMANENCE_WEIGHT, self.passing_share)]
-
-    def passing_share(self, query: CameraTime, index: int) -> Tensor:
-        """Return the mean of 1 - G over all Gaussians, []; those that were made static have G = 1."""
-        return (1 - permanent_share(dict(self.splats.items()))[: self.conditioned]).sum() / max(1, len(self))
+    def penalty(self) -> Tensor:
+        """Return the weighted mean of 1 - G over all Gaussians, []; those that were made static have G = 1."""
+        passing = 1 - permanent_share(dict(self.splats.items()))[: self.conditioned]
+        return PERMANENCE_WEIGHT * passing.sum() / max(1, len(self))
 
     def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
         G = permanent_share(dict(self.splats.items())).detach()

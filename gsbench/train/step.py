@@ -127,7 +127,7 @@ class Step:
     def __call__(self, views: Sequence[View], terms: Sequence[LossTerm] = ()) -> list[ViewResult]:
         """Render a batch of views and store the gradient of the loss in the model's parameters.
 
-        The loss is the mean over views of the photometric loss plus weighted terms.
+        The loss is the mean over views of the photometric loss plus weighted terms, plus the model's penalty.
 
         Raises:
             DivergedError: a 3D Gaussian of a view has a value that is not finite.
@@ -150,6 +150,8 @@ class Step:
             total = add_up([result.sums for result in results])
             for parameter in sources:
                 parameter.grad = total.get(id(parameter))
+            if (penalty := self.model.penalty()) is not None:
+                penalty.backward()
         return results
 
     def _signature(self, views: Sequence[View], sources: list[nn.Parameter], workers: int) -> Hashable:

@@ -12,7 +12,7 @@ from gsbench.kernels.backends import AUTO, CPU, REFERENCE, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.loss import l1_ssim
 from gsbench.kernels.slices import slice_static
-from gsbench.kernels.tape import Tape
+from gsbench.kernels.tape import Tape, collect_gradients
 from gsbench.measure.speed import StageClock
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import EffectSets
@@ -192,6 +192,32 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
     sums[id(sh0)] -= 1
     for x, gradient in zip(leaves, expected, strict=True):
         torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
+
+
+def test_a_network_is_differentiated_once() -> None:
+    """Catches a pass through a network for each input of a kernel that it computes, a gradient that such a pass would
+    have and one pass lacks, and a tensor that is cut off from its network where no tape runs."""
+    g = torch.Generator().manual_seed(6)
+    raw = torch.randn(20, 7, generator=g).requires_grad_()
+    sh0, shN = torch.randn(20, 1, 3, generator=g), torch.randn(20, 15, 3, generator=g)
+    passes = []
+
+    def loss() -> Tensor:
+        hidden = raw.sin()
+        hidden.register_hook(passes.append)
+        scales, quats = (2 * collect_gradients(hidden)).split([3, 4], -1)
+        factors, faded = slice_static(scales, quats, scales[:, 0].exp())
+        colors = show_colors(sh0, shN, scales, faded, center=torch.zeros(3), degree=3)[0]
+        return (factors.sum(-1) * colors).sum() + faded.sum()
+
+    (expected,) = torch.autograd.grad(loss(), [raw])
+    passes.clear()
+    sums: dict[int, Tensor] = {}
+    with Tape() as tape:
+        value = loss()
+    tape.backward(value, torch.ones(()), [raw], sums)
+    torch.testing.assert_close(sums[id(raw)], expected)
+    assert len(passes) == 1
 
 
 def test_two_views_may_share_a_gradient() -> None:

@@ -50,11 +50,13 @@ def halves(name: str) -> dict[str, float]:
     return {key: 0.5 for key, p in options_of(name).items() if p.annotation is float}
 
 
+# Networks small enough for a test.
+NARROW: dict[str, dict[str, Any]] = {"hexplane": {"channels": 3, "resolution": 5, "time_resolution": 4, "width": 6}}
 # Every registered model is tested without being listed: EVERY has the variants above, and the others by their names.
 assert registry.is_registered("3dgs")  # all are
 NAMES = sorted(registry._REGISTRY)
 EVERY = VARIANTS | {
-    name + end: (name, halves(name) | ({"agr": True} if end else {}))
+    name + end: (name, halves(name) | NARROW.get(name, {}) | ({"agr": True} if end else {}))
     for name in NAMES
     for end in ("", "_agr")
     if name not in MODELS
@@ -80,6 +82,9 @@ def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
             parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
         if model.refinement is not None:
             for parameter in (model.refinement.weight_out, model.refinement.bias_out):
+                parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
+        for name, parameter in model.named_parameters():
+            if name.partition(".")[0] not in ("splats", "refinement", "log_lambda"):  # of a field
                 parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
     return model
 

@@ -17,6 +17,7 @@ from small import (
     EXTENT,
     MODELS,
     NAMES,
+    NARROW,
     N,
     active,
     covariances,
@@ -111,19 +112,21 @@ def test_a_refusal_says_what_is_meant(name: str, options: dict[str, Any], messag
 
 @REGISTERED
 def test_every_number_among_the_options_matters(name: str) -> None:
-    """Catches an option that is checked and then forgotten: neither the start nor a slice depends on it."""
+    """Catches an option that is checked and then forgotten: neither start, slice nor loss depends on it."""
 
     def numbers(options: dict[str, Any]) -> list[Tensor]:
-        model = started(build(name, **options))
-        return [*raw(model).values(), *tensors_of(moved(model).slice(QUERY))]
+        model = moved(started(build(name, **options)))
+        penalty = model.penalty()
+        return [*raw(model).values(), *tensors_of(model.slice(QUERY)), *([] if penalty is None else [penalty])]
 
-    static, before = "time" not in registry.find(name).observes, numbers(halves(name))
+    options = halves(name) | NARROW.get(name, {})
+    static, before = "time" not in registry.find(name).observes, numbers(options)
     for key in halves(name):
         if static and "time" in key:  # of a model that derives from one with time
             continue
         both = name == "ndgs" and key in ("lambda_d", "lambda_t")  # which a joint gate needs equal
         changed = {"lambda_d": 0.25, "lambda_t": 0.25} if both else {key: 0.25}
-        after = numbers(halves(name) | changed)
+        after = numbers(options | changed)
         assert any(not torch.equal(x, y) for x, y in zip(before, after, strict=True)), key
 
 
@@ -348,6 +351,7 @@ def test_agr_moves_what_it_should(variant: str) -> None:
     """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity; and a refinement whose
     switching on in mid-training is a jump."""
     model = lively(variant)
+    model.set_active(replace(model.active, warms_up=True))  # after which a field may change raw parameters too
     before, after = raw(model), model.refined(QUERY)
     names = [*model.centers, *model.geometry]
     expected = model.refinement([before[k] for k in names], torch.tensor(0.45, dtype=torch.float64))
@@ -358,7 +362,7 @@ def test_agr_moves_what_it_should(variant: str) -> None:
     for p in (model.refinement.weight_out, model.refinement.bias_out):
         p.data.zero_()
     on = tensors_of(model.slice(QUERY))
-    model.set_active(ActiveComponents(3, False, False))
+    model.set_active(replace(model.active, refine=False))
     assert all(torch.equal(a, b) for a, b in zip(on, tensors_of(model.slice(QUERY)), strict=True))
 
 

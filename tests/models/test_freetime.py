@@ -34,13 +34,11 @@ def test_a_share_of_an_opacity_lasts() -> None:
     opacities = model.slice(QUERY).opacities / torch.sigmoid(model.splats["opacities"])
     expected = torch.full((N,), 0.81174101, dtype=torch.float64)
     torch.testing.assert_close(opacities.detach(), expected, rtol=0, atol=5.1e-9)
-    ((weight, penalty),) = model.penalties()
-    assert weight == 1e-3
-    assert penalty(QUERY, 0).item() == pytest.approx(1 - 0.73105858)
-    penalty(QUERY, 0).backward()
+    assert model.penalty().item() == pytest.approx(1e-3 * (1 - 0.73105858))
+    model.penalty().backward()
     assert (model.splats["permanence"].grad < 0).all()
     as_if = with_effect_sets(model, 0, N // 3)
-    assert as_if.passing_share(QUERY, 0).item() == pytest.approx((1 - 0.73105858) / 3)
+    assert as_if.penalty().item() == pytest.approx(1e-3 * (1 - 0.73105858) / 3)
 
 
 @pytest.mark.parametrize(

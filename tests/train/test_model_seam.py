@@ -34,8 +34,8 @@ class Deformed(Gaussians3DModel):
     def groups(self) -> dict[str, list[nn.Parameter]]:
         return super().groups() | {"field": list(self.field.parameters())}
 
-    def penalties(self) -> Any:
-        return [(0.5, lambda *_: self.field.weight.square().sum() - self.field.bias[0])]
+    def penalty(self) -> Tensor:
+        return 0.5 * (self.field.weight.square().sum() - self.field.bias[0])
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         self.started_at = points.times

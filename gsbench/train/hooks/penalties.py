@@ -2,7 +2,7 @@
 
     loss = (1 - w) L1 + w (1 - SSIM) + sum_k weight_k penalty_k(view)
 
-`gsbench.train.regularisers` defines them. A model adds its own by `GaussianModel.penalties`.
+`gsbench.train.regularisers` defines them. A model adds terms of its parameters alone by `GaussianModel.penalty`.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Penalties(Hook):
             if self.training.schedule.within(step, weighted.start, weighted.stop):
                 penalty.prepare(step, views[0])
                 terms.append((weighted.weight, penalty))
-        return [*terms, *self.training.model.penalties()]
+        return terms
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
         for penalty in self.active.values():

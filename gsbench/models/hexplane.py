@@ -1,0 +1,197 @@
+"""Define 4DGaussians: 3D Gaussians that a field, stored in planes over position and time, moves, turns and resizes.
+
+Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2024, arXiv 2310.08528, with the
+constants of the authors' code. The planes are those of HexPlane (Cao and Johnson, CVPR 2023).
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+from itertools import combinations
+from typing import Any, ClassVar, cast
+
+import torch
+from torch import Tensor, nn
+
+from gsbench.kernels.tape import collect_gradients
+from gsbench.kernels.tensors import check_number
+from gsbench.models.base import Raw
+from gsbench.models.camera_time import CameraTime
+from gsbench.models.deformable import Linear
+from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.registry import register
+from gsbench.scenes.scene import Points
+
+CHANGED = {"means": 3, "scales": 3, "quats": 4}  # the raw parameters that the field changes, with their widths
+THINNEST = 1e-3  # least width of the box of the planes, in parts of its largest: all initial points may lie in a plane
+
+
+@register("hexplane")
+class HexPlaneModel(Gaussians3DModel):
+    """4DGaussians: canonical 3D Gaussians, as in 3DGS, and a field that changes their raw parameters at a time t,
+
+        (dp, ds, dr) = network(planes(mu_p, t))        mean = mu_p + dp
+        cov = R S S^T R^T with R of the quaternion q + dr and S = diag(exp(s + ds))
+
+    AGR changes raw parameters too, so both act in `refined`, before the slice. Density control sees the canonical
+    Gaussians, which alone are drawn during the warm-up.
+    """
+
+    observes: ClassVar[tuple[str, ...]] = ("time",)
+    warm_up = 3 / 23  # the authors': 3,000 of 23,000
+    planes: "Planes"  # of an initialised model, as the network
+    network: "Network"
+
+    def __init__(
+        self,
+        *,
+        channels: int = 32,  # numbers in a node of a plane
+        levels: int = 2,  # sets of six planes; each has twice the nodes along x, y and z of the set before
+        resolution: int = 64,  # nodes along x, y and z in the first level
+        time_resolution: int = 50,  # nodes along t in every level
+        width: int = 64,  # of the hidden layers
+        space_smoothness: float = 1e-4,  # weights in the loss, see `Planes.penalty`
+        time_smoothness: float = 1e-2,
+        time_sparsity: float = 1e-4,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        check_number(channels, "channels", 1, 1024)
+        check_number(levels, "levels", 1, 8)
+        check_number(resolution, "resolution", 3, 1024)
+        check_number(time_resolution, "time_resolution", 3, 4096)
+        check_number(width, "width", 1, 4096)
+        check_number(space_smoothness, "space_smoothness", 0)
+        check_number(time_smoothness, "time_smoothness", 0)
+        check_number(time_sparsity, "time_sparsity", 0)
+        self.channels, self.width = channels, width
+        self.nodes = [(*[resolution << level] * 3, time_resolution) for level in range(levels)]
+        self.weights = space_smoothness, time_smoothness, time_sparsity
+
+    def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
+        """Start as 3DGS does, with a field of random weights: at the end of the warm-up, the Gaussians jump."""
+        super().initialise(points, extent, generator)
+        self.planes = Planes(points.means, self.nodes, self.channels, generator)
+        self.network = Network(len(self.nodes) * self.channels, self.width, generator)
+
+    def refined(self, query: CameraTime) -> Raw:
+        """Return the raw parameters after AGR and, from the end of the warm-up on, the field have changed them."""
+        raw = super().refined(query)
+        if self.active.warms_up:
+            return raw
+        assert query.time is not None
+        changes = collect_gradients(self.network(self.planes(raw["means"], query.time)))
+        by_name = zip(CHANGED, changes.split(list(CHANGED.values()), -1), strict=True)
+        return raw | {name: raw[name] + change for name, change in by_name}
+
+    def penalty(self) -> Tensor | None:
+        return None if self.active.warms_up else self.planes.penalty(*self.weights)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        field = {"planes": list(self.planes.parameters()), "network": list(self.network.parameters())}
+        return super().groups() | field
+
+
+class Planes(nn.Module):
+    """Planes of features over pairs of the axes x, y, z, t (section 4.2); their box is that of the initial points.
+
+    The features of a level are the product of samples of its six planes. Space planes start at random, planes with t
+    at 1, where time changes nothing.
+    """
+
+    low: Tensor  # [3] the corners of the box, world units
+    high: Tensor  # [3]
+
+    def __init__(
+        self,
+        points: Tensor,  # [N, 3] positions of the initial points, world units
+        nodes: Sequence[tuple[int, ...]],  # of each level along x, y, z and t
+        channels: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        low, high = points.aminmax(dim=0)
+        self.register_buffer("high", high)
+        self.register_buffer("low", torch.minimum(low, high - THINNEST * (high - low).max()))
+        self.levels = cast("Sequence[nn.ParameterDict]", nn.ModuleList(nn.ParameterDict() for _ in nodes))
+        for level, along in zip(self.levels, nodes, strict=True):
+            for (a, columns), (b, rows) in combinations(zip("xyzt", along, strict=True), 2):
+                plane = torch.ones(rows, columns, channels)
+                level[a + b] = plane if b == "t" else plane.uniform_(0.1, 0.5, generator=generator)
+
+    def forward(
+        self,
+        positions: Tensor,  # [N, 3] world units
+        time: Tensor,  # [] in [0, 1]
+    ) -> Tensor:
+        """Return the features of all levels, [N, levels C].
+
+        From the lowest to the highest corner of the box, coordinates fall from 1 to -1. Time is used as it is, so only
+        the second half of the nodes along t is read, as in the authors' code.
+        """
+        x, y, z = ((positions - self.high) * 2 / (self.low - self.high) - 1).unbind(-1)
+        at = {"x": x, "y": y, "z": z, "t": time}
+        samples = [[sample(plane, at[axes[0]], at[axes[1]]) for axes, plane in level.items()] for level in self.levels]
+        return torch.cat([reduce(torch.mul, of_level) for of_level in samples], -1)
+
+    def penalty(self, space_smoothness: float, time_smoothness: float, time_sparsity: float) -> Tensor:
+        """Return the sum over planes of three weighted terms, [].
+
+        For all planes, it is the mean square of second differences along the rows (y, z or t), not along the columns,
+        as in the authors' code. For those with t, it is also the mean distance from 1.
+        """
+        terms = []
+        for level in self.levels:
+            for axes, plane in level.items():
+                roughness = plane.diff(n=2, dim=0).square().mean()
+                terms.append(roughness * (time_smoothness if "t" in axes else space_smoothness))
+                if "t" in axes:
+                    terms.append(time_sparsity * (1 - plane).abs().mean())
+        return torch.stack(terms).sum()
+
+
+def sample(
+    plane: Tensor,  # [rows, columns, C]
+    x: Tensor,  # [N] from -1, the first column, to 1, the last
+    y: Tensor,  # [N] or [] the same for rows
+) -> Tensor:  # [N, C]
+    """Interpolate a plane bilinearly; beyond its border, it has the values of the border.
+
+    On a CPU, the gradient adds the points of a node in their order, for any number of threads; that of
+    torch.nn.functional.grid_sample depends on the width of the processor's vectors.
+    """
+    rows, columns, _ = plane.shape
+    (left, across), (top, down) = cell(x, columns), cell(y, rows)
+    first = top * columns + left
+    corners = torch.stack([first, first + 1, first + columns, first + columns + 1])  # [4, N]
+    values = plane.flatten(0, 1).index_select(0, corners.flatten()).unflatten(0, corners.shape)
+    upper_left, upper_right, lower_left, lower_right = values.unbind()
+    return upper_left.lerp(upper_right, across).lerp(lower_left.lerp(lower_right, across), down)
+
+
+def cell(x: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+    """Return which of `nodes` from -1 to 1 lies before x, and the share of the way from it to the next node."""
+    place = ((x + 1) / 2 * (nodes - 1)).clamp(0, nodes - 1)
+    before = place.detach().long().clamp(0, nodes - 2)  # of NaN too
+    return before, (place - before)[..., None]
+
+
+class Network(nn.Module):
+    """The network of 4DGaussians (section 4.3): a layer, then two more for each of the changed raw parameters."""
+
+    def __init__(self, inputs: int, width: int, generator: torch.Generator) -> None:
+        super().__init__()
+
+        def layer(inputs: int, outputs: int, *, relu: bool = False) -> Linear:
+            linear = Linear(inputs, outputs, generator, relu=relu)
+            nn.init.xavier_uniform_(linear.weight, generator=generator)
+            return linear
+
+        self.first = layer(inputs, width, relu=True)
+        self.heads = nn.ModuleList(
+            nn.Sequential(layer(width, width, relu=True), layer(width, outputs)) for outputs in CHANGED.values()
+        )
+
+    def forward(self, features: Tensor) -> Tensor:  # [N, levels C] -> [N, 10]
+        """Return the changes of the raw parameters CHANGED, side by side."""
+        hidden = self.first(features)
+        return torch.cat([head(hidden) for head in self.heads], -1)

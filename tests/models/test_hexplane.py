@@ -1,0 +1,257 @@
+"""4DGaussians: its equations by vectors of an independent numpy program, its warm-up, its penalty, bits and rows."""
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from interrupted import assert_resumes, assert_same_bits
+from small import CAMERA, fresh, lively, raw, same, seeded
+from tiny_training import train, trainer
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from gsbench.models import CameraTime
+from gsbench.models.factors import sizes
+from gsbench.models.hexplane import Network, Planes, sample
+from gsbench.models.render import render
+from gsbench.schedule import ActiveComponents
+from gsbench.train.checkpoint import without_times
+
+FULL = ActiveComponents(3, False, False)
+QUERY = CameraTime.at(CAMERA, 0.25)
+DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vectors, which have eight digits
+
+
+def doubles(*numbers: float) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+# ---- the equations of the vectors
+
+POSITION, TIME = doubles(0.2, 0.5, 1)[None], doubles(0.25)[0]
+FEATURES = doubles(0.00920011, 0.01193819, 0.01502319, 0.01906886)
+CHANGES = doubles(0.15831827, 0.14810943, 0.13868341, 0.07187866, 0.07128625, 0.07138002,
+                  0.09128860, 0.07279905, 0.04956811, 0.02206824)  # fmt: skip
+
+
+def planes_of_the_vectors() -> Planes:
+    """Planes of two levels and channels with 0.3 + 0.05 i + 0.02 c + 0.03 r - 0.01 k + 0.002 r k (1 + l)."""
+    planes = Planes(
+        torch.stack([doubles(1, 0, 1.5), doubles(-1, 2, -0.5)]), [(3, 4, 5, 4), (6, 8, 10, 4)], 2, seeded(0)
+    )
+    for number, level in enumerate(planes.levels):
+        for i, plane in enumerate(level.values()):
+            r, k, c = torch.meshgrid(*[torch.arange(n).double() for n in plane.shape], indexing="ij")
+            plane.data = 0.3 + 0.05 * i + 0.02 * c + 0.03 * r - 0.01 * k + 0.002 * r * k * (1 + number)
+    return planes.double()
+
+
+def network_of_the_vectors() -> Network:
+    network: Any = Network(4, 8, seeded(0)).double()
+    for number, layer in enumerate([network.first, *(head[i] for head in network.heads for i in (0, 1))]):
+        rows, columns = layer.weight.shape
+        i, j = torch.arange(rows).double(), torch.arange(columns).double()
+        layer.weight.data = torch.sin(0.37 * number + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
+        layer.bias.data = 0.05 * torch.cos(number + 0.3 * i)
+    return network
+
+
+def test_the_features_of_planes() -> None:
+    """Catches rows in place of columns, another order of axes, levels or corners of the box, a time mapped to [-1, 1],
+    and a sum in place of the product."""
+    planes = planes_of_the_vectors()
+    assert [plane.shape for plane in planes.levels[1].values()] == [
+        (8, 6, 2), (10, 6, 2), (4, 6, 2), (10, 8, 2), (4, 8, 2), (4, 10, 2)]  # fmt: skip
+    x, y, z = doubles(-0.2, 0.5, -0.5)[:, None]
+    pairs = [(x, y), (x, z), (x, TIME), (y, z), (y, TIME), (z, TIME)]
+    samples = [sample(plane, *pair)[0, 0] for plane, pair in zip(planes.levels[0].values(), pairs, strict=True)]
+    expected = doubles(0.36310000, 0.37360000, 0.45125000, 0.46200000, 0.54218750, 0.60000000)
+    torch.testing.assert_close(torch.stack(samples).detach(), expected, **DIGITS)
+    torch.testing.assert_close(planes(POSITION, TIME).detach()[0], FEATURES, **DIGITS)
+
+
+def test_the_network() -> None:
+    """Catches a lost or further layer or ReLU, heads in another order, and a hidden layer of another head."""
+    torch.testing.assert_close(network_of_the_vectors()(FEATURES[None]).detach()[0], CHANGES, rtol=0, atol=1e-8)
+
+
+def test_a_changed_gaussian() -> None:
+    """Catches scales that change after the exp, and a quaternion that is normalised before the sum."""
+    model: Any = lively("hexplane", 4)
+    model.select(torch.arange(1))
+    model.planes, model.network = planes_of_the_vectors(), network_of_the_vectors()
+    model.splats["means"].data = POSITION
+    model.splats["scales"].data = doubles(0.01, 0.02, 0.03).log()[None]
+    model.splats["quats"].data = doubles(0.9, 0.1, -0.2, 0.3)[None]
+    changed = model.refined(QUERY)
+    torch.testing.assert_close(changed["means"].detach(), POSITION + CHANGES[:3], **DIGITS)
+    torch.testing.assert_close(
+        sizes(changed["scales"]).detach()[0], doubles(0.01074525, 0.02147777, 0.03221968), **DIGITS
+    )
+    quaternion = doubles(0.92888720, 0.16192139, -0.14096223, 0.30179411)
+    torch.testing.assert_close(normalize(changed["quats"], dim=-1).detach()[0], quaternion, **DIGITS)
+    geometry = model.slice(QUERY)
+    assert torch.equal(geometry.means, changed["means"])
+    torch.testing.assert_close(geometry.factors, model.factors(changed))
+
+
+def test_the_penalty() -> None:
+    """Catches differences of the first order or along columns, a plane of space taken for one of time, and a mean over
+    the planes or levels."""
+    planes = planes_of_the_vectors()
+    del planes.levels[1]  # type: ignore[attr-defined]
+    for plane in planes.levels[0].values():
+        plane.data[1, 1] += 0.1
+    terms = [planes.penalty(*weights).detach() for weights in torch.eye(3).tolist()]
+    torch.testing.assert_close(torch.stack(terms), doubles(0.01805556, 0.01958333, 1.39691667), **DIGITS)
+    both = planes_of_the_vectors()
+    torch.testing.assert_close(both.penalty(0, 0, 1), sum((1 - plane).abs().mean() for level in both.levels
+                                                         for axes, plane in level.items() if "t" in axes))  # fmt: skip
+
+
+# ---- samples
+
+
+def test_a_sample_is_that_of_torch() -> None:
+    """Catches a border that is extrapolated or zero, and a derivative of positions or nodes that is lost there."""
+    plane = torch.rand(4, 7, 3, generator=seeded(0)).double().requires_grad_()
+    x, y = (1.5 * torch.randn(2, 300, generator=seeded(1)).double()).requires_grad_().unbind()
+    corners = torch.tensor([-1, 1, 1, -1, 0]).double()
+    x, y = torch.cat([x, corners]), torch.cat([y, corners.roll(1)])
+    torches = grid_sample(plane.permute(2, 0, 1)[None], torch.stack([x, y], -1)[None, None], align_corners=True,
+                          padding_mode="border")[0, :, 0].T  # fmt: skip
+    torch.testing.assert_close(sample(plane, x, y), torches)
+    upstream = torch.randn(torches.shape, generator=seeded(2)).double()
+    inside = (x.abs() < 1) & (y.abs() < 1)  # on the border itself, torch's derivative is another
+    inputs = [plane, x, y]
+    for a, b in zip(torch.autograd.grad(sample(plane, x, y)[inside], inputs, upstream[inside]),
+                    torch.autograd.grad(torches[inside], inputs, upstream[inside]), strict=True):  # fmt: skip
+        torch.testing.assert_close(a, b)
+    torch.testing.assert_close(sample(plane, x, TIME), sample(plane, x, TIME.expand(len(x))))
+
+
+def test_the_field_has_the_gradients_of_its_values() -> None:
+    """Catches a lost or wrong derivative on the way from any number of the field, or a position, to the changes."""
+    model: Any = lively("hexplane", 5, channels=2, resolution=3, width=3)
+    fields = model.planes, model.network
+    values = [
+        x.detach().requires_grad_() for x in (model.splats["means"], *(p for f in fields for p in f.parameters()))
+    ]
+    names = [[name for name, _ in field.named_parameters()] for field in fields]
+    assert len(names[0]) == 6 * 2
+
+    def changes(positions: Tensor, *values: Tensor) -> Tensor:
+        planes = dict(zip(names[0], values, strict=False))
+        network = dict(zip(names[1], values[len(names[0]) :], strict=True))
+        features = torch.func.functional_call(fields[0], planes, (positions, TIME))
+        return torch.func.functional_call(fields[1], network, (features,))
+
+    assert torch.autograd.gradcheck(changes, values, fast_mode=True)
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("channels", [3, 32])
+def test_a_sample_has_the_same_bits_for_any_number_of_threads(channels: int) -> None:
+    """Catches a sum over the points that read a node whose order depends on the threads, as that of x[index] does."""
+    plane = torch.rand(9, 8, channels, generator=seeded(0)).requires_grad_()
+    x, y = (torch.rand(5000, generator=seeded(i)).mul(2.4).sub(1.2).requires_grad_() for i in (1, 2))
+    upstream = torch.randn(5000, channels, generator=seeded(3))
+
+    def computed(threads: int) -> list[Tensor]:
+        torch.set_num_threads(threads)
+        output = sample(plane, x, y)
+        return [output.detach(), *torch.autograd.grad(output, [plane, x, y], upstream)]
+
+    first = computed(1)
+    for threads in (2, 3, 5):
+        assert all(torch.equal(a, b) for a, b in zip(first, computed(threads), strict=True))
+
+
+def test_points_in_a_plane_make_no_nan() -> None:
+    """Catches a division by the box's width of zero, and a position that is not finite and reads beyond the nodes."""
+    points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
+    planes = Planes(points, [(4, 4, 4, 4)], 2, seeded(1))
+    positions = torch.cat([points, points + 1]).requires_grad_()
+    planes(positions, torch.tensor(0.5)).sum().backward()
+    assert positions.grad is not None
+    assert positions.grad.isfinite().all()
+    assert planes(torch.full((1, 3), math.nan), torch.tensor(0.5)).isnan().all()
+
+
+# ---- a training
+
+
+def test_the_field_waits_for_the_end_of_the_warm_up() -> None:
+    """Catches a field that acts, learns or is penalised in the warm-up, or never, and a warm-up of another share than
+    3,000 of 23,000 steps."""
+    fitted = trainer("hexplane", "train.iterations=46")
+    model: Any = fitted.model
+    camera = fitted.scene.train[0].camera
+
+    def field() -> dict[str, Tensor]:
+        return {name: x for name, x in copy.deepcopy(model.state_dict()).items() if name.startswith(("pl", "net"))}
+
+    def image(time: float) -> Tensor:
+        return render(model, camera, time, torch.zeros(3)).detach()
+
+    before = field()
+    train(fitted, until=6)
+    assert same(before, field())
+    assert model.active.warms_up
+    assert torch.equal(image(0.1), image(0.9))
+    train(fitted, until=7)
+    after = field()
+    assert not model.active.warms_up
+    assert {name for name, x in before.items() if torch.equal(x, after[name])} == {"planes.low", "planes.high"}
+    assert not torch.equal(image(0.1), image(0.9))
+
+
+def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:
+    """Catches a penalty of each view, whose sum grows with the batch, and a repeated step that adds it twice."""
+    gradients = []
+    for weights in ([0.0] * 3, [3.0, 5.0, 7.0]):
+        fitted = trainer("hexplane", "train.batch_size=3")
+        model: Any = fitted.model
+        model.weights = weights
+        model.set_active(FULL)
+        for _ in range(4):
+            fitted.gradients(fitted.scene.train[:3])
+        gradients.append([plane.grad.clone() for plane in model.planes.parameters()])
+    alone = torch.autograd.grad(model.penalty(), list(model.planes.parameters()))
+    for without, added, expected in zip(*gradients, alone, strict=True):
+        torch.testing.assert_close(added, without + expected)
+
+
+def test_a_training_goes_on_from_its_checkpoint() -> None:
+    """Catches nodes, weights, moments or a box that a checkpoint lacks: the image of a loaded model is another one."""
+    whole, _ = assert_resumes(lambda: trainer("hexplane"), 30)
+    loaded = trainer("hexplane", "seed=1")
+    loaded.model.planes.high += 1  # type: ignore[operator, union-attr]
+    loaded.load_state_dict(whole.state_dict())
+    view = whole.scene.train[3]
+    assert torch.equal(whole.render(view), loaded.render(view))
+
+
+def test_clones_and_children_are_canonical_and_share_the_field() -> None:
+    """Catches children drawn from the changed Gaussian, which the field would change twice, and rows of the field."""
+    model, plain = (fresh(name, 40) for name in ("hexplane", "3dgs"))
+    rows, before = torch.arange(40).repeat_interleave(2), copy.deepcopy(model.state_dict())
+    for each in (model, plain):
+        each.select(rows)
+        each.split_rows(torch.arange(80), seeded(1))
+    assert same(raw(model), raw(plain))
+    after = model.state_dict()
+    assert all(torch.equal(x, after[name]) for name, x in before.items() if not name.startswith("splats."))
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_training_has_the_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a repetition of a recorded step, or a penalty, whose sums use all threads."""
+    monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
+    ends = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        ends.append(without_times(train(trainer("hexplane", "train.batch_size=1")).state_dict()))
+    assert_same_bits(*ends)
