@@ -68,7 +68,10 @@ def moving(views: Sequence[View]) -> Regions:
         return Regions({}, "", f"needs {LEAST_VIEWS} evaluated views with the same camera")
     masks = {}
     for group in groups:
-        sums = np.stack([_sums(view) for view in group])  # [V, H, W, 3] of 3 x 3 pixels
+        camera = group[0].camera
+        sums = np.empty((len(group), camera.height, camera.width, 3), np.uint16)  # of 3 x 3 pixels
+        for i, view in enumerate(group):  # not a list to stack, which would take the memory twice
+            sums[i] = _sums(view)
         median = np.empty_like(sums[0])
         for row in range(0, sums.shape[1], STRIP):
             strip = np.sort(sums[:, row : row + STRIP], axis=0)
