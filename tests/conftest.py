@@ -1,6 +1,7 @@
 """Fixtures that every test folder may use."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +29,25 @@ def threads() -> Iterator[None]:
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def repeats(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Counts repetitions of recordings, those that are "done" and those that were found "outdated"."""
+    from gsbench.kernels.recording import OutdatedError, Recording
+
+    counted, repeat = Counter[str](), Recording.repeat
+
+    def count(self: Recording) -> None:
+        try:
+            repeat(self)
+        except OutdatedError:
+            counted["outdated"] += 1
+            raise
+        counted["done"] += 1
+
+    monkeypatch.setattr(Recording, "repeat", count)
+    return counted
 
 
 @pytest.fixture(scope="session")

@@ -66,6 +66,16 @@ def moving_square(views: int = VIEWS, dtype: torch.dtype = torch.float32) -> Sce
     return Scene("moving-square", train, [], train, (0.0, 0.0, 0.0), 4.4, points, "of tests/tiny_training.py")
 
 
+def near_and_far() -> Scene:
+    """The moving square seen by three cameras that most Gaussians are behind, and by one that sees all."""
+    square = moving_square()
+    far = square.train[0]
+    viewmat = far.camera.viewmat.clone()
+    viewmat[2, 3] *= 0.1
+    near = replace(far, camera=replace(far.camera, viewmat=viewmat))
+    return replace(square, train=[near, near, near, far], val=[far], test=[far])
+
+
 def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) -> Trainer:
     """A trainer of 100 steps at step 0, of the moving square with three views of val and two of test by default."""
     config = compose(model, 100, *overrides)
@@ -75,7 +85,8 @@ def trainer(model: str = "7dgs", *overrides: str, scene: Scene | None = None) ->
     built = build(config)
     assert scene.points is not None
     built.initialise(scene.points, scene.extent, generator(config.seed))
-    return Trainer(built, scene, scene.test, config)
+    scene = scene.to(config.device)
+    return Trainer(built.to(config.device), scene, scene.test, config)
 
 
 def train(trainer: Trainer, until: int | None = None) -> Trainer:

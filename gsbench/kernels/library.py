@@ -31,13 +31,13 @@ class Library:
     def call(self, name: str, slots: Slots, like: Tensor) -> None:
         """Run a kernel on the device of `like`; raises InputError if it does not support these sizes or options."""
         slots["threads"] = torch.get_num_threads()
-        run = partial(self._run, name, *[slots[field] for field in self._fields[name]])
+        run = partial(self._run, like.device, name, *[slots[field] for field in self._fields[name]])
         run()
         active = recording.current()
         if active is not None:
             active.add(run)
 
-    def _run(self, name: str, *values: Any) -> None:
+    def _run(self, device: torch.device, name: str, *values: Any) -> None:
         try:
             getattr(self.extension, name)(*values)
         except ValueError as error:
@@ -57,15 +57,12 @@ class CudaLibrary(Library):
 
     needs_scratch = True  # by torch's caching allocator
 
-    def call(self, name: str, slots: Slots, like: Tensor) -> None:
-        """Enqueue a kernel on the device of `like`."""
-        slots["threads"] = 1
-        values = [slots[field] for field in self._fields[name]]
-        if not like.is_cuda:  # tests run these kernels on the CPU
-            self._run(name, *values, 0)
+    def _run(self, device: torch.device, name: str, *values: Any) -> None:
+        if device.type != "cuda":  # tests run these kernels on the CPU
+            super()._run(device, name, *values, 0)
             return
-        with torch.cuda.device_of(like):
-            self._run(name, *values, torch.cuda.current_stream(like.device).cuda_stream)
+        with torch.cuda.device(device):
+            super()._run(device, name, *values, torch.cuda.current_stream(device).cuda_stream)
 
     def similarity_parts(self, height: int, width: int) -> int:
         """Return the number of partial sums that the kernel of `l1_ssim` writes: one per thread block."""

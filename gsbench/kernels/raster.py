@@ -187,11 +187,14 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
     """
     library = library_of(splats.depths.device.type)
     if not library.needs_scratch:
-        return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda value: value == 0)
+        return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda values: values == [0])[0]
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
-    *total, flagged = ends[-2:].tolist()
-    pairs = _checked_count(total[0] if total else 0)
-    return _list_on_gpu(library, splats, viewport, (order, ends), _room(splats, pairs)), flagged
+    *total, flagged = recording.read(ends[-2:], lambda values: values[-1] == 0 and sum(values) <= room)
+    pairs = _checked_count(sum(total))
+    room = _recorded_room(pairs)
+    lists = _room(splats, room, is_filled=recording.current() is None)
+    bins = _list_on_gpu(library, splats, viewport, (order, ends), lists)
+    return Bins(bins.offsets, bins.ids[:pairs]), flagged
 
 
 @torch.no_grad()
@@ -204,9 +207,13 @@ def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> 
     """
     library = library_of(splats.depths.device.type)
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
-    lists = _room(splats, room)
-    lists[0].fill_(-1)  # no tile, so that unused entries are sorted last
+    lists = _room(splats, room, is_filled=False)
     return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
+
+
+def _recorded_room(pairs: int) -> int:
+    """Return for how many tile intersections to make memory: more than `pairs` if this is recorded to be repeated."""
+    return pairs if recording.current() is None else int(ROOM * pairs)
 
 
 def _checked_count(pairs: int) -> int:
@@ -231,10 +238,8 @@ def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = _checked_count(
-        recording.read(total, lambda value: value <= room)
-    )  # the memory of a recording stays as it is
-    room = pairs if recording.current() is None else int(ROOM * pairs)
+    pairs = _checked_count(recording.read(total, lambda values: values[0] <= room)[0])
+    room = _recorded_room(pairs)  # repetitions use the same memory
     require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
     ids = like.new_empty(room, dtype=torch.int32)
     library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
@@ -268,12 +273,15 @@ def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Te
     return order, ends
 
 
-def _room(splats: Splats, pairs: int) -> tuple[Tensor, ...]:
+def _room(splats: Splats, pairs: int, is_filled: bool) -> tuple[Tensor, ...]:
     """Allocate four int32 tensors [pairs] for the tile and the Gaussian of each intersection, unsorted and sorted.
 
-    The last one, the sorted Gaussians, is kept for the backward pass.
+    The last one, the sorted Gaussians, is kept for the backward pass. Unless there will be `pairs` intersections
+    (`is_filled`), the first one is initialised to no tile, so that unused entries are sorted last.
     """
     rows = allocate(PAIRS, splats.depths, (3, pairs), torch.int32)
+    if not is_filled:
+        rows[0].fill_(-1)
     return *rows.unbind(), allocate(PAIRS, splats.depths, (pairs,), torch.int32)
 
 

@@ -1,8 +1,8 @@
-"""Record the kernel calls and torch operations of a function on the CPU, and repeat them in the same memory.
+"""Record the kernel calls and torch operations of a function, and repeat them in the same memory.
 
 A training step of a small model is a few dozen kernel calls, which take some microseconds each. The Python code around
 them, which checks, allocates and differentiates, takes longer, and does the same for every view. A repetition runs only
-the recorded calls, with the present values of their tensors. On a GPU, a CUDA graph does the same.
+the recorded calls, with the present values of their tensors.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 # A recording that would keep more memory is given up, because Python code is then a small share of the work. A network
 # of eight layers of 256 units needs 0.1 GB for 1,000 Gaussians.
@@ -39,13 +39,13 @@ def current() -> Recording | None:
     return getattr(_in_charge, "recording", None)
 
 
-def read(number: Tensor, holds: Callable[[int], bool]) -> int:
-    """Return the value of an integer tensor of one element.
+def read(numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
+    """Return the values of an integer tensor [n].
 
-    An active recording reads the tensor again in every repetition, which fails unless `holds(value)` is true.
+    An active recording reads the tensor again in every repetition, which fails unless `holds(values)` is true.
     """
     recording = current()
-    return int(number.item()) if recording is None else recording.read(number, holds)
+    return numbers.tolist() if recording is None else recording.read(numbers, holds)
 
 
 class Recording(TorchDispatchMode):
@@ -105,10 +105,12 @@ class Recording(TorchDispatchMode):
         """Record a call, such as that of a kernel, that is no torch operation and writes to the same memory again."""
         self._calls.append(call)
 
-    def read(self, number: Tensor, holds: Callable[[int], bool]) -> int:
+    def read(self, numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
         """Read a tensor, as the function `read` describes."""
-        self._calls.append(partial(_check, number, holds))
-        return int(number.numpy().item())  # torch's own `item` would be recorded as what cannot be repeated
+        self._calls.append(partial(_check, numbers, holds))
+        with _disable_current_modes():  # a repetition need not copy what it reads from a GPU twice
+            values: list[int] = numbers.tolist()
+        return values
 
     def repeat(self) -> None:
         """Call everything that was recorded again, in the same order; to be called without gradients.
@@ -137,6 +139,6 @@ def _redo(result: Any, operation: Callable[[], Any]) -> None:
         x.copy_(y)
 
 
-def _check(number: Tensor, holds: Callable[[int], bool]) -> None:
-    if not holds(int(number.item())):
+def _check(numbers: Tensor, holds: Callable[[list[int]], bool]) -> None:
+    if not holds(numbers.tolist()):
         raise OutdatedError

@@ -30,6 +30,10 @@ Sums = dict[int, Tensor]  # gradients by the id of the tensor with respect to wh
 WORTH_A_THREAD = 4_000
 PIXELS_OF_A_GAUSSIAN = 12
 
+# The types of devices on which a step is recorded to be repeated. Tests run the kernels of "cuda" on the CPU, where
+# repeated steps give the same bits; that they are faster on a GPU is to be shown by the first rows of `make gpu-check`.
+REPEATED_ON = ("cpu",)
+
 # A step with more work than this many Gaussians, in all views of its batch, is not recorded to be repeated. A recording
 # keeps about 900 bytes of memory for each, and Python code is a small share of such a step.
 MOST_RECORDED = 500_000
@@ -160,9 +164,9 @@ class Step:
         A model may have attributes that this class does not know, so all its numbers and strings are included.
         """
         model, sets = self.model, self.model.effect_sets
-        by_cpu_kernels = self.background.is_cpu and model.backend.serves(self.background)
+        by_kernels = self.background.device.type in REPEATED_ON and model.backend.serves(self.background)
         work = sum([work_of(len(model), view.camera.width * view.camera.height) for view in views])
-        if self.terms or not by_cpu_kernels or work > MOST_RECORDED:
+        if self.terms or not by_kernels or work > MOST_RECORDED:
             return None
         tensors = [*self.parameters, *([] if sets is None else [sets.orders, sets.intervals])]
         addresses = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])

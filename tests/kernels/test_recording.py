@@ -86,10 +86,10 @@ def test_a_recording_that_is_too_large_is_given_up(monkeypatch: pytest.MonkeyPat
 
 def test_a_number_that_was_read_is_read_again() -> None:
     """Catches a repetition with a number that no longer holds, and a reading outside of a recording."""
-    count = torch.tensor([3])
-    assert read(count, lambda _: False) == 3
+    count = torch.tensor([3, 1])
+    assert read(count, lambda _: False) == [3, 1]
     with Recording() as recording:
-        assert read(count, lambda value: value < 5) == 3
+        assert read(count, lambda values: values[0] < 5) == [3, 1]
     assert recording.is_repeatable
     count.fill_(4)
     repeated(recording)

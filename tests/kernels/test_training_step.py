@@ -1,14 +1,19 @@
-"""A training step by the CUDA kernels: what Python asks of a GPU, which bounds the step of a small scene."""
+"""A training step by the CUDA kernels: what Python asks of a GPU, and steps that are repeated in place of launched."""
 
+import copy
+import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsbench.kernels.library import CudaLibrary
-from gsbench.train.divergence import LOOK_EVERY
+from gsbench.train.checkpoint import without_times
+from gsbench.train.divergence import LOOK_EVERY, DivergedError
 
 _aten = torch.ops.aten
 WITHOUT_LAUNCH = {
@@ -33,7 +38,33 @@ class Calls(TorchDispatchMode):
         return operation(*args, **(kwargs or {}))
 
 
-@pytest.mark.usefixtures("cuda_device")
+Training = Any  # a Trainer, whose module needs hydra
+Start = Callable[..., Training]
+
+
+@pytest.fixture
+def start(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> Start:
+    """Makes a small training by the CUDA kernels: on a GPU, or by the shim with all that a training on a GPU does."""
+    pytest.importorskip("hydra", reason="needs hydra, which composes the settings of a training")
+    from tiny_training import trainer
+
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)  # the shim runs one kernel at a time
+    monkeypatch.setattr("gsbench.train.step.REPEATED_ON", ("cpu", "cuda"))
+
+    def make(model: str, *options: str, **arguments: Any) -> Training:
+        fitted = trainer(model, "train.batch_size=4", f"device={cuda_device}", *options, **arguments)
+        fitted.finite_check.every, fitted.optimizer.skip = LOOK_EVERY, fitted.finite_check.skip
+        return fitted
+
+    return make
+
+
+def launched(fitted: Training) -> Training:
+    """Return a training none of whose steps is recorded."""
+    fitted.gradients._signature = lambda *_: None
+    return fitted
+
+
 @pytest.mark.parametrize(
     ("model", "options", "kernels", "operations"),
     [
@@ -43,23 +74,17 @@ class Calls(TorchDispatchMode):
         ("7dgs", (), 58, 256),
     ],
 )
-def test_calls_of_a_step(
-    model: str, options: tuple[str, ...], kernels: int, operations: int, monkeypatch: pytest.MonkeyPatch
+def test_calls_of_a_launched_step(
+    model: str, options: tuple[str, ...], kernels: int, operations: int, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a change after which a step of four views launches more: each call takes a GPU at least two microseconds,
     and Python five; and a value that the CPU waits for."""
-    pytest.importorskip("hydra", reason="needs hydra, which composes the settings of a training")
-    from tiny_training import trainer
-
-    fitted, called, call = trainer(model, "train.batch_size=4", *options), Counter[str](), CudaLibrary.call
+    fitted, called, call = launched(start(model, *options)), Counter[str](), CudaLibrary.call
 
     def count(library: CudaLibrary, name: str, *arguments: Any) -> None:
         called[name] += 1
         call(library, name, *arguments)
 
-    # as on a GPU
-    fitted.finite_check.every, fitted.optimizer.skip = LOOK_EVERY, fitted.finite_check.skip
-    monkeypatch.setattr(fitted.gradients, "_signature", lambda *_: None)
     fitted.step, fitted.schedule.densify_stop = 90, 100  # when all parts of a model learn
     fitted.train_step()
     fitted.step = 91
@@ -69,3 +94,95 @@ def test_calls_of_a_step(
     assert called.total() <= kernels, called
     assert calls.counted.total() <= operations, calls.counted
     assert not [name for name in calls.counted if "local_scalar" in name or "nonzero" in name]
+
+
+# The SH degree rises after steps 3, 6 and 9, AGR starts at 10, Gaussians are densified and sorted after 12, their
+# opacities reset after 14, and lambda learns from 15.
+EVENTS = ("train.densify.every=12", "train.lambda_from=4500", "train.curve_points=1")
+
+
+@pytest.mark.parametrize(
+    ("model", "steps"),
+    [
+        ("7dgs", 18),
+        *[pytest.param(model, 60, marks=pytest.mark.slow) for model in ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")],
+    ],
+)
+def test_repeated_steps_train_as_launched_ones(
+    model: str, steps: int, start: Start, repeats: Counter[str], cuda_device: str
+) -> None:
+    """Catches work of a step that a repetition does not do again, or with an address, a count of Gaussians or a part
+    of the model from before an event. The shim adds in a fixed order, so all bits are equal."""
+    from interrupted import assert_same_bits
+    from tiny_training import train
+
+    trainings = []
+    for fitted in (start(model, *EVENTS), launched(start(model, *EVENTS))):
+        fitted.schedule.resets_after = range(14, 15)
+        counts = repeats["done"]
+        trainings.append(train(fitted, until=steps))
+        assert (repeats["done"] - counts > 4 * 4 * steps // 4) == (fitted is trainings[0])
+    states = [without_times(fitted.state_dict()) for fitted in trainings]
+    if cuda_device == "cpu":
+        assert_same_bits(*states)
+    assert trainings[0].loss == pytest.approx(trainings[1].loss, rel=1e-2)
+
+
+def test_more_intersections_than_there_is_room_for(
+    start: Start, repeats: Counter[str], cuda_device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches lists of tiles that write beyond their memory, which was allocated for the view that was recorded, and
+    intersections that are left out."""
+    from tiny_training import near_and_far
+
+    monkeypatch.setattr("gsbench.kernels.raster.ROOM", 1.0)
+    losses = []
+    for end in (lambda fitted: fitted, launched):
+        fitted = end(start("3dgs", "train.batch_size=1", scene=near_and_far()))
+        for fitted.step in range(90, 99):
+            fitted.train_step()
+        losses.append([float(loss) for _, loss in fitted.finite_check._steps])
+    assert losses[0] == (losses[1] if cuda_device == "cpu" else pytest.approx(losses[1], rel=1e-3))
+    assert repeats["done"] > 0
+    assert repeats["outdated"] > 0
+
+
+def test_a_bad_step_changes_nothing_until_it_is_looked_at(start: Start, repeats: Counter[str]) -> None:
+    """Catches repeated steps after a bad gradient that move a parameter, a moment or a count of updates, and another
+    step or parameter that is blamed when the CPU looks."""
+    fitted = start("4dgs")
+    real, before = fitted.gradients, None
+
+    def poisoned(*arguments: Any) -> Any:
+        results = real(*arguments)
+        if fitted.step == 5:
+            fitted.model.splats["left_quats"].grad[-1, -1] = math.inf
+        return results
+
+    fitted.gradients = poisoned
+    for fitted.step in range(9):
+        if fitted.step == 5:
+            before = copy.deepcopy((fitted.model.state_dict(), fitted.optimizer.state_dict()))
+        fitted.train_step()
+    assert before is not None
+    assert repeats["done"] > 0
+    after = fitted.model.state_dict(), fitted.optimizer.state_dict()
+    tensors: list[list[Tensor]] = [
+        [*model.values(), *[x for moments in state.values() for x in moments.values()]]
+        for model, state in (before, after)
+    ]
+    assert all(map(torch.equal, *tensors))
+    with pytest.raises(DivergedError, match="step 5: the gradient of 'left_quats' is not finite"):
+        fitted.state_dict()
+
+
+def test_a_value_that_is_not_finite_is_found_in_a_repetition(start: Start, repeats: Counter[str]) -> None:
+    """Catches a training that goes on with NaN, because the rasterizer's check was not repeated."""
+    fitted = start("7dgs")
+    for fitted.step in range(90, 93):
+        fitted.train_step()
+    assert repeats["done"] > 0
+    with torch.no_grad():
+        fitted.model.splats["means"][0, 0] = math.nan
+    with pytest.raises(DivergedError, match="step 92"):
+        fitted.train_step()
