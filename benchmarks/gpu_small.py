@@ -7,7 +7,7 @@ import torch
 from benchmarks.scene import camera, gaussians, model
 from gsbench.kernels.adam import adam_all, flag_arrays
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import RasterInputs, Viewport, backward_by_splat
+from gsbench.kernels.raster import RasterInputs, Viewport, add_density, backward_by_splat
 from gsbench.models import CameraTime
 from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
@@ -43,6 +43,8 @@ def main() -> None:
     flag_arrays([*arrays[1], skip / skip], torch.zeros(3, device="cuda").bool(), skip)
     drawn = [torch.rand(300, device="cuda") < 0.5, None]
     adam_all(*arrays, steps, [0.1, 0.2], [0.9, 0.999], 1e-15, 1 - skip, drawn)
+    counts = torch.zeros(2, 300, device="cuda").unbind()
+    add_density(drawn[0][None], arrays[0][0][None, :, :2], (1.0, 1.0), *counts, counts[0].int())
     torch.cuda.synchronize()
     print("every kernel ran")
 

@@ -43,6 +43,10 @@ class Library:
         except ValueError as error:
             raise InputError(str(error)) from None
 
+    def has(self, name: str) -> bool:
+        """Return whether there is a kernel with this name; some exist only on a GPU."""
+        return name in self._fields
+
     def takes(self, name: str, field: str) -> bool:
         """Return whether a kernel has an argument with this name."""
         return field in self._fields[name]

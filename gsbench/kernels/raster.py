@@ -216,6 +216,31 @@ def _recorded_room(pairs: int) -> int:
     return pairs if recording.current() is None else int(ROOM * pairs)
 
 
+@torch.no_grad()
+def add_density(
+    drawn: Tensor,  # [C, N] bool: which Gaussians are not culled
+    g_means2d: Tensor,  # [C, N, 2] gradient of the 2D means, per pixel
+    scale: tuple[float, float],  # of its x and y
+    gradient: Tensor,  # [N] the sum of its norms, added to
+    times_visible: Tensor,  # [N] the number of cameras in which a Gaussian is drawn, added to
+    unseen: Tensor | None,  # [N] int32: cameras since a Gaussian was last drawn, updated
+) -> None:
+    """Add up on a GPU, in one kernel, what density control needs of a view; in torch it is ten operations."""
+    drawn, g_means2d = in_rows([drawn, g_means2d])
+    slots = {
+        "N": drawn.shape[1],
+        "C": drawn.shape[0],
+        "drawn": address(drawn),
+        "g_means2d": address(g_means2d),
+        "scale_x": scale[0],
+        "scale_y": scale[1],
+        "out.gradient": address(gradient),
+        "out.times_visible": address(times_visible),
+        "out.unseen": address(unseen),
+    }
+    library_of(drawn.device.type).call("add_density", slots, drawn)
+
+
 def _checked_count(pairs: int) -> int:
     """Return the number of tile intersections; raise InputError if int32 cannot count them."""
     if pairs > MAX_PAIRS:

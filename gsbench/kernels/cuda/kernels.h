@@ -53,6 +53,22 @@ struct TileLists {
 };
 GSB_FIELDS(TileLists, OUTPUTS, tiles, splats, sorted_tiles, ids, offsets, scratch, scratch_bytes)
 
+// What density control adds up of C cameras.
+struct DensityArgs {
+    int64_t N, C;
+    const bool* drawn;       // [C, N]: which Gaussians are not culled
+    const float* g_means2d;  // [C, N, 2], per pixel
+    float scale_x, scale_y;  // from one over pixels to units of half the image
+};
+GSB_FIELDS(DensityArgs, INPUTS, N, C, drawn, g_means2d, scale_x, scale_y)
+
+// The arrays are [N] and changed.
+struct DensityState {
+    float *gradient, *times_visible;  // sums over cameras: norms of gradients, cameras in which it was drawn
+    int32_t* unseen;                  // cameras since it was last drawn; may be null
+};
+GSB_FIELDS(DensityState, OUTPUTS, gradient, times_visible, unseen)
+
 }  // namespace gsb
 
 // `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
@@ -61,6 +77,7 @@ GSB_FIELDS(TileLists, OUTPUTS, tiles, splats, sorted_tiles, ids, offsets, scratc
     GSB_KERNELS(kernel)                                                                            \
     kernel(count_tiles, BinArgs, TileCounts)                                                       \
     kernel(fill_tiles, BinArgs, TileOrder, TileLists)                                              \
+    kernel(add_density, DensityArgs, DensityState)                                                 \
     kernel(blend_backward_by_splat, BlendArgs, BlendState, PictureGrads, BlendGrads)
 
 namespace gsb::cuda {

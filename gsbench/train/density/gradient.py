@@ -4,6 +4,8 @@ import torch
 from torch import Tensor
 
 from gsbench.config import DensifyConfig
+from gsbench.kernels.library import library_of
+from gsbench.kernels.raster import add_density
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
 from gsbench.train.density.rule import DensificationRule, Score
@@ -12,6 +14,8 @@ from gsbench.train.rows import Rows
 
 class GradientRule(DensificationRule):
     """The base class of rules that use the mean gradient of each 2D mean, in units of half the image (NDC)."""
+
+    unseen: Tensor | None = None  # [N] int32: views since each Gaussian was last visible, where a rule prunes by it
 
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
@@ -27,10 +31,16 @@ class GradientRule(DensificationRule):
 
     @torch.no_grad()
     def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
-        """Add the norms of the gradients of the 2D means in one view, in units of half the image."""
-        x, y = g_means2d.unbind(-1)  # scaled separately: making a tensor of the two sizes would wait for the GPU
-        self.gradient += torch.hypot(x * (views * width / 2), y * (views * height / 2)).sum(0)
+        """Add the norms of the gradients of the 2D means in one view, in units of half the image, and count views."""
+        scale = views * width / 2, views * height / 2
+        if self.model.backend.serves(self.gradient) and library_of(self.gradient.device.type).has("add_density"):
+            add_density(drawn, g_means2d, scale, self.gradient, self.times_visible, self.unseen)
+            return
+        x, y = g_means2d.unbind(-1)
+        self.gradient += torch.hypot(x * scale[0], y * scale[1]).sum(0)
         self.times_visible += drawn.sum(0)
+        if self.unseen is not None:
+            self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     def mean_gradient(self) -> Tensor:
         """Return the mean of these norms over the views that saw each Gaussian, [N]."""
@@ -63,18 +73,14 @@ class GradientDensification(GradientRule):
     - Every 3,000 iterations all opacities are lowered to at most twice the pruning threshold.
     """
 
+    unseen: Tensor
+
     def __init__(
         self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
     ) -> None:
         super().__init__(rows, config, min_opacity, views, score)
         self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
         self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
-
-    @torch.no_grad()
-    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
-        """Add the gradients of one view, and count the views since each Gaussian was last visible."""
-        super().accumulate(drawn, g_means2d, width, height, views)
-        self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
