@@ -242,6 +242,7 @@ class Operation:
             kept.append(None if g is None else g if g.is_contiguous() else g.contiguous())
             slots[name] = address(kept[-1])
         gradients: list[Tensor | None] = []
+        zeroed: list[Tensor] = []
         for i, (key, x) in enumerate(zip(self._grad, tensors, strict=True)):
             if key is None:
                 gradients.append(None)
@@ -255,15 +256,17 @@ class Operation:
             else:
                 gradient = allocate("gradients", like, x.shape)
                 if i in self._zeroed:
-                    gradient.zero_()
+                    zeroed.append(gradient)
             gradients.append(gradient)
             slots[key] = gradient.data_ptr()
         if self._scratch is not None:
             if library.needs_scratch:
-                kept.append(allocate("scratch space of gradients", like, _filled(self._scratch, slots)).zero_())
-                slots["grad.scratch"] = address(kept[-1])
+                zeroed.append(allocate("scratch space of gradients", like, _filled(self._scratch, slots)))
+                slots["grad.scratch"] = address(zeroed[-1])
             else:
                 slots["grad.scratch"] = 0
+        if zeroed:
+            torch._foreach_zero_(zeroed)  # on a GPU in one launch
         library.call(self.backward_kernel, slots, like)
         return gradients
 

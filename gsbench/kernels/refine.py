@@ -117,7 +117,8 @@ class _Refine(Operation):
         library, features = library_of(like.device.type), networks - 1
         dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(upstream, values, strict=True)]
         moved = [allocate("gradients of AGR's features", x, x.shape) for x in values[:features]]
-        g_weights = {key: torch.zeros_like(x) for key, x in weights.items()}
+        g_weights = {key: torch.empty_like(x) for key, x in weights.items()}
+        torch._foreach_zero_(list(g_weights.values()))  # on a GPU in one launch
         scratch = None
         if library.needs_scratch:
             shape = networks, slots["refined"], slots["features"]

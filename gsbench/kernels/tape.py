@@ -17,12 +17,12 @@ from gsbench.kernels.library import Slots
 from gsbench.kernels.operation import Operation, active
 
 
-def add_to(sums: dict[int, Tensor], key: int, gradient: Tensor) -> None:
-    """Add a gradient in place to `sums[key]`; if there is none yet, the gradient becomes this entry."""
-    if key in sums:
-        sums[key] += gradient
-    else:
-        sums[key] = gradient
+def add_to(sums: dict[int, Tensor], gradients: dict[int, Tensor]) -> None:
+    """Add gradients in place to the entries of `sums` with their keys, or make them these entries."""
+    both = [key for key in gradients if key in sums]
+    if both:
+        torch._foreach_add_([sums[key] for key in both], [gradients[key] for key in both])  # on a GPU in one launch
+    sums.update({key: gradient for key, gradient in gradients.items() if key not in sums})
 
 
 def collect_gradients(x: Tensor) -> Tensor:
@@ -91,9 +91,7 @@ class Tape:
         gradients.propagate(loss, seed)
         for call in reversed(self._calls):
             gradients.run_backward(call)
-        for key in gradients.sources:
-            if (gradient := gradients.by_id.get(key)) is not None:
-                add_to(sums, key, gradient)
+        add_to(sums, {key: gradients.by_id[key] for key in gradients.sources if key in gradients.by_id})
 
 
 class _Gradients:

@@ -98,8 +98,7 @@ def _in_order(sums: Sequence[Sums]) -> Sums:
     for further in sums[1:]:
         if id(further) not in done:
             done.add(id(further))
-            for key, gradient in further.items():
-                add_to(total, key, gradient)
+            add_to(total, further)
     return total
 
 

@@ -68,10 +68,10 @@ def launched(fitted: Training) -> Training:
 @pytest.mark.parametrize(
     ("model", "options", "kernels", "operations"),
     [
-        ("4dgs", (), 54, 99),
-        ("4dgs", ("optim=sparse_adam",), 54, 101),
-        ("7dgs_noagr", (), 54, 92),
-        ("7dgs", (), 62, 216),
+        ("4dgs", (), 54, 71),
+        ("4dgs", ("optim=sparse_adam",), 54, 73),
+        ("7dgs_noagr", (), 54, 57),
+        ("7dgs", (), 62, 129),
     ],
 )
 def test_calls_of_a_launched_step(
