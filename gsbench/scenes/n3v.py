@@ -2,13 +2,14 @@
 
 import hashlib
 import io
+import math
 import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 import cv2
@@ -96,27 +97,17 @@ def load(
     require(needed, f"{root}: frames while they are decoded and measured", "use a larger scene.downscale")
     cameras = [_camera(film, rows[film], size, source) for film in films]
     digests = {film.path.name: film.digest() for film in films} | {POSES: files.digest(data)}
-    by_film = []
-    for film, camera in zip(films, cameras, strict=True):
-        pixels = _mapped(film, digests[film.path.name], (first, last), rendition, size)
-        by_film.append(
-            [
-                View(
-                    f"{film.name}/{frame:04d}",
-                    camera,
-                    (frame - first) / max(1, last - first),
-                    image,
-                    rendition.background,
-                    is_on_disk=True,
-                )
-                for frame, image in enumerate(pixels, first)
-            ]
-        )
+    paths = _decoded_files(root, films, digests, (first, last), rendition, size)
+    by_film = [
+        _views(film, camera, path, (first, last), rendition)
+        for film, camera, path in zip(films, cameras, paths, strict=True)
+    ]
     count = len(films) * (last - first + 1)
     notes.append(
         f"{count} images of {size[0]}x{size[1]}, frames {first} to {last}, are read from {DECODED} when needed, "
         f"{3e-9 * count * size[0] * size[1]:.3g} GB on disk; memory for frames: {needed / 1e9:.2g} GB"
     )
+    notes.append(f"{POSES}: depths are not read; no distortion is stated")
     notes += [f"cameras left out: {', '.join(leave_out)}"] if leave_out else []
     beside = colmap.points_beside(root)
     if beside:
@@ -203,17 +194,27 @@ def _open(name: str, path: Path) -> _Film:
     """Return a film without decoding it; raise InputError if it is no MP4 and no folder of images."""
     if path.is_dir():
         folder = path / "images" if (path / "images").is_dir() else path
-        names = [x for x in os.listdir(folder) if files.without_suffix(x) != x]
-        if not names or not all(re.search(r"\d+$", files.without_suffix(x)) for x in names):
+        numbered = sorted(
+            (int(number[0]), name)
+            for name in os.listdir(folder)
+            if (stem := files.without_suffix(name)) != name and (number := re.search(r"\d{1,9}$", stem))
+        )
+        if not numbered:
             raise InputError(f"{folder}: expected a PNG or JPEG for each frame, with its number at the end of the name")
-        names.sort(key=lambda x: int(re.findall(r"\d+", files.without_suffix(x))[-1]))
-        listed = tuple(files.find_inside(folder, x, str(folder)) for x in names)
+        for (before, _), (after, name_after) in pairwise(numbered):
+            if after != before + 1:
+                raise InputError(f"{folder}: expected frame {before + 1} after frame {before}, got {name_after}")
+        listed = tuple(files.find_inside(folder, image, str(folder)) for _, image in numbered)
         return _Film(name, path, listed, len(listed), shots.size_of(listed[0], str(listed[0])))
     if not path.is_file():
         raise InputError(f"{path}: expected a film or a folder of frames, found neither")
-    with path.open("rb") as file:  # other formats can name files and hosts, which OpenCV would open
-        if file.read(8)[4:] != b"ftyp":
-            raise InputError(f"{path}: expected an MP4, the file is of another kind or damaged: copy it again")
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    if start[4:] != b"ftyp":  # other formats can name files and hosts, which OpenCV would open
+        raise InputError(f"{path}: expected an MP4, the file is of another kind or damaged: copy it again")
     with images.open_video(path) as video:
         count, width, height = (
             int(video.get(key))
@@ -265,28 +266,48 @@ def _range(films: Sequence[_Film], frames: tuple[int, int] | None) -> tuple[int,
     return first, last
 
 
-def _mapped(
-    film: _Film, digest: str, frames: tuple[int, int], rendition: Rendition, size: Size
-) -> Tensor:  # [frames, h, w, 3] 8 bits
-    """Return the reduced frames of a film, decoded to a file if that does not exist; the file is mapped, not read."""
-    count, (width, height) = frames[1] - frames[0] + 1, size
-    content = files.digest(f"{digest} {rendition.resize}".encode())[:12]
-    folder = film.path.parent / DECODED
-    path = folder / f"{film.name}_{frames[0]}-{frames[1]}_{width}x{height}_{content}.rgb"
-    needed = 3 * count * width * height
+def _decoded_files(
+    root: Path,
+    films: Sequence[_Film],
+    digests: Mapping[str, str],  # SHA-256 by the name of the film
+    frames: tuple[int, int],
+    rendition: Rendition,
+    size: Size,
+) -> list[Path]:
+    """Return the files of the reduced frames of films; those that do not exist are written, if all fit on the disk."""
+    folder, count = root / DECODED, frames[1] - frames[0] + 1
+    needed = 3 * count * size[0] * size[1]
+    paths = [
+        folder / f"{film.name}_{frames[0]}-{frames[1]}_{size[0]}x{size[1]}_{content[:12]}.rgb"
+        for film in films
+        for content in [files.digest(f"{digests[film.path.name]} {rendition.resize}".encode())]
+    ]
     try:
-        if not path.is_file() or path.stat().st_size != needed:
-            folder.mkdir(exist_ok=True)
-            if needed > (free := shutil.disk_usage(folder).free):
-                raise InputError(
-                    f"{folder}: expected {needed / 1e9:.1f} GB for {film.name}, got {free / 1e9:.1f}: free some, or "
-                    "use a larger scene.downscale"
-                )
-            print(f"{film.path}: frames {frames[0]} to {frames[1]} are decoded to {path}", file=sys.stderr)
-            _decode(film, frames, rendition, size, path)
-        return torch.from_file(str(path), shared=False, size=needed, dtype=torch.uint8).view(count, height, width, 3)
+        folder.mkdir(exist_ok=True)
+        missing = [i for i, path in enumerate(paths) if not path.is_file() or path.stat().st_size != needed]
+        if len(missing) * needed > (free := shutil.disk_usage(folder).free):
+            raise InputError(
+                f"{folder}: expected {len(missing) * needed / 1e9:.1f} GB for frames of {len(missing)} films, got "
+                f"{free / 1e9:.1f}: free some, or use a larger scene.downscale"
+            )
+        for i in missing:
+            print(f"{films[i].path}: frames {frames[0]} to {frames[1]} are decoded to {paths[i]}", file=sys.stderr)
+            _decode(films[i], frames, rendition, size, paths[i])
     except OSError as error:
         raise InputError(f"{one_line(error)}: expected a scene's folder in which {DECODED} can be written") from None
+    return paths
+
+
+def _views(film: _Film, camera: Camera, path: Path, frames: tuple[int, int], rendition: Rendition) -> list[View]:
+    """Return the views of a film, whose pixels map the file of its frames."""
+    first, last = frames
+    shape = last - first + 1, camera.height, camera.width, 3
+    pixels = torch.from_file(str(path), shared=False, size=math.prod(shape), dtype=torch.uint8).view(shape)
+    views = []
+    for frame, image in enumerate(pixels, first):
+        time = (frame - first) / max(1, last - first)
+        views.append(View(f"{film.name}/{frame:04d}", camera, time, image, rendition.background, is_on_disk=True))
+    return views
 
 
 def _decode(film: _Film, frames: tuple[int, int], rendition: Rendition, size: Size, path: Path) -> None:

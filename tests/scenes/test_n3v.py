@@ -4,6 +4,7 @@ import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -108,6 +109,7 @@ def test_frames_and_cameras_can_be_chosen(root: Path) -> None:
     assert "cameras left out: cam01" in scene.notes
     assert "there is no cam03: rows of poses_bounds.npy are of the other films, in their order" in scene.notes
     assert "initial points: random" in scene.notes
+    assert "poses_bounds.npy: depths are not read; no distortion is stated" in scene.notes
     for names, message in ((["cam00"], "expected training"), (["cam03"], "cam03"), (CAMERAS[1:], "got all")):
         with pytest.raises(InputError, match=message):
             scenes.load(root, leave_out=names)
@@ -233,6 +235,11 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (lambda root: (root / "cam02.mp4").write_bytes(b"#EXTM3U\nhttp://localhost/"), "cam02.mp4: expected an MP4"),
     (lambda root: (root / "cam02.mp4").write_bytes((root / "cam02.mp4").read_bytes()[:60]), "OpenCV cannot decode"),
     (lambda root: [(root / "cam02.mp4").unlink(), (root / "cam02").mkdir()], "a PNG or JPEG for each frame"),
+    (
+        lambda root: [write_image(root / f"cam05/{n}.png", pixels_of(0, 0)) for n in (1, 2, 4)],
+        "cam05: expected frame 3",
+    ),
+    (lambda root: [write_image(root / f"cam05/{n}.png", pixels_of(0, 0)) for n in ("1", "01")], "expected frame 2"),
     (lambda root: [(root / f"{name}.mp4").unlink() for name in CAMERAS[1:]], "cam00, the test camera, and others"),
     (lambda root: (root / n3v.DECODED).write_bytes(b""), "a scene's folder in which decoded can be written"),
 ]
@@ -280,3 +287,12 @@ def test_captures_with_llff_poses_stay_captures(taken: Path) -> None:
     """Catches a COLMAP capture that is taken for films because poses_bounds.npy lies beside its model."""
     (taken / "poses_bounds.npy").touch()
     assert len(scenes.load(taken).test) == 1
+
+
+def test_a_full_disk_is_told_before_frames_are_decoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches films that fill the disk one after the other."""
+    left = 3 * FRAMES * WIDTH * HEIGHT * len(CAMERAS) - 1
+    monkeypatch.setattr(n3v.shutil, "disk_usage", lambda _: SimpleNamespace(free=left))
+    with pytest.raises(InputError, match=r"expected .* GB for frames of 4 films, got .*: free some"):
+        scenes.load(root)
+    assert not list((root / n3v.DECODED).iterdir())
