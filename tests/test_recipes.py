@@ -67,6 +67,18 @@ def test_deformable_learns_as_its_authors_have_it():
     assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 15_000, 100)
 
 
+def test_hexplane_learns_as_its_authors_have_it():
+    """Catches rates of the field that fall from the first static step, and a schedule of another length than 23,000
+    steps, of which the last 20,000 have the field."""
+    config = composed("model=hexplane", "+recipe=authors_hexplane")
+    for share, planes in ((3 / 23, 1.6e-3), (13 / 23, 1.6e-4), (1.0, 1.6e-5)):
+        of_run = rates(config, share)
+        assert (of_run["planes"], of_run["network"]) == pytest.approx((5 * planes, 5 * planes / 10), rel=1e-3)
+        assert (of_run["scales"], of_run["quats"]) == (5e-3, 1e-3)
+    s = Schedule(config.train, 3, config.agr, build(config).warm_up)
+    assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 18_000, 100)
+
+
 def test_an_authors_recipe_is_for_their_model():
     """Catches a field's rate that another model silently ignores."""
     with pytest.raises(InputError, match="model '4dgs' has no '"):

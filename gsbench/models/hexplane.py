@@ -6,10 +6,11 @@ constants of the authors' code. The planes are those of HexPlane (Cao and Johnso
 
 from collections.abc import Sequence
 from functools import reduce
-from itertools import combinations
+from itertools import combinations, starmap
 from typing import Any, ClassVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.tape import collect_gradients
@@ -115,7 +116,7 @@ class Planes(nn.Module):
         self.levels = cast("Sequence[nn.ParameterDict]", nn.ModuleList(nn.ParameterDict() for _ in nodes))
         for level, along in zip(self.levels, nodes, strict=True):
             for (a, columns), (b, rows) in combinations(zip("xyzt", along, strict=True), 2):
-                plane = torch.ones(rows, columns, channels)
+                plane = torch.ones(1, channels, rows, columns)
                 level[a + b] = plane if b == "t" else plane.uniform_(0.1, 0.5, generator=generator)
 
     def forward(
@@ -128,10 +129,15 @@ class Planes(nn.Module):
         From the lowest to the highest corner of the box, coordinates fall from 1 to -1. Time is used as it is, so only
         the second half of the nodes along t is read, as in the authors' code.
         """
+        # Of one image, grid_sample adds up the gradient of a node in a fixed order, for any number of threads.
         x, y, z = ((positions - self.high) * 2 / (self.low - self.high) - 1).unbind(-1)
-        at = {"x": x, "y": y, "z": z, "t": time}
-        samples = [[sample(plane, at[axes[0]], at[axes[1]]) for axes, plane in level.items()] for level in self.levels]
-        return torch.cat([reduce(torch.mul, of_level) for of_level in samples], -1)
+        at = {"x": x, "y": y, "z": z, "t": time.expand(len(x))}
+
+        def sample(axes: str, plane: Tensor) -> Tensor:
+            grid = torch.stack([at[axis] for axis in axes], -1)[None, None]  # [1, 1, N, 2] column and row in [-1, 1]
+            return F.grid_sample(plane, grid, padding_mode="border", align_corners=True)[0, :, 0].T  # [N, C]
+
+        return torch.cat([reduce(torch.mul, starmap(sample, level.items())) for level in self.levels], -1)
 
     def penalty(self, space_smoothness: float, time_smoothness: float, time_sparsity: float) -> Tensor:
         """Return the sum over planes of three weighted terms, [].
@@ -142,37 +148,11 @@ class Planes(nn.Module):
         terms = []
         for level in self.levels:
             for axes, plane in level.items():
-                roughness = plane.diff(n=2, dim=0).square().mean()
+                roughness = plane.diff(n=2, dim=-2).square().mean()
                 terms.append(roughness * (time_smoothness if "t" in axes else space_smoothness))
                 if "t" in axes:
                     terms.append(time_sparsity * (1 - plane).abs().mean())
         return torch.stack(terms).sum()
-
-
-def sample(
-    plane: Tensor,  # [rows, columns, C]
-    x: Tensor,  # [N] from -1, the first column, to 1, the last
-    y: Tensor,  # [N] or [] the same for rows
-) -> Tensor:  # [N, C]
-    """Interpolate a plane bilinearly; beyond its border, it has the values of the border.
-
-    On a CPU, the gradient adds the points of a node in their order, for any number of threads; that of
-    torch.nn.functional.grid_sample depends on the width of the processor's vectors.
-    """
-    rows, columns, _ = plane.shape
-    (left, across), (top, down) = cell(x, columns), cell(y, rows)
-    first = top * columns + left
-    corners = torch.stack([first, first + 1, first + columns, first + columns + 1])  # [4, N]
-    values = plane.flatten(0, 1).index_select(0, corners.flatten()).unflatten(0, corners.shape)
-    upper_left, upper_right, lower_left, lower_right = values.unbind()
-    return upper_left.lerp(upper_right, across).lerp(lower_left.lerp(lower_right, across), down)
-
-
-def cell(x: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
-    """Return which of `nodes` from -1 to 1 lies before x, and the share of the way from it to the next node."""
-    place = ((x + 1) / 2 * (nodes - 1)).clamp(0, nodes - 1)
-    before = place.detach().long().clamp(0, nodes - 2)  # of NaN too
-    return before, (place - before)[..., None]
 
 
 class Network(nn.Module):

@@ -10,11 +10,11 @@ from interrupted import assert_resumes, assert_same_bits
 from small import CAMERA, fresh, lively, raw, same, seeded
 from tiny_training import train, trainer
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import normalize
 
 from gsbench.models import CameraTime
 from gsbench.models.factors import sizes
-from gsbench.models.hexplane import Network, Planes, sample
+from gsbench.models.hexplane import Network, Planes
 from gsbench.models.render import render
 from gsbench.schedule import ActiveComponents
 from gsbench.train.checkpoint import without_times
@@ -43,8 +43,8 @@ def planes_of_the_vectors() -> Planes:
     )
     for number, level in enumerate(planes.levels):
         for i, plane in enumerate(level.values()):
-            r, k, c = torch.meshgrid(*[torch.arange(n).double() for n in plane.shape], indexing="ij")
-            plane.data = 0.3 + 0.05 * i + 0.02 * c + 0.03 * r - 0.01 * k + 0.002 * r * k * (1 + number)
+            c, r, k = torch.meshgrid(*[torch.arange(n).double() for n in plane[0].shape], indexing="ij")
+            plane.data = (0.3 + 0.05 * i + 0.02 * c + 0.03 * r - 0.01 * k + 0.002 * r * k * (1 + number))[None]
     return planes.double()
 
 
@@ -62,13 +62,6 @@ def test_the_features_of_planes() -> None:
     """Catches rows in place of columns, another order of axes, levels or corners of the box, a time mapped to [-1, 1],
     and a sum in place of the product."""
     planes = planes_of_the_vectors()
-    assert [plane.shape for plane in planes.levels[1].values()] == [
-        (8, 6, 2), (10, 6, 2), (4, 6, 2), (10, 8, 2), (4, 8, 2), (4, 10, 2)]  # fmt: skip
-    x, y, z = doubles(-0.2, 0.5, -0.5)[:, None]
-    pairs = [(x, y), (x, z), (x, TIME), (y, z), (y, TIME), (z, TIME)]
-    samples = [sample(plane, *pair)[0, 0] for plane, pair in zip(planes.levels[0].values(), pairs, strict=True)]
-    expected = doubles(0.36310000, 0.37360000, 0.45125000, 0.46200000, 0.54218750, 0.60000000)
-    torch.testing.assert_close(torch.stack(samples).detach(), expected, **DIGITS)
     torch.testing.assert_close(planes(POSITION, TIME).detach()[0], FEATURES, **DIGITS)
 
 
@@ -103,7 +96,7 @@ def test_the_penalty() -> None:
     planes = planes_of_the_vectors()
     del planes.levels[1]  # type: ignore[attr-defined]
     for plane in planes.levels[0].values():
-        plane.data[1, 1] += 0.1
+        plane.data[..., 1, 1] += 0.1
     terms = [planes.penalty(*weights).detach() for weights in torch.eye(3).tolist()]
     torch.testing.assert_close(torch.stack(terms), doubles(0.01805556, 0.01958333, 1.39691667), **DIGITS)
     both = planes_of_the_vectors()
@@ -111,25 +104,7 @@ def test_the_penalty() -> None:
                                                          for axes, plane in level.items() if "t" in axes))  # fmt: skip
 
 
-# ---- samples
-
-
-def test_a_sample_is_that_of_torch() -> None:
-    """Catches a border that is extrapolated or zero, and a derivative of positions or nodes that is lost there."""
-    plane = torch.rand(4, 7, 3, generator=seeded(0)).double().requires_grad_()
-    x, y = (1.5 * torch.randn(2, 300, generator=seeded(1)).double()).requires_grad_().unbind()
-    corners = torch.tensor([-1, 1, 1, -1, 0]).double()
-    x, y = torch.cat([x, corners]), torch.cat([y, corners.roll(1)])
-    torches = grid_sample(plane.permute(2, 0, 1)[None], torch.stack([x, y], -1)[None, None], align_corners=True,
-                          padding_mode="border")[0, :, 0].T  # fmt: skip
-    torch.testing.assert_close(sample(plane, x, y), torches)
-    upstream = torch.randn(torches.shape, generator=seeded(2)).double()
-    inside = (x.abs() < 1) & (y.abs() < 1)  # on the border itself, torch's derivative is another
-    inputs = [plane, x, y]
-    for a, b in zip(torch.autograd.grad(sample(plane, x, y)[inside], inputs, upstream[inside]),
-                    torch.autograd.grad(torches[inside], inputs, upstream[inside]), strict=True):  # fmt: skip
-        torch.testing.assert_close(a, b)
-    torch.testing.assert_close(sample(plane, x, TIME), sample(plane, x, TIME.expand(len(x))))
+# ---- gradients and bits
 
 
 def test_the_field_has_the_gradients_of_its_values() -> None:
@@ -152,17 +127,17 @@ def test_the_field_has_the_gradients_of_its_values() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("channels", [3, 32])
-def test_a_sample_has_the_same_bits_for_any_number_of_threads(channels: int) -> None:
+def test_features_have_the_same_bits_for_any_number_of_threads() -> None:
     """Catches a sum over the points that read a node whose order depends on the threads, as that of x[index] does."""
-    plane = torch.rand(9, 8, channels, generator=seeded(0)).requires_grad_()
-    x, y = (torch.rand(5000, generator=seeded(i)).mul(2.4).sub(1.2).requires_grad_() for i in (1, 2))
-    upstream = torch.randn(5000, channels, generator=seeded(3))
+    positions = torch.randn(5000, 3, generator=seeded(0))
+    planes = Planes(positions / 2, [(9, 8, 7, 6)], 32, seeded(1))
+    inputs = [positions.requires_grad_(), *planes.levels[0].values()]
+    upstream = torch.randn(5000, 32, generator=seeded(2))
 
     def computed(threads: int) -> list[Tensor]:
         torch.set_num_threads(threads)
-        output = sample(plane, x, y)
-        return [output.detach(), *torch.autograd.grad(output, [plane, x, y], upstream)]
+        features = planes(positions, torch.tensor(0.3))
+        return [features.detach(), *torch.autograd.grad(features, inputs, upstream)]
 
     first = computed(1)
     for threads in (2, 3, 5):
@@ -170,14 +145,13 @@ def test_a_sample_has_the_same_bits_for_any_number_of_threads(channels: int) -> 
 
 
 def test_points_in_a_plane_make_no_nan() -> None:
-    """Catches a division by the box's width of zero, and a position that is not finite and reads beyond the nodes."""
+    """Catches a division by the box's width of zero, and a gradient that is infinite there."""
     points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
     planes = Planes(points, [(4, 4, 4, 4)], 2, seeded(1))
     positions = torch.cat([points, points + 1]).requires_grad_()
     planes(positions, torch.tensor(0.5)).sum().backward()
     assert positions.grad is not None
     assert positions.grad.isfinite().all()
-    assert planes(torch.full((1, 3), math.nan), torch.tensor(0.5)).isnan().all()
 
 
 # ---- a training
