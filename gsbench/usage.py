@@ -55,7 +55,7 @@ def text(words: Sequence[str]) -> str:
     for group, title in DESCRIBED.items():
         lines += [f"{title}:"]
         for path in _files(folders, group):
-            name, sentence = f"  {path.stem:{_INDENT - 2}}", first_sentence(path)
+            name, sentence = f"  {path.stem} ".ljust(_INDENT), first_sentence(path)
             lines += textwrap.wrap(sentence, WIDTH, initial_indent=name, subsequent_indent=" " * _INDENT) or [name]
         lines += [""]
     scenes = ", ".join(path.stem for path in _files(folders, "scene"))
