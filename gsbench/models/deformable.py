@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number
 from gsbench.models.base import Raw
 from gsbench.models.camera_time import CameraTime
@@ -113,7 +114,7 @@ class DeformationField(nn.Module):
         hidden = inputs
         for i, layer in enumerate(self.layers):
             hidden = layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden)
-        return self.head(hidden).split([3, 3, 4], -1)
+        return collect_gradients(self.head(hidden)).split([3, 3, 4], -1)
 
 
 def encode(x: Tensor, octaves: int) -> Tensor:
