@@ -72,8 +72,9 @@ class Trainer(TrainingParts):
         views = self.batches.at(step, self.schedule.resolution(step))
         with stages("loss"):
             terms = [term for hook in self.hooks for term in hook.loss_terms(step, views)]
+            maps = [image_map for hook in self.hooks for image_map in hook.image_maps(step, views)]
         try:
-            results = self.gradients(views, terms)
+            results = self.gradients(views, terms, maps)
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
         with stages("density"):

@@ -55,6 +55,10 @@ class Optimizer:
         # [] on a GPU: 1 from the first step whose loss or gradient was not finite, so that no step changes anything
         self.skip: Tensor | None = None
 
+    def add(self, name: str, parameters: list[nn.Parameter], rate: LearningRate) -> None:
+        """Also optimize a group of parameters that is not of the model; use it before the first step."""
+        self.groups[name], self.rates[name] = parameters, rate
+
     @cached_property
     def torch_adam(self) -> torch.optim.Adam:
         """torch's Adam with the same groups and moments; created at first use, because its import takes a second."""

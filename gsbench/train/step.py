@@ -18,7 +18,7 @@ from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.divergence import DivergedError
-from gsbench.train.hooks import LossTerm
+from gsbench.train.hooks import ImageMap, LossTerm
 from gsbench.train.losses import photometric
 from gsbench.train.step_replay import Observed, Stages, StepReplay
 
@@ -125,19 +125,23 @@ class Step:
         self.antialias = antialias
         self.stages = stages
         self.terms: Sequence[LossTerm] = ()
+        self.maps: Sequence[ImageMap] = ()
         self._replay: StepReplay[ViewResult] = StepReplay()
 
-    def __call__(self, views: Sequence[View], terms: Sequence[LossTerm] = ()) -> list[ViewResult]:
-        """Render a batch of views and store the gradient of the loss in the model's parameters.
+    def __call__(
+        self, views: Sequence[View], terms: Sequence[LossTerm] = (), maps: Sequence[ImageMap] = ()
+    ) -> list[ViewResult]:
+        """Render a batch of views and store the gradient of the loss in all parameters.
 
-        The loss is the mean over views of the photometric loss plus weighted terms, plus the model's penalty.
+        The loss is the mean over views of the photometric loss of the mapped render plus weighted terms, plus the
+        model's penalty.
 
         Raises:
             DivergedError: a 3D Gaussian of a view has a value that is not finite.
             InputError: the rasterizer refuses 3D Gaussians for another reason.
             TooLargeError: the memory does not suffice.
         """
-        self.terms = terms
+        self.terms, self.maps = terms, maps
         sources = [parameter for parameter in self.parameters if parameter.requires_grad]
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
@@ -165,7 +169,7 @@ class Step:
         model, sets = self.model, self.model.effect_sets
         by_kernels = self.background.device.type in REPEATED_ON and model.backend.serves(self.background)
         work = sum([work_of(len(model), view.camera.width * view.camera.height) for view in views])
-        if self.terms or not by_kernels or work > MOST_RECORDED:
+        if self.terms or self.maps or not by_kernels or work > MOST_RECORDED:
             return None
         tensors = [*self.parameters, *([] if sets is None else [sets.orders, sets.intervals])]
         addresses = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
@@ -206,7 +210,10 @@ class Step:
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):
-                loss = photometric(output.image, view.target[None], self.ssim_weight, self.model.backend)
+                image = output.image
+                for image_map in self.maps:
+                    image = image_map(image, index)
+                loss = photometric(image, view.target[None], self.ssim_weight, self.model.backend)
                 for weight, term in self.terms:
                     loss = loss + weight * term(query, index)
         with stages("backward"):

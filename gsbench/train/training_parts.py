@@ -64,6 +64,9 @@ class TrainingParts:
         self.hooks: list[Hook] = [hook(self) for hook in hook_types()]
         for hook in self.hooks:
             self.rows.add(hook.reindex)
+            for name, (parameters, rate) in hook.groups().items():
+                self.optimizer.add(name, parameters, rate)
+                self.gradients.parameters += parameters
 
     def hook(self, kind: type[H]) -> H:
         """Return the hook of a class."""

@@ -99,7 +99,7 @@ def test_early_steps_see_small_images() -> None:
     """Catches a resolution that is not the schedule's, a camera that does not shrink with its image, or its centre."""
     fitted, looked = trainer("3dgs", "train.coarse=[[2,15000]]", "train.batch_size=1"), list[View]()
     real, half = fitted.gradients, fitted.schedule.scaled(15_000)
-    fitted.gradients = lambda views, terms: looked.extend(views) or real(views, terms)
+    fitted.gradients = lambda views, *more: looked.extend(views) or real(views, *more)
     for fitted.step in (0, half - 1, half):
         fitted.train_step()
     assert [view.camera.width for view in looked] == [SIZE // 2, SIZE // 2, SIZE]

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 from gsbench.errors import InputError
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor, nn
 
-    from gsbench.config import Config
+    from gsbench.config import Config, LearningRate
     from gsbench.measure.curve import Curve
     from gsbench.measure.speed import Effort, StageClock
     from gsbench.models import CameraTime, GaussianModel
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 # A weight, and the term [] of a view of the batch by its index.
 LossTerm = tuple[float, "Callable[[CameraTime, int], Tensor]"]
+# What the loss sees of the render [1, H, W, 3] of a view of the batch by its index.
+ImageMap = Callable[["Tensor", int], "Tensor"]
+TrainedGroup = tuple["list[nn.Parameter]", "LearningRate"]
 H = TypeVar("H", bound="Hook")
 ELSEWHERE = ("gsbench.gates.long_lived", "gsbench.gates.hook")  # hooks outside of this folder, which act last
 
@@ -100,6 +103,14 @@ class Hook:
 
     def loss_terms(self, step: int, views: Sequence[View]) -> Sequence[LossTerm]:
         """Return terms that are added to the loss of each view of a step; threads call them at the same time."""
+        return ()
+
+    def groups(self) -> dict[str, TrainedGroup]:
+        """Return what the hook trains beside the model: parameters and their learning rate by the name of the group."""
+        return {}
+
+    def image_maps(self, step: int, views: Sequence[View]) -> Sequence[ImageMap]:
+        """Return what is done to each render of a step before the loss; threads call the maps at the same time."""
         return ()
 
     def rate_factors(self, step: int) -> dict[str, float]:
