@@ -129,10 +129,11 @@ class Planes(nn.Module):
         From the lowest to the highest corner of the box, coordinates fall from 1 to -1. Time is used as it is, so only
         the second half of the nodes along t is read, as in the authors' code.
         """
-        # Of one image, grid_sample adds up the gradient of a node in a fixed order, for any number of threads.
-        x, y, z = ((positions - self.high) * 2 / (self.low - self.high) - 1).unbind(-1)
+        # NaN would end the process in the gradient of grid_sample.
+        x, y, z = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num().unbind(-1)
         at = {"x": x, "y": y, "z": z, "t": time.expand(len(x))}
 
+        # One thread samples a single plane, so its gradient adds up in a fixed order.
         def sample(axes: str, plane: Tensor) -> Tensor:
             grid = torch.stack([at[axis] for axis in axes], -1)[None, None]  # [1, 1, N, 2] column and row in [-1, 1]
             return F.grid_sample(plane, grid, padding_mode="border", align_corners=True)[0, :, 0].T  # [N, C]

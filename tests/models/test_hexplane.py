@@ -67,7 +67,17 @@ def test_the_features_of_planes() -> None:
 
 def test_the_network() -> None:
     """Catches a lost or further layer or ReLU, heads in another order, and a hidden layer of another head."""
-    torch.testing.assert_close(network_of_the_vectors()(FEATURES[None]).detach()[0], CHANGES, rtol=0, atol=1e-8)
+    network = network_of_the_vectors()
+    torch.testing.assert_close(network(FEATURES[None]).detach()[0], CHANGES, rtol=0, atol=1e-8)
+    features = torch.randn(20, 4, generator=seeded(0)).double()  # those of the vectors pass every ReLU
+
+    def layer(x: Tensor, of: Any) -> Tensor:
+        return x @ of.weight.mT + of.bias
+
+    hidden = layer(features, network.first).relu()
+    heads: Any = network.heads
+    expected = torch.cat([layer(layer(hidden, first).relu(), last) for first, last in heads], -1)
+    torch.testing.assert_close(network(features), expected)
 
 
 def test_a_changed_gaussian() -> None:
@@ -145,10 +155,11 @@ def test_features_have_the_same_bits_for_any_number_of_threads() -> None:
 
 
 def test_points_in_a_plane_make_no_nan() -> None:
-    """Catches a division by the box's width of zero, and a gradient that is infinite there."""
+    """Catches a division by the box's width of zero, a gradient that is infinite there, and a
+    crash at NaN."""
     points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
     planes = Planes(points, [(4, 4, 4, 4)], 2, seeded(1))
-    positions = torch.cat([points, points + 1]).requires_grad_()
+    positions = torch.cat([points, points + 1, torch.full((1, 3), math.nan)]).requires_grad_()
     planes(positions, torch.tensor(0.5)).sum().backward()
     assert positions.grad is not None
     assert positions.grad.isfinite().all()
