@@ -55,10 +55,13 @@ class MovingGaussians3D(Gaussians3DModel):
         geometry = super().slice_geometry(raw, query)
         if self.kernel is not slice_static or not self.uses_kernel(raw):
             return geometry
-        shift, factor = self.change({name: x[: self.conditioned] for name, x in raw.items()}, query)
-        static = len(raw["means"]) - len(shift)
-        means = geometry.means + F.pad(shift, (0, 0, 0, static))
-        return geometry._replace(means=means, opacities=geometry.opacities * F.pad(factor, (0, static), value=1.0))
+        if self.conditioned is None:
+            shift, factor = self.change(raw, query)
+        else:  # static Gaussians neither move nor fade
+            shift, factor = self.change({name: x[: self.conditioned] for name, x in raw.items()}, query)
+            static = len(raw["means"]) - len(shift)
+            shift, factor = F.pad(shift, (0, 0, 0, static)), F.pad(factor, (0, static), value=1.0)
+        return geometry._replace(means=geometry.means + shift, opacities=geometry.opacities * factor)
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
