@@ -21,8 +21,8 @@ from gsbench import kernels
 from gsbench.errors import InputError, one_line, printable
 from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
 from gsbench.measure import record as records
-from gsbench.measure.flicker import films_of, tof
-from gsbench.measure.images import to_bytes, write_png
+from gsbench.measure.flicker import films_of, grey_of, tof
+from gsbench.measure.images import write_png
 from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import SSIM_LEAST_SIDE, psnr
 from gsbench.measure.record import Cost, Record
@@ -202,7 +202,7 @@ def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, f
         if min(truth.shape[:2]) >= SSIM_LEAST_SIDE:
             values.append(of_other_papers(image, truth))
         if view.name in is_filmed:
-            frames[view.name] = to_bytes(image.cpu().numpy()), to_bytes(truth.cpu().numpy())
+            frames[view.name] = grey_of(image), grey_of(truth)
     means = {name: fmean(of_view[name] for of_view in values) for name in (values or [{}])[0]}
     flows = [tof(*zip(*(frames[name] for name in film), strict=True)) for film in films]
     known = [flow for flow in flows if flow is not None]

@@ -14,6 +14,7 @@ in the region `moving` (gsbench.measure.regions) of none of its views. Tests of 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import fmean
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsbench.measure.images import Pixels, strip
+from gsbench.measure.images import Pixels, strip, to_bytes
 from gsbench.measure.record import Region
 from gsbench.measure.regions import LEAST_VIEWS, Mask, Regions, by_camera
 from gsbench.scenes import View
@@ -30,6 +31,7 @@ LEAST_HEIGHT = 120  # pixels of the picture of a row over time; each frame is as
 NO_FILM = f"needs a film: {LEAST_VIEWS} evaluated views of one camera, in the order of their times"
 FARNEBACK = (0.5, 3, 15, 3, 5, 1.2, 0)  # scale, levels, window, iterations, neighbourhood, its sigma, flags
 SKIPPED = 2  # frames at each end, for tOF
+Grey = NDArray[np.uint8]  # [H, W] an image in 8 bits
 NAMES = ("flicker", "static_drift", "flicker_truth")
 
 
@@ -128,23 +130,30 @@ def films_of(views: Sequence[View]) -> list[list[View]]:
     return [group for group in by_camera(views) if len(group) >= LEAST_VIEWS and is_in_order(group)]
 
 
-def tof(renders: Sequence[Pixels], truths: Sequence[Pixels]) -> float | None:  # [H, W, 3] of each frame
+def tof(renders: Sequence[Grey], truths: Sequence[Grey]) -> float | None:  # of each frame
     """Compute tOF (Chu et al. 2020, TecoGAN) of a film: how much the optical flow of renders differs from the truth's.
 
     It is the mean over pixels of the Euclidean length of the difference of both flows, in pixels, as in its authors'
     code (the text has the L1 norm): Farneback's flow of 8-bit grey images, cropped to multiples of 32 pixels with at
     least 16 removed, without the first two frames and the last two. None: too few frames or pixels.
     """
-    height, width = (32 * ((side - 16) // 32) for side in renders[0].shape[:2])
+    shape = renders[0].shape
+    height, width = (32 * ((side - 16) // 32) for side in shape)
     if min(height, width) <= 0 or len(renders) < 2 * SKIPPED + 2:
         return None
-    top, left = ((side - kept) // 2 for side, kept in zip(renders[0].shape[:2], (height, width), strict=True))
-    flows = []
-    for frames in (renders, truths):
-        greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in frames[SKIPPED:-SKIPPED]]
-        greys = [grey[top : top + height, left : left + width] for grey in greys]
-        flows.append([cv2.calcOpticalFlowFarneback(a, b, None, *FARNEBACK) for a, b in itertools.pairwise(greys)])  # type: ignore[call-overload]  # None: no flow to begin with
-    return fmean(flow_difference(a, b) for a, b in zip(*flows, strict=True))
+    top, left = (shape[0] - height) // 2, (shape[1] - width) // 2
+
+    def flows(frames: Sequence[Grey]) -> Iterator[NDArray[Any]]:  # [height, width, 2] each
+        cropped = [grey[top : top + height, left : left + width] for grey in frames[SKIPPED:-SKIPPED]]
+        for before, after in itertools.pairwise(cropped):
+            yield cv2.calcOpticalFlowFarneback(before, after, np.empty(0), *FARNEBACK)
+
+    return fmean(flow_difference(a, b) for a, b in zip(flows(renders), flows(truths), strict=True))
+
+
+def grey_of(image: Tensor) -> Grey:  # [H, W, 3]
+    """Return an image in grey, for `tof`."""
+    return np.asarray(cv2.cvtColor(to_bytes(image.cpu().numpy()), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def flow_difference(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:  # [H, W, 2], each

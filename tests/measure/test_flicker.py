@@ -111,7 +111,7 @@ def test_tof_of_films():
     truth's motion of a pixel a frame, and the first two and last two frames may be anything."""
     texture = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
     texture = np.asarray(torch.nn.functional.avg_pool2d(torch.from_numpy(texture)[None].float(), 9, 1, 4)[0]) * 3 - 256
-    wide = np.repeat(texture.clip(0, 255).astype(np.uint8)[..., None], 3, -1)
+    wide = texture.clip(0, 255).astype(np.uint8)
     moved = [wide[:, i : i + 128] for i in range(8)]
     still = [wide[:, :128]] * 8
     assert tof(moved, moved) == 0
