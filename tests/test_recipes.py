@@ -79,6 +79,17 @@ def test_hexplane_learns_as_its_authors_have_it():
     assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 18_000, 100)
 
 
+def test_stg_learns_as_its_authors_have_it():
+    """Catches rates of a short run or of gsbench's recipe, and rounds at other steps."""
+    config = composed("model=stg", "+recipe=authors_stg", "train.iterations=15000", "train.recipe_iterations=15000")
+    for share in (0.0, 1.0):
+        of_run = rates(config, share)
+        assert of_run["path"] == pytest.approx(1.75 * 1.6e-4 * 5)  # 5: the extent
+        assert (of_run["times"], of_run["turns"], of_run["durations"], of_run["scales"]) == (1e-4, 1e-4, 3e-2, 1.5e-3)
+    s = Schedule(config.train, config.model.sh_degree, config.agr)
+    assert [step + 1 for step in range(15_000) if s.densifies(step)] == [600, 700, 800, 900, 1000, 1100]
+
+
 def test_an_authors_recipe_is_for_their_model():
     """Catches a field's rate that another model silently ignores."""
     with pytest.raises(InputError, match="model '4dgs' has no '"):
