@@ -22,7 +22,8 @@ from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
-CHANGED = {"means": 3, "scales": 3, "quats": 4}  # the raw parameters that the field changes, with their widths
+GEOMETRY = (("means",), ("scales",), ("quats",))  # the raw parameters that each head of the network changes
+APPEARANCE = (("opacities",), ("sh0", "shN"))
 THINNEST = 1e-3  # least width of the box of the planes, in parts of its largest: all initial points may lie in a plane
 
 
@@ -33,8 +34,8 @@ class HexPlaneModel(Gaussians3DModel):
         (dp, ds, dr) = network(planes(mu_p, t))        mean = mu_p + dp
         cov = R S S^T R^T with R of the quaternion q + dr and S = diag(exp(s + ds))
 
-    AGR changes raw parameters too, so both act in `refined`, before the slice. Density control sees the canonical
-    Gaussians, which alone are drawn during the warm-up.
+    and with `appearance` also opacities and colours. AGR changes raw parameters too, so both act in `refined`, before
+    the slice. Density control sees the canonical Gaussians, which alone are drawn during the warm-up.
     """
 
     observes: ClassVar[tuple[str, ...]] = ("time",)
@@ -50,6 +51,7 @@ class HexPlaneModel(Gaussians3DModel):
         resolution: int = 64,  # nodes along x, y and z in the first level
         time_resolution: int = 50,  # nodes along t in every level
         width: int = 64,  # of the hidden layers
+        appearance: bool = False,  # whether the field also changes opacities and colours
         space_smoothness: float = 1e-4,  # weights in the loss, see `Planes.penalty`
         time_smoothness: float = 1e-2,
         time_sparsity: float = 1e-4,
@@ -65,6 +67,7 @@ class HexPlaneModel(Gaussians3DModel):
         check_number(time_smoothness, "time_smoothness", 0)
         check_number(time_sparsity, "time_sparsity", 0)
         self.channels, self.width = channels, width
+        self.heads = GEOMETRY + APPEARANCE * appearance
         self.nodes = [(*[resolution << level] * 3, time_resolution) for level in range(levels)]
         self.weights = space_smoothness, time_smoothness, time_sparsity
 
@@ -72,7 +75,9 @@ class HexPlaneModel(Gaussians3DModel):
         """Start as 3DGS does, with a field of random weights: at the end of the warm-up, the Gaussians jump."""
         super().initialise(points, extent, generator)
         self.planes = Planes(points.means, self.nodes, self.channels, generator)
-        self.network = Network(len(self.nodes) * self.channels, self.width, generator)
+        self.outputs = {name: self.splats[name][0].numel() for head in self.heads for name in head}
+        outputs = [sum(self.outputs[name] for name in head) for head in self.heads]
+        self.network = Network(len(self.nodes) * self.channels, self.width, outputs, generator)
 
     def refined(self, query: CameraTime) -> Raw:
         """Return the raw parameters after AGR and, from the end of the warm-up on, the field have changed them."""
@@ -81,8 +86,8 @@ class HexPlaneModel(Gaussians3DModel):
             return raw
         assert query.time is not None
         changes = collect_gradients(self.network(self.planes(raw["means"], query.time)))
-        by_name = zip(CHANGED, changes.split(list(CHANGED.values()), -1), strict=True)
-        return raw | {name: raw[name] + change for name, change in by_name}
+        by_name = zip(self.outputs, changes.split(list(self.outputs.values()), -1), strict=True)
+        return raw | {name: raw[name] + change.view_as(raw[name]) for name, change in by_name}
 
     def penalty(self) -> Tensor | None:
         return None if self.active.warms_up else self.planes.penalty(*self.weights)
@@ -157,9 +162,15 @@ class Planes(nn.Module):
 
 
 class Network(nn.Module):
-    """The network of 4DGaussians (section 4.3): a layer, then two more for each of the changed raw parameters."""
+    """The network of 4DGaussians (section 4.3): a layer, then heads of two more layers each."""
 
-    def __init__(self, inputs: int, width: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        width: int,  # of the hidden layers
+        outputs: Sequence[int],  # of each head
+        generator: torch.Generator,
+    ) -> None:
         super().__init__()
 
         def layer(inputs: int, outputs: int, *, relu: bool = False) -> Linear:
@@ -169,10 +180,10 @@ class Network(nn.Module):
 
         self.first = layer(inputs, width, relu=True)
         self.heads = nn.ModuleList(
-            nn.Sequential(layer(width, width, relu=True), layer(width, outputs)) for outputs in CHANGED.values()
+            nn.Sequential(layer(width, width, relu=True), layer(width, last)) for last in outputs
         )
 
-    def forward(self, features: Tensor) -> Tensor:  # [N, levels C] -> [N, 10]
-        """Return the changes of the raw parameters CHANGED, side by side."""
+    def forward(self, features: Tensor) -> Tensor:  # [N, inputs] -> [N, sum of outputs]
+        """Return the outputs of all heads, side by side."""
         hidden = self.first(features)
         return torch.cat([head(hidden) for head in self.heads], -1)

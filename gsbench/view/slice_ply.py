@@ -122,11 +122,12 @@ def has_harmonics(model: GaussianModel) -> bool:
 def harmonics_at(model: GaussianModel, query: CameraTime) -> Tensor:
     """Return the SH coefficients of the colours at a certain time, [N, K, 3], of the degrees in use."""
     used = (model.active.sh_degree + 1) ** 2
-    sh0, shN = model.splats["sh0"], model.splats["shN"]
+    raw = model.refined(query)  # which AGR and fields change
+    sh0, shN = raw["sh0"], raw["shN"]
     if not isinstance(model, Gaussians4DModel):
         return torch.cat([sh0, shN], 1)[:, :used]
     waves = torch.cat([sh0.flatten(1, 2), shN], 1).unflatten(1, (model.time_degree + 1, -1))  # [N, M, K, 3]
     assert query.time is not None
     frequencies = torch.arange(model.time_degree + 1).to(waves)
-    phase = 2 * math.pi * frequencies * (query.time - model.refined(query)["times"])  # AGR moves mean times too
+    phase = 2 * math.pi * frequencies * (query.time - raw["times"])
     return (waves * torch.cos(phase)[..., None, None]).sum(1)[:, :used]

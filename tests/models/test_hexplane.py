@@ -13,11 +13,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsbench.models import CameraTime
+from gsbench.models.appearance import sh_colors
 from gsbench.models.factors import sizes
 from gsbench.models.hexplane import Network, Planes
 from gsbench.models.render import render
 from gsbench.schedule import ActiveComponents
 from gsbench.train.checkpoint import without_times
+from gsbench.view.slice_ply import harmonics_at
 
 FULL = ActiveComponents(3, False, False)
 QUERY = CameraTime.at(CAMERA, 0.25)
@@ -33,7 +35,7 @@ def doubles(*numbers: float) -> Tensor:
 POSITION, TIME = doubles(0.2, 0.5, 1)[None], doubles(0.25)[0]
 FEATURES = doubles(0.00920011, 0.01193819, 0.01502319, 0.01906886)
 CHANGES = doubles(0.15831827, 0.14810943, 0.13868341, 0.07187866, 0.07128625, 0.07138002,
-                  0.09128860, 0.07279905, 0.04956811, 0.02206824)  # fmt: skip
+                  0.09128860, 0.07279905, 0.04956811, 0.02206824, -0.00492522)  # fmt: skip
 
 
 def planes_of_the_vectors() -> Planes:
@@ -48,8 +50,8 @@ def planes_of_the_vectors() -> Planes:
     return planes.double()
 
 
-def network_of_the_vectors() -> Network:
-    network: Any = Network(4, 8, seeded(0)).double()
+def network_of_the_vectors(*further: int) -> Network:
+    network: Any = Network(4, 8, [3, 3, 4, 1, *further], seeded(0)).double()
     for number, layer in enumerate([network.first, *(head[i] for head in network.heads for i in (0, 1))]):
         rows, columns = layer.weight.shape
         i, j = torch.arange(rows).double(), torch.arange(columns).double()
@@ -81,10 +83,13 @@ def test_the_network() -> None:
 
 
 def test_a_changed_gaussian() -> None:
-    """Catches scales that change after the exp, and a quaternion that is normalised before the sum."""
-    model: Any = lively("hexplane", 4)
+    """Catches scales that change after the exp, a quaternion that is normalised before the sum, and colours, in a slice
+    or its export, that do not change."""
+    model: Any = lively("hexplane", 4, appearance=True)
+    model.set_active(FULL)
     model.select(torch.arange(1))
-    model.planes, model.network = planes_of_the_vectors(), network_of_the_vectors()
+    model.planes, model.network = planes_of_the_vectors(), network_of_the_vectors(48)
+    model.splats["opacities"].data = doubles(-1.2)
     model.splats["means"].data = POSITION
     model.splats["scales"].data = doubles(0.01, 0.02, 0.03).log()[None]
     model.splats["quats"].data = doubles(0.9, 0.1, -0.2, 0.3)[None]
@@ -95,9 +100,16 @@ def test_a_changed_gaussian() -> None:
     )
     quaternion = doubles(0.92888720, 0.16192139, -0.14096223, 0.30179411)
     torch.testing.assert_close(normalize(changed["quats"], dim=-1).detach()[0], quaternion, **DIGITS)
-    geometry = model.slice(QUERY)
-    assert torch.equal(geometry.means, changed["means"])
-    torch.testing.assert_close(geometry.factors, model.factors(changed))
+    sliced = model.slice(QUERY)
+    assert torch.equal(sliced.means, changed["means"])
+    torch.testing.assert_close(sliced.factors, model.factors(changed))
+    torch.testing.assert_close(sliced.opacities.detach(), doubles(0.23060021), **DIGITS)
+    harmonics = torch.cat([changed["sh0"], changed["shN"]], 1)
+    before = torch.cat([model.splats["sh0"], model.splats["shN"]], 1)
+    of_field = model.network(model.planes(POSITION, TIME))[:, 11:]
+    torch.testing.assert_close(harmonics - before, of_field.unflatten(1, (16, 3)))
+    torch.testing.assert_close(sliced.colors, sh_colors(harmonics, normalize(sliced.means - CAMERA, dim=-1), 3))
+    assert torch.equal(harmonics_at(model, QUERY), harmonics)
 
 
 def test_the_penalty() -> None:
@@ -119,7 +131,7 @@ def test_the_penalty() -> None:
 
 def test_the_field_has_the_gradients_of_its_values() -> None:
     """Catches a lost or wrong derivative on the way from any number of the field, or a position, to the changes."""
-    model: Any = lively("hexplane", 5, channels=2, resolution=3, width=3)
+    model: Any = lively("hexplane", 5, channels=2, resolution=3, width=3, appearance=True, sh_degree=1)
     fields = model.planes, model.network
     values = [
         x.detach().requires_grad_() for x in (model.splats["means"], *(p for f in fields for p in f.parameters()))
