@@ -234,8 +234,7 @@ class CholeskyModel(JointModel):
         """
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)
-        by_name = {name: [name] for name in self.columns} if len(self.columns) > 1 else {}
-        by_name["static"] = list(self.columns)
+        by_name = {name: [name] for name in self.columns} | {"static": list(self.columns)}
         shift = torch.zeros_like(gain[:, 0])
         opacity_factors = {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
         for query, weight in zip(queries, weights.double(), strict=True):

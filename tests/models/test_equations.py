@@ -8,6 +8,7 @@ import pytest
 import torch
 from small import CAMERA, CHOLESKY, MODELS, N, covariances, fresh, joint, lively, moved, raw, seeded, started
 
+from gsbench.kernels.backends import REFERENCE
 from gsbench.models import CameraTime, Gaussians3D, build
 from gsbench.models.base import Raw
 from gsbench.models.beta import BetaModel, joint_factor, opacity_factor, softplus_inverse
@@ -182,6 +183,18 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     assert TIME_OPACITY_FACTOR_MIN == 0.05
     model.splats["scales"].data[:] = torch.tensor([0.0, 1.0, -1.0, 5.0])
     assert model.scales().tolist() == pytest.approx([math.e] * N)
+
+
+def test_4dgs_that_is_long_in_time_keeps_its_digits() -> None:
+    """Catches a reflection in float32 that loses what is thin in space: a Gaussian lasts 10^5 times its size."""
+    model = lively("4dgs", 400)
+    model.splats["scales"].data += torch.tensor([-5.0, -5, -5, 7])
+    model.backend = REFERENCE
+    exact = covariances(model.slice(QUERY)).flatten(1)
+    single = model.float().slice(CameraTime.at(CAMERA.float(), TIME))
+    error = (covariances(single).flatten(1) - exact).norm(dim=1) / exact.norm(dim=1)
+    assert error.median() < 1e-6
+    assert error.max() < 1e-3
 
 
 # ---- dGS, dBS and FreeTimeGS: one Gaussian at the origin, with numbers for which the equations were evaluated by hand

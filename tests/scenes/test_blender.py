@@ -59,10 +59,12 @@ def test_camera_of_a_known_frame(downscale: int) -> None:
 
 
 def test_axes(tiny: Path) -> None:
-    """Catches a flipped or swapped axis: right is +u, up is -v, ahead is +depth, for two cameras by hand."""
+    """Catches a flipped or swapped axis: right is +u, up is -v, ahead is +depth, for two cameras by hand; sides that
+    are swapped on another device."""
     scene = scenes.load(tiny)
     f = 4 / math.tan(0.4)
-    front, side = scene.train
+    front, side = (view.to("cpu") for view in scene.train)
+    assert (front.camera.width, front.camera.height) == (8, 6)
     assert project(front, [0, 0, 0]) == pytest.approx((4, 3, 4), abs=1e-5)
     assert project(front, [1, 0, 0]) == pytest.approx((4 + f / 4, 3, 4), abs=1e-5)
     assert project(front, [0, 1, 0]) == pytest.approx((4, 3 - f / 4, 4), abs=1e-5)
