@@ -269,7 +269,8 @@ def hostile() -> list[Record]:
     gate = Gate(-1.0, 1e300, -1e300, rows, orders, -1, 2**62, None, HOSTILE, -1.0, None, 1e300, -1e300)
     notes = [HOSTILE, HOSTILE[::-1], "", *(f"note {i}" for i in range(50))]
     bad[-1] = but(bad[-1], on_demand=OnDemand(screen, [gate], notes))
-    return [*bad, lost(but(bad[0], model="4dgs"), HOSTILE)]
+    other = but(elsewhere(bad[0], "other"), rendered_elsewhere={"kind": HOSTILE, "resized_from": HOSTILE})
+    return [*bad, lost(but(bad[0], model="4dgs"), HOSTILE), other]
 
 
 def at_paper(
