@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -36,17 +36,18 @@ def repeats(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts repetitions of recordings, those that are "done" and those that were found "outdated"."""
     from gsbench.kernels.recording import OutdatedError, Recording
 
-    counted, repeat = Counter[str](), Recording.repeat
+    counted, repeat, check = Counter[str](), Recording.repeat, Recording.check
 
-    def count(self: Recording) -> None:
+    def count(self: Recording, call: Callable[[Recording], None], outcome: str) -> None:
         try:
-            repeat(self)
+            call(self)
         except OutdatedError:
             counted["outdated"] += 1
             raise
-        counted["done"] += 1
+        counted[outcome] += 1
 
-    monkeypatch.setattr(Recording, "repeat", count)
+    monkeypatch.setattr(Recording, "repeat", lambda self: count(self, repeat, "done"))
+    monkeypatch.setattr(Recording, "check", lambda self: count(self, check, "checked"))
     return counted
 
 

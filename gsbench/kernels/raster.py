@@ -189,7 +189,8 @@ def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, 
     if not library.needs_scratch:
         return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda values: values == [0])[0]
     order, ends = _sort_on_gpu(library, splats, viewport, flags)
-    *total, flagged = recording.read(ends[-2:], lambda values: values[-1] == 0 and sum(values) <= room)
+    # The kernel leaves out intersections beyond its memory, so a repetition of four views waits for the GPU only once.
+    *total, flagged = recording.read(ends[-2:], lambda values: values[-1] == 0 and sum(values) <= room, is_late=True)
     pairs = _checked_count(sum(total))
     room = _recorded_room(pairs)
     lists = _room(splats, room, is_filled=recording.current() is None)

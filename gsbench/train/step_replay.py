@@ -17,6 +17,8 @@ from torch import Tensor
 from gsbench.kernels.recording import OutdatedError, Recording
 from gsbench.scenes import Camera, View
 
+GRAPHED_ON = ("cuda",)  # types of devices on which what is recorded becomes CUDA graphs
+
 Stages = Callable[[str], AbstractContextManager[None]]  # `with stages("loss"): ...` marks work of one stage
 Result = TypeVar("Result")
 
@@ -63,6 +65,10 @@ class _RecordedView(Generic[Result]):
 
         self.result = work(self._observed, recorded)
         self.is_repeatable = all(recording.is_repeatable for _, recording in self._recordings)
+        if self.is_repeatable and observed.target.device.type in GRAPHED_ON:
+            with suppress(RuntimeError):  # then single calls are repeated
+                for _, recording in self._recordings:
+                    recording.capture()
 
     @torch.no_grad()
     def repeat(self, observed: Observed, stages: Stages) -> Result:
@@ -71,6 +77,11 @@ class _RecordedView(Generic[Result]):
             with stages(stage):
                 recording.repeat()
         return self.result
+
+    def check(self) -> None:
+        """Raise OutdatedError if the repetition met other numbers than its calls can work with."""
+        for _, recording in self._recordings:
+            recording.check()
 
 
 class StepReplay(Generic[Result]):
@@ -104,7 +115,10 @@ class StepReplay(Generic[Result]):
             self._signature, self._recorded, self._is_repeatable = signature, [], True
         if recorded := self._recorded:
             with suppress(OutdatedError):  # then the work is recorded anew
-                return of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
+                results = of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
+                for view in recorded:
+                    view.check()
+                return results
         if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: work(index, observed[index], stages))
         recorded = of_all(lambda index, stages: _RecordedView(partial(work, index), observed[index], stages))

@@ -4,6 +4,8 @@ import subprocess
 import sys
 import threading
 import weakref
+from collections.abc import Callable
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -96,6 +98,32 @@ def test_a_number_that_was_read_is_read_again() -> None:
     count.fill_(5)
     with pytest.raises(OutdatedError):
         repeated(recording)
+
+
+def test_what_is_captured_is_repeated_and_read_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches calls that run while they are captured or are left out of a graph, and a late read that is forgotten,
+    is made before the calls have run, or ends a repetition that is not at fault."""
+    captured = []
+
+    def graph_of(calls: list[Callable[[], object]]) -> Callable[[], object]:
+        captured.append(len(calls))
+        return lambda: [call() for call in calls]
+
+    monkeypatch.setattr("gsbench.kernels.recording.graph_of", graph_of)
+    x, total = torch.tensor([1, 2]), torch.zeros(1, dtype=torch.int64)
+    with Recording() as recording:
+        double = x * 2
+        assert read(double, lambda values: values[0] < 100, is_late=True) == [2, 4]
+        total += double.sum()
+    recording.capture()
+    assert captured == [3]
+    assert total.item() == 6
+    for first, is_good in ((10, True), (50, False), (49, True)):
+        x[0], before = first, total.item()
+        repeated(recording)
+        assert total.item() == before + 2 * (first + 2)
+        with nullcontext() if is_good else pytest.raises(OutdatedError):
+            recording.check()
 
 
 @pytest.mark.parametrize("work", [Tensor.item, Tensor.nonzero, torch.rand_like, lambda x: x[x > 0]])
