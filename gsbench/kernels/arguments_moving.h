@@ -1,4 +1,4 @@
-// The arguments of the kernels of gsbench/kernels/slices.py: slices of dGS, dBS and FreeTimeGS. See arguments.h, which
+// The arguments of the kernels of gsbench/kernels/slices.py: slices of dGS, dBS, FreeTimeGS, SharpTimeGS. See arguments.h, which
 // includes this file.
 #pragma once
 
@@ -37,20 +37,20 @@ struct DirectBetaGrads {
 };
 GSB_FIELDS(DirectBetaGrads, GRADS, means, directions, times, scales, skew, precision, coupling, betas, opacities)
 
-// Gaussians of FreeTimeGS.
+// Gaussians of FreeTimeGS or, if `plateaus` is not null, of SharpTimeGS.
 struct FreeTimeArgs {
     int64_t N, conditioned;
-    const float *means, *times, *scales, *quats;          // [N, 3] [N, 1] [N, 3] logs, [N, 4]
-    const float *durations, *velocities, *opacities;      // [N, 1] logs, [N, 3] [N] logits
-    const float* time;                                    // []
+    const float *means, *times, *scales, *quats;                 // [N, 3] [N, 1] [N, 3] logs, [N, 4]
+    const float *durations, *plateaus, *velocities, *opacities;  // [N, 1] logs, [N, 1] logs, [N, 3] [N] logits
+    const float* time;                                           // []
     int threads;
 };
-GSB_FIELDS(FreeTimeArgs, INPUTS, N, conditioned, means, times, scales, quats, durations, velocities, opacities, time,
-           threads)
+GSB_FIELDS(FreeTimeArgs, INPUTS, N, conditioned, means, times, scales, quats, durations, plateaus, velocities,
+           opacities, time, threads)
 
 struct FreeTimeGrads {
-    float *means, *times, *scales, *quats, *durations, *velocities, *opacities;
+    float *means, *times, *scales, *quats, *durations, *plateaus, *velocities, *opacities;
 };
-GSB_FIELDS(FreeTimeGrads, GRADS, means, times, scales, quats, durations, velocities, opacities)
+GSB_FIELDS(FreeTimeGrads, GRADS, means, times, scales, quats, durations, plateaus, velocities, opacities)
 
 }  // namespace gsb

@@ -16,6 +16,7 @@
 #include "math/projection.h"
 #include "math/rotated.h"
 #include "math/scalar.h"
+#include "math/sharp_time.h"
 #include "math/similarity.h"
 #include "math/slicing.h"
 #include "math/static.h"

@@ -185,7 +185,7 @@ slice_direct_beta = _conditional_slice(  # dBS
     derive=_direct_beta_sizes,
 )
 
-slice_free_time = _conditional_slice(  # FreeTimeGS
+slice_free_time = _conditional_slice(  # FreeTimeGS and, with plateaus, SharpTimeGS
     "slice_free_time",
     inputs={
         "means": _parameter("N 3"),
@@ -193,6 +193,7 @@ slice_free_time = _conditional_slice(  # FreeTimeGS
         "scales": _parameter("N 3"),  # logarithms
         "quats": _parameter("N 4"),
         "durations": _parameter("N 1"),  # logarithms
+        "plateaus": _parameter("N 1", "plateau"),  # logarithms
         "velocities": _parameter("N 3"),
         "opacities": _parameter("N"),
         "time": _of_view(""),

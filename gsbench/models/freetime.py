@@ -128,7 +128,6 @@ class SharpTimeModel(FreeTimeModel, gates=True):
 
     geometry = ("scales", "quats", "durations", "plateaus", "velocities")
     moving = (*FreeTimeModel.moving, "plateaus")
-    kernel = slice_static
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return the start of FreeTimeGS: sigma is sqrt(2) standard deviations, and r is nearly 0."""

@@ -113,7 +113,9 @@ def _moving(model: MovingGaussians3D, g: torch.Generator) -> Raw:
     raw = {key: x + SPREADS.get(key, 0.3) * torch.randn(x.shape, generator=g) for key, x in raw.items()}
     raw["scales"] = torch.randn(N, 3, generator=g) - 1
     raw["scales"][3, 0] = -17.0  # beyond where sizes stop
-    for key, column in (("precision", 0), ("durations", 0), ("betas", 1)):
+    if "plateaus" in raw:  # of which some contain the time of the slice, and some make f larger than 2
+        raw["plateaus"] = torch.randn(N, 1, generator=g) - 1
+    for key, column in (("precision", 0), ("durations", 0), ("plateaus", 0), ("betas", 1)):
         if key in raw:
             raw[key][5:7, column] = -17.0
     if "betas" in raw:

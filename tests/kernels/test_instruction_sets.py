@@ -21,7 +21,7 @@ MARGIN = 1.5  # the machine may be shared; what this is to catch was twice as sl
 
 def calls() -> dict[str, Callable[[], object]]:
     """Forward and backward of every operation, by what it does."""
-    names = "3dgs", "4dgs", "7dgs", "dgs", "dbs", "freetime", "ubs"
+    names = "3dgs", "4dgs", "7dgs", "dgs", "dbs", "freetime", "sharptime", "ubs"
     sliced = {name: model(name, N, agr=name == "7dgs") for name in names}
     query = CameraTime.at(torch.tensor([0.0, 0.0, -4.0]), 0.4)
     splats, (viewmats, Ks) = [x.requires_grad_() for x in gaussians(N)], camera(200)

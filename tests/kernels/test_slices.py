@@ -108,7 +108,7 @@ def test_arguments_are_taken_by_name() -> None:
     """Catches a default that is not all rows, an input in the place of another, and a name that is dropped."""
     _, raw = sliced_model("freetime", {}, torch.float32)
     by_name = {key: x for key, x in raw.items() if key in slice_free_time.inputs} | {"time": TIME}
-    in_order = slice_free_time(*(by_name[key] for key in slice_free_time.inputs), len(raw["means"]))
+    in_order = slice_free_time(*(by_name.get(key) for key in slice_free_time.inputs), len(raw["means"]))
     assert all(torch.equal(x, y) for x, y in zip(slice_free_time(**by_name), in_order, strict=True))
     with pytest.raises(InputError, match=r"slice_free_time: expected means, times, .*, got colours too"):
         slice_free_time(**by_name, colours=TIME)

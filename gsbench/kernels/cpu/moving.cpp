@@ -1,8 +1,9 @@
-// Slices of 3D Gaussians that move and fade (dGS, dBS, FreeTimeGS), sixteen at a time. math/direct.h,
-// math/direct_beta.h and math/free_time.h have the formulas.
+// Slices of 3D Gaussians that move and fade (dGS, dBS, FreeTimeGS, SharpTimeGS), sixteen at a time. math/direct.h,
+// math/direct_beta.h, math/free_time.h and math/sharp_time.h have the formulas.
 #include "../math/direct.h"
 #include "../math/direct_beta.h"
 #include "../math/free_time.h"
+#include "../math/sharp_time.h"
 
 #include "isa.h"
 #include "observation.h"
@@ -143,6 +144,18 @@ GSB_HD inline void add(const FreeTimeParameters<Vec>& g, const FreeTimeGrads& ou
     add_row(g.velocity, out.velocities, i, n);
 }
 
+// ---- SharpTimeGS
+
+GSB_HD inline void load(const FreeTimeArgs& a, int64_t i, int n, SharpTimeParameters<Vec>& p) {
+    load(a, i, n, static_cast<FreeTimeParameters<Vec>&>(p));
+    p.plateau = load_first(a.plateaus + i, n);
+}
+
+GSB_HD inline void add(const SharpTimeParameters<Vec>& g, const FreeTimeGrads& out, int64_t i, int n) {
+    add(static_cast<const FreeTimeParameters<Vec>&>(g), out, i, n);
+    add_first(g.plateau, out.plateaus + i, n);
+}
+
 // ---- all of them
 
 template <template <class> class Model, class Args, class Slice>
@@ -211,10 +224,12 @@ void slice_direct_beta_backward(const DirectBetaArgs& a, const BetaSliceGrads& g
     a.times ? slice_backward<Beta4>(a, grads, out) : slice_backward<Beta3>(a, grads, out);
 }
 
-void slice_free_time(const FreeTimeArgs& a, const Observation& out) { slice<FreeTimeGaussian>(a, out); }
+void slice_free_time(const FreeTimeArgs& a, const Observation& out) {
+    a.plateaus ? slice<SharpTimeGaussian>(a, out) : slice<FreeTimeGaussian>(a, out);
+}
 
 void slice_free_time_backward(const FreeTimeArgs& a, const ObservationGrads& grads, const FreeTimeGrads& out) {
-    slice_backward<FreeTimeGaussian>(a, grads, out);
+    a.plateaus ? slice_backward<SharpTimeGaussian>(a, grads, out) : slice_backward<FreeTimeGaussian>(a, grads, out);
 }
 
 }  // namespace GSB_ISA

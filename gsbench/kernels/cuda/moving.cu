@@ -1,8 +1,9 @@
-// Slices of 3D Gaussians that move and fade (dGS, dBS, FreeTimeGS) and their gradients, one Gaussian per thread.
-// math/direct.h, math/direct_beta.h and math/free_time.h have the formulas.
+// Slices of 3D Gaussians that move and fade (dGS, dBS, FreeTimeGS, SharpTimeGS) and their gradients, one Gaussian per thread.
+// math/direct.h, math/direct_beta.h, math/free_time.h and math/sharp_time.h have the formulas.
 #include "../math/direct.h"
 #include "../math/direct_beta.h"
 #include "../math/free_time.h"
+#include "../math/sharp_time.h"
 
 #include "rows.h"
 
@@ -142,6 +143,18 @@ __device__ void add(const FreeTimeParameters<float>& g, const FreeTimeGrads& out
     add_row(g.velocity, out.velocities, i);
 }
 
+// ---- SharpTimeGS
+
+__device__ void load(const FreeTimeArgs& a, int64_t i, SharpTimeParameters<float>& p) {
+    load(a, i, static_cast<FreeTimeParameters<float>&>(p));
+    p.plateau = a.plateaus[i];
+}
+
+__device__ void add(const SharpTimeParameters<float>& g, const FreeTimeGrads& out, int64_t i) {
+    add(static_cast<const FreeTimeParameters<float>&>(g), out, i);
+    out.plateaus[i] += g.plateau;
+}
+
 // ---- all of them
 
 template <template <class> class Model, class Args, class Slice>
@@ -210,12 +223,13 @@ void slice_direct_beta_backward(const DirectBetaArgs& a, const BetaSliceGrads& g
 }
 
 void slice_free_time(const FreeTimeArgs& a, const Observation& out, Stream stream) {
-    slice<FreeTimeGaussian>(a, out, stream);
+    a.plateaus ? slice<SharpTimeGaussian>(a, out, stream) : slice<FreeTimeGaussian>(a, out, stream);
 }
 
 void slice_free_time_backward(const FreeTimeArgs& a, const ObservationGrads& grads, const FreeTimeGrads& out,
                               Stream stream) {
-    slice_backward<FreeTimeGaussian>(a, grads, out, stream);
+    a.plateaus ? slice_backward<SharpTimeGaussian>(a, grads, out, stream)
+               : slice_backward<FreeTimeGaussian>(a, grads, out, stream);
 }
 
 }  // namespace gsb::cuda
