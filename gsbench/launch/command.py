@@ -30,7 +30,7 @@ from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
 
 NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{].*|''|\"\"|")  # values for Hydra
-QUESTIONS = ("--hydra-help", "--cfg", "-c", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
+QUESTIONS = ("--hydra-help", "--cfg", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def parse(words: Sequence[str]) -> Command:
     parser = argparse.ArgumentParser("python -m gsbench", add_help=False, allow_abbrev=False)
     parser.add_argument("-m", "--multirun", action="store_true")
     parser.add_argument("-cd", "--config-dir", type=Path)
-    options, others = parser.parse_known_args(words)
+    whole = ["--cfg" if word == "-c" else word for word in words]  # argparse takes -c for the beginning of -cd
+    options, others = parser.parse_known_args(whole)
     unknown = [word for word in others if word.startswith("-")]
     asks = any(word in QUESTIONS for word in unknown)
     if unknown and not asks:

@@ -216,7 +216,7 @@ def _read_views(
             images.decode_photo(data, shot.where)
         except images.DamagedError:
             before = replaced[image]
-            return _decode(before, images.read_image(before.path, str(before.path)), is_named=True)
+            return _decode(before, images.read_image(before.path, str(before.path)))
         raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
 
     loaded = shots.read(listed_shots, rendition, in_8_bits=rendition.downscale == 1, decode=decode)
@@ -224,12 +224,12 @@ def _read_views(
     return loaded.views, dict(zip(names, loaded.digests, strict=True))
 
 
-def _decode(image: _Image, data: bytes, *, is_named: bool = False) -> images.Pixels:
+def _decode(image: _Image, data: bytes) -> images.Pixels:
     """Decode an opaque image; if a training image is damaged, the error names the option that replaces it."""
     try:
         decoded = images.decode_photo(data, str(image.path))
     except images.DamagedError as error:
-        if image.camera == TEST_CAMERA or is_named:
+        if image.camera == TEST_CAMERA:
             raise
         advice = f"replace it by the frame before with data.repair=[{image.path.stem}]"
         raise images.DamagedError(f"{error}, or {advice}") from error

@@ -91,6 +91,11 @@ def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
         [compose_run(run) for run in runs_of(parse(words.split()))[0]]
 
 
+def test_a_question_is_left_to_hydra() -> None:
+    """Catches a question that is refused as an option, such as for the config of a run, and a run taken for one."""
+    assert [parse(["+exp=mini", *words]).asks for words in ([], ["--cfg", "job"], ["-c", "job"])] == [False, True, True]
+
+
 def test_scenes_of_the_user_are_choices() -> None:
     """Catches a retry or a job that cannot compose a scene without a file."""
     assert compose_run(["+exp=mini", "data.scenes=[new]", "scene=new"]).config.scene.name == "new"

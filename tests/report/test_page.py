@@ -20,6 +20,7 @@ from records import (
     HOSTILE,
     but,
     chapter,
+    elsewhere,
     every_row,
     frontier,
     hostile,
@@ -125,12 +126,17 @@ def test_every_colour_is_defined():
 
 
 def test_charts_hold_the_numbers_of_their_tables():
-    """Catches a figure of other numbers than those of its table, and infinity in its JSON."""
+    """Catches a figure of other numbers than those of its table, curves without the letters of events, a figure that
+    goes as one run lacks its cost, and infinity in its JSON."""
     drawn, of = charts_of(*frontier(**SMALL)), sections(*frontier(**SMALL))
     (rows,) = drawn["g0-frontier-0"]["datasets"].values()
     means = [row["psnr_db"] for row in rows if row["kind"] == "mean"]
     assert means == pytest.approx(of["frontier"].table.psnr_db.tolist(), rel=1e-4)
     assert {row["kind"] for row in rows} == {"mean", "run"}
+    (rows,) = drawn["g0-curves-0"]["datasets"].values()
+    assert any(row["letter"] for row in rows)
+    figures = {key for key in charts_of(*frontier(**SMALL), elsewhere(make(), "other")) if "frontier" in key}
+    assert figures == {key for key in drawn if "frontier" in key}
     (rows,) = charts_of(*three_lengths())["g0-frontier-0"]["datasets"].values()
     best = {(row["model"], row["variant"]) for row in rows if row["best"] is True and row["kind"] == "mean"}
     assert best == {("a", ""), ("a", "iterations=4"), ("b", ""), ("b", "iterations=9")}

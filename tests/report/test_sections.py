@@ -122,7 +122,8 @@ def test_all_comparisons_of_a_report_are_corrected_together():
 
 
 def test_an_effect_is_priced_from_published_models():
-    """Catches an effect that is priced from models nobody ran, or from another model than the published one."""
+    """Catches an effect that is priced from models nobody ran, or from another model than the published one, and one
+    that is said to be nested and is not."""
     published = with_effects("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
     section = sections(*published, *(but(r, model="3dgs_new") for r in with_effects("3dgs")))["effects"]
     priced = dict(zip(section.table.effect, section.table.dB, strict=True))
@@ -130,6 +131,9 @@ def test_an_effect_is_priced_from_published_models():
     expected |= {"AGR, with time and direction": 2.0, "time × direction": 2.0}
     assert priced == pytest.approx(expected)
     assert section.table["computed from"].iloc[-1] == "3dgs + 7dgs_noagr − 4dgs − 6dgs"
+    table = sections(*published, *(but(r, model="7dgs_nodir") for r in with_effects("4dgs")))["effects"].table
+    nested = table["computed from"][table.effect.str.endswith(", nested")]
+    assert nested.tolist() == ["7dgs_nodir − 3dgs", "7dgs_noagr − 7dgs_nodir"]
     for part in ("3 of 8 combinations", "3dgs_new"):
         assert any(part in note for note in section.notes)
 

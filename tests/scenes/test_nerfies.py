@@ -123,7 +123,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (edit(LEFT, lambda content: content.update(orientation=[[1, 0, 0]] * 3)), "orientation: .*rigid"),
     (lambda root: (root / LEFT).unlink(), "camera/left_000.json: expected a file"),
     (lambda root: (root / "rgb/2x/left_003.png").unlink(), "rgb/2x/left_003.png .*expected a file"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)

@@ -30,8 +30,10 @@ def test_the_numbers_of_the_sheet() -> None:
 def test_the_gradient() -> None:
     """Catches a gradient that lacks a row of pixels, a channel, or the identity."""
     generator = torch.Generator().manual_seed(0)
-    image, of_camera = (torch.rand(shape, generator=generator, dtype=torch.float64, requires_grad=True)
-                        for shape in ((1, 3, 4, 3), (4, 3)))  # fmt: skip
+    image, of_camera = (
+        torch.rand(shape, generator=generator, dtype=torch.float64, requires_grad=True)
+        for shape in ((1, 3, 4, 3), (4, 3))
+    )
     assert torch.autograd.gradcheck(in_colors_of, (image, of_camera))
 
 
