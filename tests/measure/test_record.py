@@ -145,6 +145,7 @@ def test_what_read_would_refuse_is_not_written(tmp_path, changes, word):
         (["curve"], [[i, i, 20] for i in range(100_000)], ["curve: expected array of length <= 10000"]),
         (["provenance", "versions", "python"], None, ["provenance.versions", "expected str, got null"]),
         (["model"], "\ud800", ["model", "Unicode"]),
+        (["per_view", 0, "name"], "\ud800", ["per_view[0].name", "Unicode"]),
         (["version"], 2, ["version", "expected 1"]),
         (["version"], True, ["version"]),
         (["version"], 1.0, ["version"]),

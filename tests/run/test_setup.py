@@ -75,13 +75,15 @@ def test_the_record_names_a_replaced_image(tmp_path: Path) -> None:
     folder = tmp_path / "Tiny"
     folder.mkdir()
     (folder / CAMERAS).write_text("\n".join([HEADER, *map(row, range(COUNT))]))
-    image = np.random.default_rng(0).integers(0, 256, (12, 12, 3), np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (12, 14, 3), np.uint8)
     for frame in (3, 4):
         for camera in range(COUNT):
             assert cv2.imwrite(str(folder / f"Tiny_undist_{frame:05d}_{camera:02d}.png"), image)
     words = ["+exp=technicolor", "model=3dgs", "scene=custom", "scene.name=Tiny", "data.initial_points=20"]
     words += ["train.iterations=1", "protocol.pictures=0", f"data.root={tmp_path}", f"results={tmp_path}"]
-    assert "repaired" not in run_here(*words)[0].protocol
+    protocol = run_here(*words)[0].protocol
+    assert "repaired" not in protocol
+    assert protocol["resolution"] == "14x12"
     damage(folder, "Tiny_undist_00004_09")
     assert "data.repair=[Tiny_undist_00004_09]" in (run_here(*words)[0].reason or "")
     record, results = run_here(*words, "data.repair=[Tiny_undist_00004_09]")
