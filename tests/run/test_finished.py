@@ -8,12 +8,14 @@ from typing import Any
 
 import pytest
 import torch
+from report.records import lost, make
 from tiny_run import overrides, run_here
 
 from gsbench.errors import InputError
 from gsbench.measure import perceptual, provenance
 from gsbench.measure import record as files
 from gsbench.measure.record import Record
+from gsbench.run import execution
 from gsbench.train import checkpoint
 from gsbench.train.loop import Trainer
 
@@ -176,3 +178,11 @@ def test_weights_that_are_named_must_exist(tmp_path: Path) -> None:
     """Catches a file that is named and missing, in whose place another is loaded."""
     with pytest.raises(InputError):
         perceptual.load("vgg", tmp_path / "gone.pth")
+
+
+def test_a_run_that_ends_well_at_last_leaves_its_record_alone(tmp_path: Path) -> None:
+    """Catches the record of an earlier success that stays beside a later one."""
+    folder = tmp_path / "run"
+    for each, count in ((make(), 1), (lost(make()), 2), (lost(make()), 2), (make(), 1)):
+        execution.write(each, folder)
+        assert len([*folder.iterdir()]) == count

@@ -208,6 +208,7 @@ def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
     depth = points.means @ cameras[0].viewmat[2, :3] + cameras[0].viewmat[2, 3]  # all cameras look along z
     assert depth.min() >= 2 * scene.extent - 1e-4
     assert depth.quantile(0.9) > 5 * scene.extent
+    assert 20 * scene.extent < depth.max() <= 100 * scene.extent + 1e-3
 
 
 @pytest.mark.skipif(not PLAYROOM.is_dir(), reason="../shared/data/scenes/playroom is not here")
