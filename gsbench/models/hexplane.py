@@ -49,7 +49,7 @@ class HexPlaneModel(Gaussians3DModel):
         channels: int = 32,  # numbers in a node of a plane
         levels: int = 2,  # sets of six planes; each has twice the nodes along x, y and z of the set before
         resolution: int = 64,  # nodes along x, y and z in the first level
-        time_resolution: int = 50,  # nodes along t in every level
+        time_resolution: int = 25,  # nodes along t in every level
         width: int = 64,  # of the hidden layers
         appearance: bool = False,  # whether the field also changes opacities and colours
         space_smoothness: float = 1e-4,  # weights in the loss, see `Planes.penalty`
