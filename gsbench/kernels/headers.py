@@ -1,8 +1,9 @@
-"""Read constants from the C++ headers of the kernels, so that C++ and Python use the same values."""
+"""Read constants and arguments from the C++ headers of the kernels, so that C++ and Python use the same."""
 
 import re
 from importlib import resources
 
+_ARGUMENTS = ("arguments.h", "arguments_moving.h", "cpu/kernels.h", "cuda/kernels.h")
 _LINE = re.compile(r"^constexpr (int|float|double) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)?;", re.MULTILINE)
 
 
@@ -14,6 +15,14 @@ def _constants(header: str, *kinds: str) -> dict[str, float]:
         for type_, name, value, divisor in _LINE.findall(text)
         if type_ in kinds
     }
+
+
+def argument_structures() -> set[tuple[str, str]]:
+    """Return the role and the field names, such as ("OUTPUTS", "means, factors"), of each structure of arguments."""
+    folder = resources.files("gsbench.kernels")
+    text = "".join(folder.joinpath(header).read_text() for header in _ARGUMENTS)
+    declared = re.findall(r"^GSB_FIELDS\(\w+, (\w+), ([^)]*)\)", text, re.MULTILINE)
+    return {(role, ", ".join(re.findall(r"\w+", names))) for role, names in declared}
 
 
 _thresholds = _constants("math/thresholds.h", "float", "double")

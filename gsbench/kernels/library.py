@@ -11,6 +11,7 @@ from torch import Tensor
 from gsbench import kernels
 from gsbench.errors import InputError
 from gsbench.kernels import cuda, recording
+from gsbench.kernels.headers import argument_structures
 
 # The prefix of a kernel argument's name, by the role of its C++ structure (kernels/arguments.h).
 _PREFIX = {"INPUTS": "", "OUTPUTS": "out.", "GIVEN": "given.", "GRADS": "grad."}
@@ -24,7 +25,17 @@ class Library:
     needs_scratch = False  # whether torch must provide scratch memory; the kernels of the CPU allocate their own
 
     def __init__(self, extension: ModuleType) -> None:
-        """Store the compiled extension and read the argument names of its kernels."""
+        """Store the compiled extension and read the argument names of its kernels.
+
+        Raises:
+            InputError: a kernel has other arguments than its source; it would ignore what it does not know.
+        """
+        declared = argument_structures()
+        for name, signature in extension.SIGNATURES.items():
+            if not declared.issuperset(signature):
+                raise InputError(
+                    f"the compiled kernel {name} is not of this source: run `make setup` to build it again"
+                )
         self.extension = extension
         self._fields = {name: _fields(signature) for name, signature in extension.SIGNATURES.items()}
 

@@ -7,6 +7,7 @@ tested without being listed. Where plain numbers give no gradient, `VALUES` has 
 import importlib
 import pkgutil
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -16,7 +17,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsbench import kernels
 from gsbench.errors import InputError
-from gsbench.kernels.library import library_of
+from gsbench.kernels.library import Library, library_of
 from gsbench.kernels.operation import EVERY_ROW, MOST_KNOWN, Gradient, Operation, sizes_of
 from gsbench.kernels.raster import count_tiles
 from gsbench.kernels.slices import slice_static
@@ -299,6 +300,13 @@ def test_every_kernel_is_declared() -> None:
     without_gradient = {"adam_all", "flag_values", "flag_arrays", "exact_splats", "exact_image"}
     without_gradient |= {"count_tiles", "fill_tiles"}
     assert {name.removesuffix("_backward") for name in kernels.native().SIGNATURES} == called | without_gradient
+
+
+def test_kernels_of_another_source_are_refused() -> None:
+    """Catches a build older than its source: its kernels would ignore arguments that they do not know."""
+    older = dict(kernels.native().SIGNATURES) | {"slice_free_time": (("INPUTS", "N, threads"),)}
+    with pytest.raises(InputError, match="slice_free_time is not of this source"):
+        Library(SimpleNamespace(SIGNATURES=older))
 
 
 def test_a_message_says_what_was_expected_and_what_came() -> None:
