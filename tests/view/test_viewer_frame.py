@@ -146,10 +146,10 @@ def test_a_kernels_time_is_its_stages(
     """Catches time that counts for another stage, or for none."""
     run, slow = Library._run, 0.02
 
-    def run_slowly(library: Library, name: str, *values: object) -> None:
+    def run_slowly(library: Library, device: torch.device, name: str, *values: object) -> None:
         if name == kernel:
             time.sleep(slow)
-        run(library, name, *values)
+        run(library, device, name, *values)
 
     monkeypatch.setattr(Library, "_run", run_slowly)
     (cost,) = agr.render(camera_of(0.5, agr), NOW).costs
