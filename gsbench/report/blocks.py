@@ -17,7 +17,6 @@ from gsbench.report.sections.effects import is_single
 from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
-RIVALS = ["dgs", "dbs", "ubs", "freetime", "freetime_plus", "sharptime", "stg", "hexplane", "deformable_narrow"]
 MOVING = ["monocular", "rig", "array"]
 DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the study dnerf100
 KINDS = {
@@ -291,7 +290,8 @@ def dnerf100_rivals(published: Path) -> str:
         "gaussians": Column("Gaussians", 0),
     }
     table = runs.groupby(["model", "scene"])[list(columns)].mean().groupby("model").mean()
-    table = table.loc[["4dgs", "7dgs", "auto", *RIVALS]].sort_values("psnr_db", ascending=False)
+    models = ["4dgs", "7dgs", "auto", *paper_tables.SUCCESSORS, *paper_tables.RIVALS]
+    table = table[table.index.isin(models)].sort_values("psnr_db", ascending=False)
     return block(table, **columns)
 
 
