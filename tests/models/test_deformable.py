@@ -191,11 +191,12 @@ def test_clones_and_children_are_canonical_and_share_the_field() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_training_has_the_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a repetition of a recorded step whose products use all threads, which is only felt with one view."""
+@pytest.mark.parametrize("model", ["deformable", "hexplane"])
+def test_a_field_trains_to_the_same_bits_for_any_number_of_threads(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a repetition of a recorded step, or a penalty, that uses all threads, only felt with one view."""
     monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
     ends = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        ends.append(without_times(train(trainer("deformable", "train.batch_size=1")).state_dict()))
+        ends.append(without_times(train(trainer(model, "train.batch_size=1")).state_dict()))
     assert_same_bits(*ends)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes, assert_same_bits
+from interrupted import assert_resumes
 from small import CAMERA, fresh, lively, raw, same, seeded
 from tiny_training import train, trainer
 from torch import Tensor
@@ -18,7 +18,6 @@ from gsbench.models.factors import sizes
 from gsbench.models.hexplane import Network, Planes
 from gsbench.models.render import render
 from gsbench.schedule import ActiveComponents
-from gsbench.train.checkpoint import without_times
 from gsbench.view.slice_ply import harmonics_at
 
 FULL = ActiveComponents(3, False, False)
@@ -245,14 +244,3 @@ def test_clones_and_children_are_canonical_and_share_the_field() -> None:
     assert same(raw(model), raw(plain))
     after = model.state_dict()
     assert all(torch.equal(x, after[name]) for name, x in before.items() if not name.startswith("splats."))
-
-
-@pytest.mark.usefixtures("threads")
-def test_a_training_has_the_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a repetition of a recorded step, or a penalty, whose sums use all threads."""
-    monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
-    ends = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        ends.append(without_times(train(trainer("hexplane", "train.batch_size=1")).state_dict()))
-    assert_same_bits(*ends)
