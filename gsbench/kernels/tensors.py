@@ -31,6 +31,12 @@ def check_number(x: object, name: str, low: float = -LARGEST, high: float = LARG
         raise InputError(f"{name}: expected a number in [{low:g}, {high:g}], got {x!r:.80}")
 
 
+def check_whole(x: object, name: str, low: int, high: int) -> None:
+    """Raise InputError unless `x` is a whole number from `low` to `high`; the message contains `name`."""
+    if isinstance(x, bool) or not isinstance(x, int) or not low <= x <= high:
+        raise InputError(f"{name}: expected {low}, {low + 1}, .., {high}, got {x!r:.80}")
+
+
 def check_positive(x: object, name: str) -> None:
     """Raise InputError unless `x` is a positive finite number; the message contains `name`."""
     if not isinstance(x, int | float) or not 0 < x < math.inf:

@@ -6,6 +6,8 @@ neural refinement).
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -16,13 +18,13 @@ from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.operation import Operation
-from gsbench.kernels.tensors import check_positive
+from gsbench.kernels.tensors import check_positive, check_whole
 from gsbench.models.appearance import ColorOrder, sh_colors
 from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.effect_sets import NAMES, EffectSets
 from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
 from gsbench.models.portable_math import exp, log, sqrt
-from gsbench.models.refinement import OCTAVES, Refinement
+from gsbench.models.refinement import OCTAVES, Changes, DeepRefinement, Refinement
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
 from gsbench.scenes.scene import Points
@@ -59,6 +61,9 @@ class GaussianModel(nn.Module, ABC):
         *,
         agr: bool = False,  # whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time
         agr_octaves: int = OCTAVES,  # frequencies of AGR's time encoding
+        agr_depth: int | None = None,  # of one deeper network in the place of AGR's; None: AGR as published
+        agr_width: int = 64,  # of that network
+        agr_mean_octaves: int = 0,  # of its encoding of means
         sh_degree: int = 3,  # of the colours, 0 to 3
         backend: Backend = AUTO,  # the implementation that computes conditional 3D Gaussians, colours and AGR
     ) -> None:
@@ -68,9 +73,16 @@ class GaussianModel(nn.Module, ABC):
             raise InputError(f"sh_degree: expected 0, 1, 2 or 3, got {sh_degree}")
         self.splats = nn.ParameterDict()
         self.log_lambda = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
-        self.refinement: Refinement | None = None
-        if not isinstance(agr_octaves, int) or not 0 <= agr_octaves <= 32:
-            raise InputError(f"agr_octaves: expected 0, 1, .., 32, got {agr_octaves}")
+        self.refinement: Changes | None = None
+        check_whole(agr_octaves, "agr_octaves", 0, 32)
+        check_whole(agr_width, "agr_width", 1, 4096)
+        check_whole(agr_mean_octaves, "agr_mean_octaves", 0, 32)
+        self.new_refinement: Callable[..., Changes] = Refinement
+        if agr_depth is not None:
+            check_whole(agr_depth, "agr_depth", 1, 64)
+            self.new_refinement = partial(
+                DeepRefinement, width=agr_width, depth=agr_depth, mean_octaves=agr_mean_octaves
+            )
         self.agr = agr
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree
@@ -238,7 +250,7 @@ class GaussianModel(nn.Module, ABC):
             outputs = [*(widths[name] for name in self.centers), sum(widths[name] for name in self.geometry)]
             size = size_of(points)
             units = torch.cat([torch.full((n,), size if name in self.lengths else 1.0) for name, n in widths.items()])
-            self.refinement = Refinement(outputs, generator, self.agr_octaves, units)
+            self.refinement = self.new_refinement(outputs, generator, octaves=self.agr_octaves, units=units)
         self.set_active(self.active)
 
     @torch.no_grad()

@@ -4,7 +4,6 @@ Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene 
 arXiv 2309.13101, with the constants of the authors' code.
 """
 
-import math
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,13 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.tape import collect_gradients
-from gsbench.kernels.tensors import check_number
+from gsbench.kernels.tensors import check_whole
 from gsbench.models.base import Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.factors import rotation, sizes
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.portable_math import cos, linear, sin
+from gsbench.models.networks import HiddenLayers, Linear, encode
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
@@ -54,10 +53,10 @@ class DeformableModel(Gaussians3DModel):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        check_number(width, "width", 1, 4096)
-        check_number(depth, "depth", 1, 64)
-        check_number(octaves, "octaves", 0, 32)
-        check_number(time_octaves, "time_octaves", 0, 32)
+        check_whole(width, "width", 1, 4096)
+        check_whole(depth, "depth", 1, 64)
+        check_whole(octaves, "octaves", 0, 32)
+        check_whole(time_octaves, "time_octaves", 0, 32)
         self.new_field = partial(DeformationField, width, depth, octaves, time_octaves, time_network)
 
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
@@ -79,11 +78,11 @@ class DeformableModel(Gaussians3DModel):
 
 
 class DeformationField(nn.Module):
-    """The network phi of Deformable-3DGS (section 3.2), with ReLU after each hidden layer.
+    """The network phi of Deformable-3DGS (section 3.2).
 
     Its input is the encoded position and features of the time: those of a network of two layers, or the encoded time.
-    Hidden layer depth // 2 + 1, counted from 0, reads the input once more, beside the layer before it. Positions are
-    in world units, as the authors have them: gsbench brings scenes to the size of D-NeRF's when it loads them.
+    Positions are in world units, as the authors have them: gsbench brings scenes to the size of D-NeRF's when it loads
+    them.
     """
 
     def __init__(
@@ -97,10 +96,7 @@ class DeformationField(nn.Module):
             first, last = Linear(features, width, generator, relu=True), Linear(width, TIME_FEATURES, generator)
             self.of_time, features = nn.Sequential(first, last), TIME_FEATURES
         inputs = 3 * (1 + 2 * octaves) + features
-        self.rereads = depth // 2 + 1
-        widths = [inputs, *[width] * (depth - 1)]
-        widths = [n + inputs if i == self.rereads else n for i, n in enumerate(widths)]
-        self.layers = nn.ModuleList(Linear(n, width, generator, relu=True) for n in widths)
+        self.hidden = HiddenLayers(inputs, width, depth, generator)
         self.head = Linear(width, 3 + 3 + 4, generator)
 
     def forward(
@@ -111,28 +107,4 @@ class DeformationField(nn.Module):
         """Return shifts of means [N, 3], changes of scales [N, 3] (both world units) and of unit quaternions [N, 4]."""
         features = self.of_time(encode(time.reshape(1, 1), self.time_octaves))
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
-        hidden = inputs
-        for i, layer in enumerate(self.layers):
-            hidden = layer(torch.cat([inputs, hidden], -1) if i == self.rereads else hidden)
-        return collect_gradients(self.head(hidden)).split([3, 3, 4], -1)
-
-
-def encode(x: Tensor, octaves: int) -> Tensor:
-    """Return [x, sin x, cos x, sin 2x, cos 2x, .. cos 2^(octaves-1) x], [N, C] -> [N, C (1 + 2 octaves)]."""
-    angles = x[:, None] * 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)[:, None]  # [N, octaves, C]
-    return torch.cat([x, torch.stack([sin(angles), cos(angles)], 2).flatten(1)], -1)
-
-
-class Linear(nn.Module):
-    """A layer W x + b, with ReLU or without, whose weights start as those of torch.nn.Linear, drawn from the seed."""
-
-    def __init__(self, inputs: int, outputs: int, generator: torch.Generator, *, relu: bool = False) -> None:
-        super().__init__()
-        self.relu = relu
-        bound = 1 / math.sqrt(inputs)
-        self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator))
-        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound, generator=generator))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Apply the layer to [N, inputs]."""
-        return linear(x, self.weight, self.bias, relu=self.relu)
+        return collect_gradients(self.head(self.hidden(inputs))).split([3, 3, 4], -1)

@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.tape import collect_gradients
-from gsbench.kernels.tensors import check_number
+from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.deformable import Linear
 from gsbench.models.gaussians3d import Gaussians3DModel
+from gsbench.models.networks import Linear
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
@@ -58,11 +58,11 @@ class HexPlaneModel(Gaussians3DModel):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        check_number(channels, "channels", 1, 1024)
-        check_number(levels, "levels", 1, 8)
-        check_number(resolution, "resolution", 3, 1024)
-        check_number(time_resolution, "time_resolution", 3, 4096)
-        check_number(width, "width", 1, 4096)
+        check_whole(channels, "channels", 1, 1024)
+        check_whole(levels, "levels", 1, 8)
+        check_whole(resolution, "resolution", 3, 1024)
+        check_whole(time_resolution, "time_resolution", 3, 4096)
+        check_whole(width, "width", 1, 4096)
         check_number(space_smoothness, "space_smoothness", 0)
         check_number(time_smoothness, "time_smoothness", 0)
         check_number(time_sparsity, "time_sparsity", 0)

@@ -1,7 +1,11 @@
-"""Change the parameters of Gaussians over time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3)."""
+"""Change the parameters of Gaussians over time by AGR, the adaptive Gaussian refinement of 7DGS (section 4.3).
+
+A deeper network can take its place, to compare networks over Gaussians of any number of dimensions.
+"""
 
 import functools
 import math
+from abc import ABC, abstractmethod
 
 import torch
 import torch.nn.functional as F
@@ -9,6 +13,8 @@ from torch import Tensor, nn
 
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
+from gsbench.kernels.tape import collect_gradients
+from gsbench.models.networks import HiddenLayers, Linear, encode
 from gsbench.models.portable_math import cos, sin
 
 OCTAVES = 10  # K of the time encoding in the 7DGS paper
@@ -26,7 +32,37 @@ def _frequencies(octaves: int, device: torch.device, dtype: torch.dtype) -> Tens
     return math.pi * 2.0 ** torch.arange(octaves, device=device, dtype=dtype)
 
 
-class Refinement(nn.Module):
+class Changes(nn.Module, ABC):
+    """The base class of networks that add to raw parameters of Gaussians, as AGR does."""
+
+    @abstractmethod
+    def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
+        """Return what the network adds at a time to each of the raw parameters [N, c]."""
+
+    def forward(
+        self,
+        values: list[
+            Tensor
+        ],  # raw parameters [N, c]: first the means, which are the input, then those of the covariance
+        time: Tensor,  # [] in [0, 1]
+        *,
+        by_kernel: bool = False,  # whether the backend's kernel (float32) may compute it
+        rows: int | None = None,  # only the first `rows` Gaussians change; None: all
+        intervals: Tensor
+        | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
+    ) -> list[Tensor]:
+        """Return the raw parameters plus the outputs of the networks at a time."""
+        if rows is not None:
+            resting = [x[:rows] for x in values]
+            moved = Changes.forward(self, resting, time)
+            if intervals is not None:
+                awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
+                moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
+            return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
+        return [x + added for x, added in zip(values, self.added(values, time), strict=True)]
+
+
+class Refinement(Changes):
     """The networks of AGR, the adaptive Gaussian refinement (7DGS, eq. 14 and 15).
 
     Each network has one hidden layer of 64 units. Its input is the means of a Gaussian and an encoding of the time, its
@@ -61,38 +97,30 @@ class Refinement(nn.Module):
 
     def forward(
         self,
-        values: list[
-            Tensor
-        ],  # raw parameters [N, c]: first the means, which are the input, then those of the covariance
-        time: Tensor,  # [] in [0, 1]
+        values: list[Tensor],
+        time: Tensor,
         *,
-        by_kernel: bool = False,  # whether the backend's kernel (float32) computes it, which stores no hidden layer
-        rows: int | None = None,  # only the first `rows` Gaussians change; None: all
-        intervals: Tensor
-        | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
+        by_kernel: bool = False,
+        rows: int | None = None,
+        intervals: Tensor | None = None,
     ) -> list[Tensor]:
-        """Return the raw parameters plus the outputs of AGR's networks at a time."""
-        if by_kernel:
-            gamma = encode_time(time, self.octaves)
-            return refine(
-                values,
-                self.weight_in,
-                self.bias_in,
-                self.weight_out,
-                self.bias_out,
-                self.units,
-                gamma,
-                rows=rows,
-                intervals=intervals,
-                time=None if intervals is None else time,
-            )
-        if rows is not None:
-            resting = [x[:rows] for x in values]
-            moved = self(resting, time)
-            if intervals is not None:
-                awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
-                moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
-            return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
+        """Return the raw parameters plus the outputs; the kernel of AGR stores no hidden layer."""
+        if not by_kernel:
+            return super().forward(values, time, rows=rows, intervals=intervals)
+        return refine(
+            values,
+            self.weight_in,
+            self.bias_in,
+            self.weight_out,
+            self.bias_out,
+            self.units,
+            encode_time(time, self.octaves),
+            rows=rows,
+            intervals=intervals,
+            time=None if intervals is None else time,
+        )
+
+    def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
         # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         weights_out = (self.weight_out * self.units[:, None]).split(self.widths)
@@ -100,9 +128,49 @@ class Refinement(nn.Module):
         features = torch.cat(values[: len(self.widths) - 1], -1)
         hidden = torch.relu(F.linear(features, weight_in, bias_in)).split(HIDDEN, -1)
         layers = zip(hidden, weights_out, biases_out, strict=True)
-        residuals = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1).split([x.shape[-1] for x in values], -1)
-        return [x + residual for x, residual in zip(values, residuals, strict=True)]
+        outputs = torch.cat([F.linear(h, w, b) for h, w, b in layers], -1)
+        return list(outputs.split([x.shape[-1] for x in values], -1))
 
     def at_time(self, time: Tensor) -> Tensor:
         """Return the contribution of the encoded time to the hidden layer, a vector that all Gaussians share."""
         return F.linear(encode_time(time, self.octaves), self.weight_in[:, self.features :], self.bias_in)
+
+
+class DeepRefinement(Changes):
+    """One network for all parameters in the place of AGR's, with any number of hidden layers and ReLU after each.
+
+    It has what distinguishes the field of Deformable-3DGS from AGR: depth, width, and means that are encoded,
+    [x, sin x, cos x, .. cos 2^(octaves-1) x], with the input once more in the middle, and without a gradient to the
+    means that it reads. Its output layer starts at zero, as AGR's.
+    """
+
+    units: Tensor  # [sum of outputs]
+
+    def __init__(
+        self,
+        outputs: list[int],  # of each mean, and the last for the covariance
+        generator: torch.Generator,
+        *,
+        width: int,  # of the hidden layers
+        depth: int,  # the number of hidden layers
+        octaves: int,  # of the encoding of times
+        mean_octaves: int,  # of the encoding of means; 0: they are read as they are
+        units: Tensor,  # [sum of outputs] the sizes of inputs and outputs in this scene
+    ) -> None:
+        super().__init__()
+        self.inputs, self.octaves, self.mean_octaves = len(outputs) - 1, octaves, mean_octaves
+        self.register_buffer("units", units)
+        inputs = sum(outputs[:-1]) * (1 + 2 * mean_octaves) + 2 * octaves
+        self.hidden = HiddenLayers(inputs, width, depth, generator)
+        self.head = Linear(width, sum(outputs), generator)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
+        means = torch.cat(values[: self.inputs], -1).detach()
+        means = means / self.units[: means.shape[-1]]
+        gamma = encode_time(time, self.octaves)
+        inputs = torch.cat([encode(means, self.mean_octaves), gamma.expand(len(means), -1)], -1)
+        return list(
+            (collect_gradients(self.head(self.hidden(inputs))) * self.units).split([x.shape[-1] for x in values], -1)
+        )

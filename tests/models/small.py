@@ -4,13 +4,14 @@ import inspect
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsbench.models import CameraTime, GaussianModel, build, registry
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import has_gates
 from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
+from gsbench.models.refinement import Changes, DeepRefinement
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
 
@@ -25,9 +26,11 @@ MODELS: dict[str, dict[str, Any]] = {
     "7dgs_nodir": {"lambda_t": 0.5},
 }
 CHOLESKY = ("6dgs", "7dgs", "7dgs_nodir")
+DEEP = {"agr": True, "agr_depth": 4, "agr_width": 6, "agr_mean_octaves": 2}  # its last hidden layer reads the input
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     **{name: (name, options) for name, options in MODELS.items()},
     **{f"{name}_agr": (name, options | {"agr": True}) for name, options in MODELS.items()},
+    **{f"{name}_deep_agr": (name, MODELS[name] | DEEP) for name in ("3dgs", "7dgs")},
     "4dgs_constant_colors": ("4dgs", {"time_degree": 0}),
     **{f"{name}_paper": (name, MODELS[name] | {"factor_order": "paper"}) for name in CHOLESKY},
     **{
@@ -74,6 +77,13 @@ def started(model: GaussianModel, count: int = N, seed: int = 0) -> GaussianMode
     return model
 
 
+def last_layer(refinement: Changes) -> tuple[nn.Parameter, nn.Parameter]:
+    """Weights and biases of the last layer of AGR or of a network in its place."""
+    if isinstance(refinement, DeepRefinement):
+        return refinement.head.weight, refinement.head.bias
+    return refinement.weight_out, refinement.bias_out
+
+
 def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
     """The model in float64, with every raw parameter moved and networks that say something."""
     model, g = model.double(), seeded(seed + 1)
@@ -81,7 +91,7 @@ def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
         for parameter in model.splats.values():
             parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
         if model.refinement is not None:
-            for parameter in (model.refinement.weight_out, model.refinement.bias_out):
+            for parameter in last_layer(model.refinement):
                 parameter += 0.05 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)
         for name, parameter in model.named_parameters():
             if name.partition(".")[0] not in ("splats", "refinement", "log_lambda"):  # of a field

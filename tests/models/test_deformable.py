@@ -56,7 +56,7 @@ def test_the_field() -> None:
     """Catches a layer that is lost or applied twice, a second input at another layer or in another order, a lost or
     further ReLU, and outputs in another order."""
     field = DeformationField(16, 8, 10, 6, True, seeded(0)).double()
-    numbered = dict(enumerate(field.layers)) | {20: field.of_time[0], 21: field.of_time[1]}
+    numbered = dict(enumerate(field.hidden.layers)) | {20: field.of_time[0], 21: field.of_time[1]}
     for number, layer in numbered.items():
         for parameter, values in zip((layer.weight, layer.bias), weights_of(number, *layer.weight.shape), strict=True):
             parameter.data.copy_(values)  # of equal shape

@@ -23,6 +23,7 @@ from small import (
     covariances,
     fresh,
     halves,
+    last_layer,
     lively,
     moved,
     options_of,
@@ -41,6 +42,7 @@ from gsbench.models.beta import BetaModel
 from gsbench.models.camera_time import unit
 from gsbench.models.gated import as_gated, has_gates
 from gsbench.models.gaussian_batch import reach, tensors_of
+from gsbench.models.refinement import DeepRefinement
 from gsbench.models.simplifications import simplifications_of
 from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.scenes.points import SH_C0, nearest_distances
@@ -307,6 +309,7 @@ def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
         model.set_active(ActiveComponents(degree, False, True))
         held = {"means"}
     held |= {"means"} if "field" in model.groups() else set()  # the positions that a field reads,
+    held |= set(model.centers) if isinstance(model.refinement, DeepRefinement) else set()
     if "path" in model.splats:  # and the times of a path, which AGR moves by the means
         held = {"means", "times"} if model.agr else {"times"}
     splats, names = raw(model), sorted(set(model.splats) - held)
@@ -359,7 +362,7 @@ def test_agr_moves_what_it_should(variant: str) -> None:
     assert not any(torch.equal(after[k], before[k]) for k in names)
     for untouched in set(before) - set(names):
         assert torch.equal(after[untouched], before[untouched])
-    for p in (model.refinement.weight_out, model.refinement.bias_out):
+    for p in last_layer(model.refinement):
         p.data.zero_()
     on = tensors_of(model.slice(QUERY))
     model.set_active(replace(model.active, refine=False))
@@ -376,7 +379,7 @@ def test_what_is_off_does_not_learn(variant: str) -> None:
         model.set_active(ActiveComponents(3, refine, tune))
         model.zero_grad(set_to_none=True)
         sum(x.square().sum() for x in tensors_of(model.slice(QUERY))).backward()
-        learnt = model.refinement.weight_out.grad
+        learnt = last_layer(model.refinement)[0].grad
         assert (learnt is not None and learnt.any(1).all().item()) == refine
         assert all((p.grad is not None and p.grad.any().item()) == tune for p in model.log_lambda.parameters())
     for p in model.log_lambda.parameters():
