@@ -1,6 +1,7 @@
 """Scores of other programs' renders: those of gsbench's own runs give its own numbers, and wrong files are refused."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,7 +13,8 @@ from gsbench.measure import record as files
 from gsbench.measure.record import Record
 from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
-from gsbench.score import main, of_other_papers
+from gsbench.scenes import Camera, View
+from gsbench.score import main, of_other_papers, other_metrics
 
 VIEWS = ("r_0", "r_1")  # of the split test
 SIZE = 16
@@ -122,6 +124,21 @@ def test_the_ssim_of_other_papers():
         "dssim2": 0.02579413,
     }
     assert {name: values[name] for name in expected} == pytest.approx(expected, abs=1e-8)
+
+
+def test_flow_is_that_of_whole_films():
+    """Catches frames that a film loses, views of no film, and the sum of films: one of two renders stands still."""
+    texture = torch.rand(1, 1, 96, 160, generator=torch.Generator().manual_seed(0)).mul(255).int().float()
+    wide = (torch.nn.functional.avg_pool2d(texture, 9, 1, 4)[0, 0] * 3 - 256).clamp(0, 255) / 255
+    cameras = [Camera(torch.eye(4) * (1 + x), torch.eye(3), 128, 96) for x in range(3)]
+    places = [(0, t) for t in range(6)] + [(1, t) for t in range(6)] + [(2, 0)]  # camera and frame
+    frames = [wide[:, t : t + 128, None].expand(-1, -1, 3) for _, t in places]
+    views = [View(f"{c}/{t}", cameras[c], t / 5, image) for (c, t), image in zip(places, frames, strict=True)]
+    shown = [frames[0] if camera else image for (camera, _), image in zip(places, frames, strict=True)]
+    means = other_metrics(views, SimpleNamespace(images=lambda: shown))
+    padded = [of_other_papers(*pair)["ssim_padded"] for pair in zip(shown, frames, strict=True)]
+    assert means["tof_farneback"] == pytest.approx(0.5, abs=0.1)
+    assert means["ssim_padded"] == pytest.approx(np.mean(padded))
 
 
 def test_colours_are_corrected_by_the_best_affine_map():

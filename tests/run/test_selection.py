@@ -17,7 +17,7 @@ from tiny_training import compose, moving_square
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, Candidate, Record, TimeScreen
 from gsbench.report.sections.curves import events
-from gsbench.run import load, log, selection
+from gsbench.run import load, log, progress, selection
 from gsbench.run.identity import RunSpec
 from gsbench.run.selection import FOLDER, choose_model, length_name, lengths
 from gsbench.run.settings import candidates, label_of
@@ -37,6 +37,7 @@ class Choice(NamedTuple):
     compared_after: int  # iterations of the best
     iterations: int  # of the best in the end
     steps: int  # of all trainings together
+    planned: int  # steps, before any is known to be the best
     saves: dict[str, int]  # after which a run is killed
     failing: tuple[str, str]  # a candidate that diverges, and one that loses all Gaussians
     then: str  # the best of the others
@@ -55,6 +56,7 @@ MODELS = Choice(
     21,
     30,
     3 * 21 + 30,
+    3 * 21 + 30,
     {"midway": 17, "chosen": 4 * 21 + 1},
     failing=("4dgs", "6dgs"),
     then="7dgs_noagr",
@@ -67,6 +69,7 @@ LENGTHS = Choice(
     20,
     20,
     10 + 20 + 40,
+    10 + 20 + 40 + 80,
     {"midway": 7, "chosen": 71},
     failing=("iterations=10", "iterations=40"),
     then="iterations=20",
@@ -175,12 +178,19 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
     choice: Choice, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a second call that trains, a record that loses the choice when images are measured again, and a tracker
-    that lacks the steps before the choice."""
+    that lacks the steps before the choice, and a progress that starts over with each candidate."""
     words, tracker = overrides(square, tmp_path, *choice.words, "log=json"), MagicMock()
+    reports: list[progress.Progress] = []
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(progress, "write", lambda _, each: reports.append(each))
     monkeypatch.setitem(log.TRACKERS, "json", tracker)
     record, folder = run_here(*words)
     sent = [step for (step, _), _ in tracker().add.call_args_list]
     assert sent == [*(point.iteration for point in record.curve), choice.iterations]
+    trainings = [(each.step, each.seconds) for each in reports if each.seconds and each.steps == choice.planned]
+    assert trainings[-1][0] == choice.steps
+    assert all(list(values) == sorted(values) for values in zip(*trainings, strict=True))
+    assert reports[-1].step == reports[-1].steps
     name = choice.best.removeprefix("iterations=")
     assert re.search(rf"{name} (iterations is kept|is trained to the end)", capsys.readouterr().err)
     monkeypatch.setattr(Trainer, "train_step", lambda _: pytest.fail("trained again"))

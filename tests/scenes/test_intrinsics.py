@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_scene import check_message, edit, write_images
+from tiny_scene import check_message, edit, write_image, write_images
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -108,6 +108,10 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
     )
     assert capsys.readouterr().err == f"tiny: {scene.notes[0]}\n"
     assert numbers(scenes.load(tiny, downscale=2).train[0]) == pytest.approx([value / 2 for value in expected])
+    edit(tiny, lambda content: content.update(h=13))
+    write_image(tiny / "train/r_1.png", np.zeros((7, 8, 3), np.uint8))  # each fits 17 x 13
+    with pytest.raises(InputError, match="expected 8x6 as the first image, got 8x7"):
+        scenes.load(tiny)
 
 
 @pytest.mark.parametrize(

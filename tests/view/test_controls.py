@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from viser import ClientHandle
 from visitor import CAMERA, Visitor, free_port, packed, until, update, visit
 
 from gsbench import kernels
@@ -189,14 +190,16 @@ def test_everything_is_brought_back(page: Visitor) -> None:
     assert page.controls.layout == SIDE
 
 
-def test_the_image_is_saved_as_it_is_shown(page: Visitor, viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a file of another size or of other colours, one without a name, and two for a double click."""
-    page.set("show", WIPE)
+def test_the_image_is_saved_as_it_is_shown(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a file of another size or of other colours, one without a name, two for a double click, and one that
+    nobody asked for, as the page opens."""
     files: list[tuple[str, bytes]] = []
-    monkeypatch.setattr(page.browser.client, "send_file_download", lambda name, data, **_: files.append((name, data)))
-    shown = page.set("save image", True)
-    page.connection.send(update(page.control("save image"), True))
-    page.look(image_height=70)
+    monkeypatch.setattr(ClientHandle, "send_file_download", lambda _, name, data, **__: files.append((name, data)))
+    with visit(viewer) as page:
+        page.set("show", WIPE)
+        shown = page.set("save image", True)
+        page.connection.send(update(page.control("save image"), True))
+        page.look(image_height=70)
     ((name, data),) = files
     assert name == f"square {' '.join(model.name for model in viewer.renderers)}.png"
     assert same(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], shown)
