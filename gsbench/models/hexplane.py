@@ -4,15 +4,18 @@ Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", CVPR 2
 constants of the authors' code. The planes are those of HexPlane (Cao and Johnson, CVPR 2023).
 """
 
+import math
 from collections.abc import Sequence
 from functools import reduce
-from itertools import combinations, starmap
-from typing import Any, ClassVar, cast
+from itertools import starmap
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsbench.kernels.backends import CPU
+from gsbench.kernels.planes import sample_planes
 from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
@@ -23,6 +26,7 @@ from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
 GEOMETRY = (("means",), ("scales",), ("quats",))  # the raw parameters that each head of the network changes
+SPACE, TIME = ("xy", "xz", "yz"), ("xt", "yt", "zt")  # the axes of a level's planes
 APPEARANCE = (("opacities",), ("sh0", "shN"))
 THINNEST = 1e-3  # least width of the box of the planes, in parts of its largest: all initial points may lie in a plane
 
@@ -68,16 +72,16 @@ class HexPlaneModel(Gaussians3DModel):
         check_number(time_sparsity, "time_sparsity", 0)
         self.channels, self.width = channels, width
         self.heads = GEOMETRY + APPEARANCE * appearance
-        self.nodes = [(*[resolution << level] * 3, time_resolution) for level in range(levels)]
+        self.levels, self.nodes = levels, (resolution, resolution, resolution, time_resolution)
         self.weights = space_smoothness, time_smoothness, time_sparsity
 
     def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
         """Start as 3DGS does, with a field of random weights: at the end of the warm-up, the Gaussians jump."""
         super().initialise(points, extent, generator)
-        self.planes = Planes(points.means, self.nodes, self.channels, generator)
+        self.planes = Planes(points.means, self.nodes, self.levels, self.channels, generator)
         self.outputs = {name: self.splats[name][0].numel() for head in self.heads for name in head}
         outputs = [sum(self.outputs[name] for name in head) for head in self.heads]
-        self.network = Network(len(self.nodes) * self.channels, self.width, outputs, generator)
+        self.network = Network(self.levels * self.channels, self.width, outputs, generator)
 
     def refined(self, query: CameraTime) -> Raw:
         """Return the raw parameters after AGR and, from the end of the warm-up on, the field have changed them."""
@@ -110,7 +114,8 @@ class Planes(nn.Module):
     def __init__(
         self,
         points: Tensor,  # [N, 3] positions of the initial points, world units
-        nodes: Sequence[tuple[int, ...]],  # of each level along x, y, z and t
+        nodes: tuple[int, int, int, int],  # along x, y, z and t in the first level
+        levels: int,  # each has twice as many along x, y and z as the level before
         channels: int,
         generator: torch.Generator,
     ) -> None:
@@ -118,11 +123,28 @@ class Planes(nn.Module):
         low, high = points.aminmax(dim=0)
         self.register_buffer("high", high)
         self.register_buffer("low", torch.minimum(low, high - THINNEST * (high - low).max()))
-        self.levels = cast("Sequence[nn.ParameterDict]", nn.ModuleList(nn.ParameterDict() for _ in nodes))
-        for level, along in zip(self.levels, nodes, strict=True):
-            for (a, columns), (b, rows) in combinations(zip("xyzt", along, strict=True), 2):
-                plane = torch.ones(1, channels, rows, columns)
-                level[a + b] = plane if b == "t" else plane.uniform_(0.1, 0.5, generator=generator)
+        self.nodes = nodes
+        along = [
+            dict(zip("xyzt", (*(n << level for n in nodes[:3]), nodes[3]), strict=True)) for level in range(levels)
+        ]
+        # The rows and columns of each level's planes: the second axis runs over rows.
+        self.shapes = [{axes: (n[axes[1]], n[axes[0]]) for axes in SPACE + TIME} for n in along]
+        space, time = (sum(math.prod(shape[axes]) for shape in self.shapes for axes in kind) for kind in (SPACE, TIME))
+        # The nodes of all planes, level by level, plane by plane and row by row
+        self.of_space = nn.Parameter(torch.empty(space, channels).uniform_(0.1, 0.5, generator=generator))
+        self.of_time = nn.Parameter(torch.ones(time, channels))
+
+    def levels(self) -> list[dict[str, Tensor]]:
+        """Return the planes of each level by their axes, [rows, columns, C]; they share the memory of the nodes."""
+        levels: list[dict[str, Tensor]] = [{} for _ in self.shapes]
+        for kind, nodes in ((SPACE, self.of_space), (TIME, self.of_time)):
+            named = [
+                (level, axes, shape[axes]) for level, shape in zip(levels, self.shapes, strict=True) for axes in kind
+            ]
+            planes = nodes.split([math.prod(shape) for _, _, shape in named])
+            for (level, axes, shape), plane in zip(named, planes, strict=True):
+                level[axes] = plane.unflatten(0, shape)
+        return levels
 
     def forward(
         self,
@@ -135,15 +157,19 @@ class Planes(nn.Module):
         the second half of the nodes along t is read, as in the authors' code.
         """
         # NaN would end the process in the gradient of grid_sample.
-        x, y, z = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num().unbind(-1)
-        at = {"x": x, "y": y, "z": z, "t": time.expand(len(x))}
+        coordinates = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num()
+        if CPU.serves(coordinates):
+            size = len(self.shapes), *self.nodes
+            (in_space,) = sample_planes(coordinates, self.of_space, None, None, *size)
+            return sample_planes(coordinates, self.of_time, in_space, time, *size)[0].flatten(1)
+        at = dict(zip("xyzt", (*coordinates.unbind(-1), time.expand(len(coordinates))), strict=True))
 
-        # One thread samples a single plane, so its gradient adds up in a fixed order.
         def sample(axes: str, plane: Tensor) -> Tensor:
             grid = torch.stack([at[axis] for axis in axes], -1)[None, None]  # [1, 1, N, 2] column and row in [-1, 1]
+            plane = plane.movedim(-1, 0)[None]
             return F.grid_sample(plane, grid, padding_mode="border", align_corners=True)[0, :, 0].T  # [N, C]
 
-        return torch.cat([reduce(torch.mul, starmap(sample, level.items())) for level in self.levels], -1)
+        return torch.cat([reduce(torch.mul, starmap(sample, level.items())) for level in self.levels()], -1)
 
     def penalty(self, space_smoothness: float, time_smoothness: float, time_sparsity: float) -> Tensor:
         """Return the sum over planes of three weighted terms, [].
@@ -152,11 +178,11 @@ class Planes(nn.Module):
         as in the authors' code. For those with t, it is also the mean distance from 1.
         """
         terms = []
-        for level in self.levels:
+        for level in self.levels():
             for axes, plane in level.items():
-                roughness = plane.diff(n=2, dim=-2).square().mean()
-                terms.append(roughness * (time_smoothness if "t" in axes else space_smoothness))
-                if "t" in axes:
+                roughness = plane.diff(n=2, dim=0).square().mean()
+                terms.append(roughness * (time_smoothness if axes in TIME else space_smoothness))
+                if axes in TIME:
                     terms.append(time_sparsity * (1 - plane).abs().mean())
         return torch.stack(terms).sum()
 

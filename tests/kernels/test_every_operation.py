@@ -25,9 +25,10 @@ from gsbench.kernels.slices import slice_static
 N, C, WIDTH, HEIGHT = 5, 2, 20, 18
 TILES = count_tiles(WIDTH, HEIGHT)
 SIZES = {"N": N, "C": C, "K": 3, "sets": C, "D": 3, "rest": 7, "one": 1, "pairs": C * TILES * N}
-SIZES |= {"width": WIDTH, "height": HEIGHT}
+SIZES |= {"width": WIDTH, "height": HEIGHT, "levels": 2}
 OTHER_SIZE = 4  # where a name is neither above nor derived
 NUMBERS = {"near": 0.01, "far": 100.0, "waves": 2, "subtracts": False, "conditioned": EVERY_ROW, "refined": EVERY_ROW}
+NUMBERS |= {"x": 3, "y": 4, "z": 5, "t": 6}
 WITHOUT = {"time": {"waves": 1}}  # numbers that an input left out changes
 PLAIN: dict[type, Any] = {int: 1, float: 0.5, bool: True}
 VALUES: dict[str, Tensor] = {

@@ -113,6 +113,33 @@ struct LinearGrads {
 };
 GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
 
+// Planes of features over two of the axes x, y, z (time null), or over one of them and t; on a GPU torch samples them.
+constexpr int MOST_LEVELS = 8;
+
+struct PlaneArgs {
+    int64_t N;
+    int C, levels, x, y, z, t;          // nodes along each axis in the first level; of x, y, z, the next has twice as many
+    const float *coordinates, *nodes;   // [N, 3] [M, C]
+    const float *factors, *time;        // [N, levels C] []; null: ones, planes of space
+    int threads;
+};
+GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, t, coordinates, nodes, factors, time, threads)
+
+struct Features {
+    float* features;  // [N, levels C]
+};
+GSB_FIELDS(Features, OUTPUTS, features)
+
+struct FeatureGrads {
+    const float* features;
+};
+GSB_FIELDS(FeatureGrads, GIVEN, features)
+
+struct PlaneGrads {
+    float *coordinates, *nodes, *factors;  // nodes: zero on entry
+};
+GSB_FIELDS(PlaneGrads, GRADS, coordinates, nodes, factors)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -122,7 +149,9 @@ GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
     kernel(exact_splats, ExactProjectArgs, ExactSplats)\
     kernel(exact_image, ExactArgs, ExactPicture)   \
     kernel(linear, LinearArgs, Layer)              \
-    kernel(linear_backward, LinearArgs, LayerState, LayerGrads, LinearGrads)
+    kernel(linear_backward, LinearArgs, LayerState, LayerGrads, LinearGrads) \
+    kernel(sample_planes, PlaneArgs, Features)     \
+    kernel(sample_planes_backward, PlaneArgs, FeatureGrads, PlaneGrads)
 
 namespace gsb {
 

@@ -1,0 +1,69 @@
+"""Samples of planes against torch's, in float64, at nodes, at the border of the grid and beyond it."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.planes import sample_planes
+from gsbench.models.hexplane import Planes
+
+
+def planes(channels: int, levels: int) -> Planes:
+    """Planes of random features whose box is [-1, 1]^3: a position p has the coordinates -p."""
+    g = torch.Generator().manual_seed(0)
+    corners = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    field = Planes(corners, (5, 4, 3, 6), levels, channels, g)
+    for nodes in field.parameters():
+        nodes.data.uniform_(0.5, 1.5, generator=g)
+    return field
+
+
+def gradients(field: Planes, positions: Tensor, time: float, upstream: Tensor) -> list[Tensor]:
+    """The features, and the gradients of positions and nodes."""
+    positions = positions.clone().requires_grad_()
+    features = field(positions, positions.new_tensor(time))
+    return [features, *torch.autograd.grad(features, [positions, *field.parameters()], upstream)]
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize(("channels", "levels"), [(32, 2), (3, 3), (40, 1)])
+@pytest.mark.parametrize("time", [0.0, 0.37, 1.0, 1.5])
+def test_samples_and_gradients_are_torch_s(channels: int, levels: int, time: float) -> None:
+    """Catches a wrong corner, share, axis, level or channel, a product without one of the planes, channels beyond the
+    last, and a gradient that leaves the grid: points are inside, on nodes, on the border and far outside."""
+    g = torch.Generator().manual_seed(1)
+    inside = torch.rand(70, 3, generator=g) * 2 - 1
+    far = torch.randn(30, 3, generator=g) * 3
+    nodes = torch.cartesian_prod(*[torch.tensor([-1.0, 0.5, 1.0])] * 3)
+    positions = torch.cat([inside, far, nodes, torch.tensor([[math.inf, -math.inf, 0.1]])])
+    upstream = torch.randn(len(positions), levels * channels, generator=g)
+    upstream[5:9] = 0  # these rows are left out
+    field = planes(channels, levels)
+    computed = gradients(field, positions, time, upstream)
+    expected = gradients(field.double(), positions.double(), time, upstream.double())
+    # At a node, the derivative by a position jumps: rounding decides on which side of it a point lies.
+    smooth = torch.ones(len(positions), dtype=torch.bool)
+    smooth[len(inside) + len(far) :] = False
+    for name, x, y in zip(("features", "positions", "space", "time"), computed, expected, strict=True):
+        rows = smooth if name == "positions" else slice(None)
+        torch.testing.assert_close(x[rows].double(), y[rows], rtol=2e-5, atol=2e-5, msg=name)
+
+
+def test_positions_at_the_border_have_the_gradient_of_inside_or_none() -> None:
+    """Catches a derivative beyond the border, where features are constant, and a division by zero in a cell's width."""
+    positions = torch.tensor([[1.0001, 0.2, 0.3], [-7.0, 0.2, 0.3], [math.nan, 0.2, 0.3]])
+    _, by_position, *_ = gradients(planes(16, 1), positions, 0.5, torch.ones(3, 16))
+    assert not by_position[:, 0].any()
+    assert by_position[:, 1:].abs().min() > 0
+
+
+def test_nodes_that_do_not_fit_are_refused() -> None:
+    """Catches nodes that the kernel would read past their end, and numbers of them that overflow."""
+    with pytest.raises(InputError, match=r"expected nodes of shape \[47, 'C'\], got \[46, 2\]"):
+        sample_planes(torch.zeros(1, 3), torch.zeros(46, 2), None, None, 1, 5, 4, 3, 6)
+    for levels, nodes in ((0, 5), (9, 5), (1, 1), (1, 1 << 20)):
+        with pytest.raises(InputError, match="expected 1 to 8 levels of 2 to 4096 nodes"):
+            sample_planes(torch.zeros(1, 3), torch.zeros(46, 2), None, None, levels, nodes, 4, 3, 6)
