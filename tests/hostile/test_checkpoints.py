@@ -216,6 +216,7 @@ WRONG: list[tuple[str, tuple[Any, ...], Any]] = [  # part of a checkpoint, where
     ("config", (), {}),
     ("config", ("seed",), "x"),
     ("config", ("train",), 3),
+    ("config", ("data", "scenes"), ["${oc.env:HOME}"]),
     ("config", ("model", "name"), "nosuch"),
     ("scene", (), {}),
     ("scene", ("extent",), "x"),

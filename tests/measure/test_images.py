@@ -58,11 +58,11 @@ def test_errors_of_float32_have_a_log_scale():
 
 
 def test_small_images_are_enlarged_without_smoothing_and_nan_is_seen():
-    """Would catch interpolated pixels, every pixel of a 100-wide image becomes 3 x 3 equal ones, and broken pixels that
+    """Would catch interpolated pixels, every pixel of a 110-wide image becomes 3 x 3 equal ones, and broken pixels that
     look like a perfect black."""
-    image = np.random.default_rng(0).random((5, 100, 3))
-    shown = cells(pictures.strip([(image, image)]), 15, 300)[0]
-    assert (shown.reshape(5, 3, 100, 3, 3).min((1, 3)) == shown.reshape(5, 3, 100, 3, 3).max((1, 3))).all()
+    image = np.random.default_rng(0).random((5, 110, 3))
+    shown = cells(pictures.strip([(image, image)]), 15, 330)[0]
+    assert (shown.reshape(5, 3, 110, 3, 3).min((1, 3)) == shown.reshape(5, 3, 110, 3, 3).max((1, 3))).all()
     assert np.abs(shown[1::3, 1::3] / 255 - image).max() < 0.01
     truth = np.zeros((4, 300, 3))
     render = truth.copy()

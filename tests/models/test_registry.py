@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -10,14 +11,18 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from gsbench import export
 from gsbench.config import CONF, register_schema
 from gsbench.errors import InputError
+from gsbench.gates import __main__ as gates
 from gsbench.kernels.slices import slice_static
 from gsbench.models import CameraTime, registry
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.registry import build, find
 from gsbench.run.load import typed_config
 from gsbench.scenes.points import random_points
+from gsbench.stability import __main__ as stability
+from gsbench.view import __main__ as view
 
 MODEL = """
 from gsbench.models.gaussians3d import Gaussians3DModel
@@ -102,6 +107,16 @@ def test_a_module_that_cannot_be_imported(folder: Path, text: str | None, messag
         find("none", "models_of_none")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("command", [view, export, gates, stability])
+def test_a_command_imports_the_module_of_a_runs_model(
+    command: ModuleType, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a command that cannot read the run of a user's model."""
+    words = ["--checkpoint"] if command is gates else ["--video", str(folder / "x.webm")] if command is export else []
+    assert command.main([*words, str(folder), "--model-module", "models_of_none"]) == 2
+    assert "--model-module: expected a Python module that can be imported" in capsys.readouterr().err
 
 
 def test_a_checkpoint_imports_nothing(folder: Path) -> None:

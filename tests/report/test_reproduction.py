@@ -10,7 +10,7 @@ from records import but, frontier, lost, on_demand, results, write_all
 
 from gsbench.measure.machine import Hardware
 from gsbench.report.__main__ import main
-from gsbench.report.reproduction import AGREES, DIFFERS, LIMITS, UNDECIDED, compare, reasons, sections, summary
+from gsbench.report.reproduction import AGREES, DIFFERS, LIMITS, TITLES, UNDECIDED, compare, reasons, sections, summary
 
 SEEDS = (0, 1, 2)
 WIDE = "the interval is too wide: more seeds are needed"
@@ -112,6 +112,7 @@ def test_the_model_that_differs_is_named():
     of = reproduced(runs(0, change=of_one(by(1.5))), runs(*SEEDS))
     (row,) = of.of("psnr_db", DIFFERS).to_dict("records")
     assert (row["model"], row["scene"]) == ("7dgs", "suzanne")
+    assert list(summary(of).quantity) == list(TITLES)
     counted = summary(of).set_index("quantity").loc["psnr_db"].to_dict()
     expected = {"agrees": 9, "differs": 1, "largest": pytest.approx(row["difference"]), "on": "7dgs on suzanne"}
     assert counted.items() >= expected.items()

@@ -16,6 +16,7 @@ from gsbench import kernels
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.factors import KINDS
+from gsbench.models.render import render
 from gsbench.run import setup
 from gsbench.run.load import load_run
 from gsbench.scenes import Points, View
@@ -236,11 +237,16 @@ def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatc
 
 
 def test_equal_images_have_no_change() -> None:
-    """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped."""
+    """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped, and two images
+    of which one is not filtered."""
     model = small_model()
     double = float32_error.float64_model(model)
     rendered = [
         float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).image for view in VIEWS
     ]
+    exact = float32_error.render_twice(model, double, VIEWS[0].camera, VIEWS[0].time, torch.zeros(3), True)
+    assert torch.equal(exact.image, render(model, VIEWS[0].camera, VIEWS[0].time, torch.zeros(3), True))
+    assert torch.allclose(exact.image.double(), exact.exact.image, atol=1e-4)
+    assert not torch.allclose(exact.image, rendered[0], atol=1e-3)
     equal = [replace(view, pixels=image) for view, image in zip(VIEWS, rendered, strict=True)]
     assert psnr_float32(model, equal) == (0.0, "")
