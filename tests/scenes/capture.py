@@ -5,8 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from scenes.tiny_scene import write_image
 from scipy.spatial.transform import Rotation
+
+from gsbench.scenes import Scene
+from gsbench.scenes.scene import UP, up_of
 
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 COLOR = (140, 128, 102)  # RGB of the points
@@ -89,3 +93,9 @@ def small_capture(root: Path) -> Path:
     for i, name in enumerate(NAMES):
         write_image(root / "images" / name, np.full((HEIGHT, WIDTH, 3), 20 * i, np.uint8))
     return small_model(root)
+
+
+def has_estimated_up(scene: Scene) -> bool:
+    """Whether the upward direction is that of the training cameras, and not the z axis."""
+    up = up_of(torch.stack([view.camera.viewmat for view in scene.train]))
+    return scene.up == up != UP

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from capture import COLOR, COUNT, HEIGHT, NAMES, WIDTH, Capture, circle, small_model
+from capture import COLOR, COUNT, HEIGHT, NAMES, WIDTH, Capture, circle, has_estimated_up, small_model
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -53,6 +53,7 @@ def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kin
     """Catches a transposed rotation, a wrong order of numbers, images of other cameras, times and a split askew."""
     views = write_embedded(tmp_path / "own", blender, kind)
     scene = scenes.load(tmp_path / "own")
+    assert has_estimated_up(scene)
     first, last = views[0].time, views[-1].time
     assert scene.name == "own"
     assert [len(scene.train), len(scene.val), len(scene.test)] == [21, 0, 3]

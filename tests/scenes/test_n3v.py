@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes.capture import COLOR, Capture
+from scenes.capture import COLOR, Capture, has_estimated_up
 from scenes.tiny_scene import write_image
 from scipy.spatial.transform import Rotation
 
@@ -78,6 +78,7 @@ def test_a_camera_of_the_release() -> None:
 def test_films_cameras_times_and_splits(root: Path) -> None:
     """Catches films mixed with rows, frames of another time, blue for red, and a test camera that trains."""
     scene = scenes.load(root)
+    assert has_estimated_up(scene)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (15, 0, 5)
     assert [view.name for view in scene.train[2:5]] == ["cam04/0000", "cam01/0001", "cam02/0001"]
     assert [view.name for view in scene.test] == [f"cam00/{frame:04d}" for frame in range(FRAMES)]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes.capture import circle
+from scenes.capture import circle, has_estimated_up
 from scenes.tiny_scene import write_image
 
 from gsbench import scenes
@@ -86,6 +86,7 @@ def test_a_camera_of_the_release() -> None:
 def test_cameras_times_and_splits(root: Path) -> None:
     """Catches images mixed with cameras, a test view that trains, and intrinsics of another size."""
     scene = scenes.load(root)
+    assert has_estimated_up(scene)
     assert [view.name for view in (*scene.train, *scene.test)] == ["left_000", "right_003", "right_000", "left_003"]
     assert [view.time for view in (*scene.train, *scene.test)] == [0.0, 1.0, 0.0, 1.0]
     for view in (*scene.train, *scene.test):

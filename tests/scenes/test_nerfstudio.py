@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from capture import circle
+from capture import circle, has_estimated_up
 from tiny_scene import check_message, write_image
 
 from gsbench import scenes
@@ -54,6 +54,7 @@ def change(root: Path, **values: Any) -> None:
 def test_it_is_read(root: Path) -> None:
     """Catches a message that names other files, cameras of other images, another split, and points left out."""
     scene = scenes.load(root)
+    assert has_estimated_up(scene)
     assert [len(scene.train), len(scene.val), len(scene.test)] == [15, 0, 2]
     assert [view.name for view in scene.test] == ["images/frame_00007", "images/frame_00015"]
     for view in (*scene.train, *scene.test):

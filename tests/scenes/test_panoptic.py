@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scenes.capture import circle
+from scenes.capture import circle, has_estimated_up
 from scenes.tiny_scene import write_image
 
 from gsbench import scenes
@@ -59,6 +59,7 @@ def edit(change: Callable[[dict[str, Any]], object], split: str = "train") -> Ca
 def test_cameras_times_masks_and_splits(root: Path) -> None:
     """Catches cameras mixed with times, an inverted pose, a mask of another image, and a test camera that trains."""
     scene = scenes.load(root)
+    assert has_estimated_up(scene)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (12, 0, 3)
     assert [view.name for view in scene.train[3:6]] == ["4/000000", "0/000003", "1/000003"]
     assert [view.time for view in scene.test] == [0.0, 0.5, 1.0]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes.capture import COLOR, Capture
+from scenes.capture import COLOR, Capture, has_estimated_up
 from scenes.tiny_scene import write_image
 
 from gsbench import scenes
@@ -42,6 +42,7 @@ def root(tmp_path: Path) -> Path:
 def test_cameras_times_and_splits(root: Path) -> None:
     """Catches a transposed rotation, a centre in the middle, a held-out camera that trains, and times of raw frames."""
     scene = scenes.load(root)
+    assert has_estimated_up(scene)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (45, 0, 3)
     assert [view.time for view in scene.test] == [0.0, 0.5, 1.0]
     assert all(view.name.endswith(f"_{TEST_CAMERA}") for view in scene.test)
