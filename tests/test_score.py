@@ -80,14 +80,16 @@ def test_floats_of_an_own_run_have_its_numbers(trained, square, tmp_path, capsys
 
 
 def test_pngs_differ_by_no_more_than_rounding(trained, square, tmp_path):
-    """Catches channels in another order, a gamma, and rows that are shifted: the root mean squared error of a view
-    changes by at most half a step of 8 bits."""
+    """Catches channels in another order, a gamma, views of another split, and rows that are shifted: the root mean
+    squared error of a view changes by at most half a step of 8 bits."""
     ours, images = trained
     record = score(write(tmp_path / "png", in_8_bits(images)), square, tmp_path / "results")
     for view, own_view in zip(record.per_view, ours.per_view, strict=True):
         errors = [10 ** (-each.psnr / 20) for each in (view, own_view)]
         assert abs(errors[0] - errors[1]) <= 0.5 / 255
     assert record.protocol["images"] == "8-bit PNG"
+    on_val = score(tmp_path / "png", square, tmp_path / "val", "scene.eval_split=val")
+    assert [view.name for view in on_val.per_view] == ["val/r_0", "val/r_1"]
 
 
 @pytest.mark.parametrize(
