@@ -305,13 +305,18 @@ def test_latex_is_balanced_and_every_row_has_every_column():
 
 @pytest.mark.parametrize("width", [120, 80, 40])
 def test_the_terminal_form_fits(width):
-    """Catches a line that wraps, also with several seeds, every column and a long model name, and a lost column."""
+    """Catches a line that wraps, also with several seeds, every column and a long model name, a lost column, and a
+    text or a note that is not printed."""
     metrics = make().metrics | {"lpips_vgg": 0.25, "psnr_best_on_test": 26.5}
     runs = [*every_row(), make(seed=3, metrics=metrics, missing={})]
     runs += [make("a_model_with_a_name_of_forty_letters_____", seed=seed) for seed in (0, 1)]
-    lines = text.terminal(output.tables(results(*runs)), width).splitlines()
+    sections = output.tables(results(*runs))
+    lines = text.terminal(sections, width).splitlines()
     assert max(map(len, lines)) <= width
     assert any("for lack of width" in line for line in lines)
+    printed = "".join("".join(lines).split())
+    words = [part for section in sections for part in (section.title, section.text, *section.notes)]
+    assert all("".join(part.split()) in printed for part in words)
 
 
 def test_each_section_stands_where_its_flags_say(monkeypatch):
