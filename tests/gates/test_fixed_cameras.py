@@ -109,7 +109,8 @@ def test_hard_cases(scene: Callable[[], Scene], decisions: tuple[str, ...], reas
 
 @pytest.mark.parametrize("together", [False, True])
 def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave."""
+    """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave, and a
+    camera that sees nothing but black, which is 0 / 0."""
     monkeypatch.setattr(fixed_camera_test, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     times = [np.linspace(0, 1, 8) if together else np.sort(random.random(8)) for _ in range(6)]
@@ -123,6 +124,8 @@ def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> N
             images = np.outer(brightness, pattern) + 0.3 * random.standard_normal((8, 30))
             means.append(images - images.mean(0))
         low += fixed_camera_test._test_slow_change(means, times, k)[0] <= 0.05
+    blind = fixed_camera_test._test_slow_change([*means, np.zeros((8, 30))], [*times, times[0]], k)
+    assert blind == fixed_camera_test._test_slow_change(means, times, k)
     assert low / 300 == pytest.approx(0.05, abs=0.035)
 
 

@@ -144,6 +144,8 @@ def test_the_state_of_a_run_follows_from_its_traces(
     assert (run.reason is None) == (reason is None)
     if state == "running":
         assert (run.step, run.steps, run.psnr, run.seconds_left) == (100, 400, 21.5, 150.0)
+        shown = lines(status.Experiment(tmp_path / "crowd"), [replace(run, seconds_left=7560.0)])[1]
+        assert "step 100/400, val 21.50 dB, 2.1 h left" in shown
     if state == "done":
         assert run.psnr == crowd.record(*RUN)["metrics"]["psnr"]
     if traces.get("progress_of") == IN_JOB:
