@@ -75,7 +75,7 @@ def test_floats_of_an_own_run_have_its_numbers(trained, square, tmp_path, capsys
     assert {key: record.protocol[key] for key in ours.protocol if key != "backend"} == {
         key: value for key, value in ours.protocol.items() if key != "backend"
     }
-    assert (record.cost.num_gaussians, record.cost.fps, record.cost.train_s) == (7, 50.0, None)
+    assert (record.cost.num_gaussians, record.cost.fps, record.cost.train_s, record.cost.bytes) == (7, 50.0, None, None)
     assert (tmp_path / "results/dnerf/square/other/seed0/pictures.png").is_file()
 
 
@@ -88,7 +88,9 @@ def test_pngs_differ_by_no_more_than_rounding(trained, square, tmp_path):
         errors = [10 ** (-each.psnr / 20) for each in (view, own_view)]
         assert abs(errors[0] - errors[1]) <= 0.5 / 255
     assert record.protocol["images"] == "8-bit PNG"
-    on_val = score(tmp_path / "png", square, tmp_path / "val", "scene.eval_split=val")
+    costs = ("--train-seconds", "90", "--megabytes", "1.5")
+    on_val = score(tmp_path / "png", square, tmp_path / "val", "scene.eval_split=val", *costs)
+    assert (on_val.cost.train_s, on_val.cost.bytes) == (90.0, 1_500_000)
     assert [view.name for view in on_val.per_view] == ["val/r_0", "val/r_1"]
 
 

@@ -319,6 +319,21 @@ def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None
         assert not any("of training left" in line for line in lines(status.Experiment(tmp_path), nothing_known))
 
 
+def test_status_is_repeated_until_nothing_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a watch that ends with the first look, or never, and the exit status of a run that failed."""
+    folder = traced(tmp_path / "crowd", progress_of={})
+    ends = iter([{}, DIVERGED])
+    for expected, words in ((0, "1 done"), (1, "1 failed")):
+        monkeypatch.setattr(time, "sleep", lambda _: traced(tmp_path / "crowd", record_of=next(ends)))
+        assert main(["status", str(tmp_path / "crowd"), "--watch"]) == expected
+        first, *_, last = [line for line in capsys.readouterr().out.splitlines() if ": 1 runs: " in line]
+        assert first.endswith("1 running")
+        assert last.endswith(words)
+        (folder / "record.json").unlink()
+
+
 def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path) -> None:
     """Catches a status that composes configs, validates records, or imports what it does not need."""
     experiment = crowd.write(500, tmp_path)

@@ -348,6 +348,7 @@ def test_the_command_prints_and_writes(folder, capsys):
     assert Page((folder / "report.html").read_text())
     assert "PSNR train" not in printed
     assert main([str(folder), "--train"]) == 0
+    assert "PSNR train" in capsys.readouterr().out
 
 
 def test_other_forms_are_printed_and_nothing_is_written(folder, tmp_path, capsys):
@@ -453,7 +454,7 @@ def test_live_writes_again_when_a_record_arrives(tmp_path, capsys, monkeypatch):
             raise KeyboardInterrupt from None
 
     monkeypatch.setattr(time, "sleep", sleep)
-    assert output.watch(tmp_path / "mini") == 0
+    assert main([str(tmp_path / "mini"), "--live", "--train"]) == 0
     printed = capsys.readouterr().out.splitlines()
     for part, line in zip(("expected a folder of results", "1 records", "2 records"), printed, strict=False):
         assert part in line
@@ -462,3 +463,4 @@ def test_live_writes_again_when_a_record_arrives(tmp_path, capsys, monkeypatch):
     assert 'data-reload="5"' in pages[1]
     assert pages[2] == pages[3]
     assert 'data-reload="0"' in path.read_text()
+    assert "PSNR train" in path.with_name("table.md").read_text()
