@@ -9,7 +9,7 @@ from gsbench.errors import InputError, one_line, printable
 from gsbench.measure.atomic import write_atomically
 from gsbench.process.ending import end_with
 from gsbench.reading import as_json
-from gsbench.report import output, paper_tables, reproduction, select
+from gsbench.report import merge, output, paper_tables, reproduction, select
 from gsbench.report.frame import Results, load
 from gsbench.report.render import page, text
 from gsbench.report.sections import built
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     differs = False
     try:
         chosen = select.parse(options.select)
-        results = chosen.of(load(options.results))
+        results = chosen.of(merge.read(options.merge) if options.merge else load(options.results))
         if options.publish:
             print(output.publish(options.results, options.publish))
         elif len(results.runs) and options.tables:
@@ -65,6 +65,9 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
     either.add_argument("--live", action="store_true", help="write again whenever a record arrives, until Ctrl-C")
     either.add_argument("--publish", type=Path, metavar="DIR", help="copy the runs to DIR, and write its table anew")
     either.add_argument("--against", type=Path, metavar="DIR", help="compare with the runs in DIR; 1 if they differ")
+    either.add_argument(
+        "--merge", type=Path, nargs="+", metavar="DIR", help="one set of several people's runs: a static site in FOLDER"
+    )
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--latex", action="store_true", help="print the tables as LaTeX for a paper, and write nothing")
     form.add_argument(

@@ -5,7 +5,7 @@ that compares, averages or shows results starts from these tables.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from gsbench.report.columns import CURVES, RUNS, VIEWS
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
 NUMBERS = [column.name for column in RUNS if column.kind is float]
+
+Records = list[tuple[Path, Record]]  # with the paths of their files
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,15 @@ def load(root: Path) -> Results:
     Raises:
         InputError: the folder is missing or has no record.
     """
+    return tables(*records_in(root))
+
+
+def records_in(root: Path) -> tuple[Records, list[str]]:
+    """Return all records under `root` with the paths of their files, and why damaged ones are left out.
+
+    Raises:
+        InputError: the folder is missing or has no record.
+    """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
     records, faults = [], []
@@ -77,24 +88,33 @@ def load(root: Path) -> Results:
             faults.append(printable(error))
     if not records and not faults:
         raise InputError(f"{root}: expected results, found no {files.FILE_NAME} or {study.RUNS_FILE} in it or below")
-    return tables(records, faults)
+    return records, faults
 
 
-def tables(records: list[tuple[Path, Record]], faults: list[str]) -> Results:
+def tables(records: Records, faults: list[str]) -> Results:
     """Return the tables of records, sorted by RUN; of two records of one run, the first one is kept."""
+    return laid_out(*unique(records, faults))
+
+
+def unique(records: Records, faults: list[str]) -> tuple[Records, list[str]]:
+    """Return records sorted by RUN without those of a run that another describes, and the faults with theirs."""
     once: dict[tuple[Any, ...], tuple[Path, Record]] = {}
     for path, record in records:
         if (run := run_name(record)) in once:
             faults = [*faults, printable(f"{path}: the same run as {once[run][0]}; keep one of them")]
         else:
             once[run] = path, record
-    unique = [once[run] for run in sorted(once)]
-    runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in unique], dtype=object)
+    return [once[run] for run in sorted(once)], faults
+
+
+def laid_out(records: Records, faults: Sequence[str]) -> Results:
+    """Return the tables of records in their order."""
+    runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in records], dtype=object)
     first = [*(column.name for column in RUNS), "path", "record"]
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
     runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
-    views = [view for i, (_, record) in enumerate(unique) for view in _views(i, record)]
-    points = [(i, point) for i, (_, record) in enumerate(unique) for point in record.curve]
+    views = [view for i, (_, record) in enumerate(records) for view in _views(i, record)]
+    points = [(i, point) for i, (_, record) in enumerate(records) for point in record.curve]
     curves = [{"run": i} | {name: getattr(point, key) for name, key in CURVES.items()} for i, point in points]
     return Results(runs, _table(views, ["view"], VIEWS), _table(curves, [], CURVES), tuple(faults))
 

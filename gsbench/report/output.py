@@ -8,9 +8,9 @@ from pathlib import Path
 from gsbench.errors import InputError, one_line
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
-from gsbench.report import study
+from gsbench.report import contributors, merge, study
 from gsbench.report.frame import Results, load, run_name
-from gsbench.report.render import page, text
+from gsbench.report.render import page, site, text
 from gsbench.report.section import Section
 from gsbench.report.sections import built
 from gsbench.report.sections.experiment import table
@@ -27,17 +27,18 @@ def tables(results: Results, columns: Sequence[str] = (), *, latex: bool = False
         columns: the columns of the result table; empty for those that the runs have.
         latex: whether they are for --latex.
     """
-    return [
+    shown = [
         table(chapter, columns) if section.key == "experiment" else section
         for chapter in results.chapters()
         for section in built(chapter, attrgetter("in_latex" if latex else "in_terminal"))
     ]
+    return shown + (contributors.sections(results) if merge.is_merged(results) and not latex else [])
 
 
 def write(
     results: Results, folder: Path, shown: Sequence[Section], *, reload: int = 0, more: Sequence[Section] = ()
 ) -> list[Path]:
-    """Write ``table.md``, ``table.csv`` and ``report.html`` to a folder, and return their paths.
+    """Write ``table.md``, ``table.csv`` and ``report.html``, or the site of a merged set, and return their paths.
 
     Args:
         results: the tables of the runs.
@@ -48,7 +49,11 @@ def write(
     """
     write_atomically(folder / "table.md", text.markdown(shown).encode())
     write_atomically(folder / "table.csv", text.csv(results.runs.drop(columns=NOT_IN_FILE)).encode())
-    return [folder / "table.md", folder / "table.csv", page.write(results, folder, reload=reload, more=more)]
+    if merge.is_merged(results):
+        pages = site.write(results, folder)[:1]
+    else:
+        pages = [page.write(results, folder, reload=reload, more=more)]
+    return [folder / "table.md", folder / "table.csv", *pages]
 
 
 def watch(folder: Path, columns: Sequence[str] = (), *, every: float = EVERY) -> int:
@@ -119,10 +124,8 @@ def publish(folder: Path, to: Path) -> str:
     earlier = load(to) if (to / study.RUNS_FILE).exists() else None
     faults = [*results.faults, *(earlier.faults if earlier else ())]
     for record in results.runs.record:
-        if record.status != "ok":
-            faults.append(f"{record.path}: {record.status}: {record.reason}")
-        elif (record.provenance.git_commit or "-dirty").endswith("-dirty"):
-            faults.append(f"{record.path}: its commit is {record.provenance.git_commit}, which does not reproduce it")
+        if reason := merge.unpublishable(record):
+            faults.append(f"{record.path}: {reason}")
     if faults:
         more = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
         raise InputError(

@@ -146,11 +146,11 @@ def _why_unmatched(unmatched: pd.DataFrame, runs: pd.DataFrame) -> str:
     others = runs[(runs[ROW[:4]] == first[ROW[:4]]).all(axis=1) & (runs.side != first.side)]
     if first.side == "reference" or others.empty:
         return f"only the {first.side} folder has it"
-    smallest = min((_differing(config, first.config) for config in others.config), key=len)
+    smallest = min((other_settings(config, first.config) for config in others.config), key=len)
     return f"another training: {printable(listed(smallest)) or 'another variant'}"
 
 
-def _differing(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
+def other_settings(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     """Describe the settings of two trainings that differ, except the seed."""
     return training_differences({**there, "seed": None}, {**here, "seed": None})
 
@@ -161,7 +161,7 @@ def _incomparable(new: pd.DataFrame, reference: pd.DataFrame) -> str:
         return f"no {'new' if new.empty else 'reference'} run finished"
     runs = pd.concat([reference, new])
     for config in runs.config:
-        if differing := _differing(runs.config.iloc[0], config):
+        if differing := other_settings(runs.config.iloc[0], config):
             return f"another training: {printable(listed(differing))}"
     if runs.data_hash.nunique() > 1:
         return "other data"

@@ -79,7 +79,8 @@ class Figure:
 class Section:
     """A part of a report; the table has numbers, which every renderer shows by `columns`.
 
-    A column "psnr_db ±" is shown in the cell of "psnr_db", and "psnr_db rank" marks it (1: best, 2: second best).
+    A column "psnr_db ±" is shown in the cell of "psnr_db", "psnr_db rank" marks it (1: best, 2: second best), and
+    "model link" is the address of a page about the cell of "model", or "".
     """
 
     key: str
@@ -91,11 +92,12 @@ class Section:
     notes: tuple[str, ...] = ()
     folded: bool = False  # whether a page shows the table only on demand
     images: tuple[Any, ...] = ()  # what gsbench.report.sections.gallery cuts from the files of runs
+    sortable: bool = False  # whether the reader of a page sorts and filters the rows, of which it shows more
 
     @property
     def shown_columns(self) -> list[str]:
-        """Return the names of the columns that are shown as such, without intervals and ranks."""
-        return [name for name in self.table if not str(name).endswith((" ±", " rank"))]
+        """Return the names of the columns that are shown as such, without intervals, ranks and links."""
+        return [name for name in self.table if not str(name).endswith((" ±", " rank", " link"))]
 
     def column(self, name: str) -> Column:
         """Return how a column is shown."""

@@ -5,10 +5,12 @@ import re
 import numpy as np
 import pytest
 from chromium import launched
-from records import frontier, hostile, on_demand, results, write_all
+from records import frontier, hostile, make, on_demand, results, write_all
 
+from gsbench.report import merge, study
 from gsbench.report.frame import load
 from gsbench.report.render import page as of_report
+from gsbench.report.render import site as of_site
 
 pytestmark = pytest.mark.slow
 WIDTHS = (375, 820, 1440)
@@ -28,7 +30,11 @@ def pages(tmp_path_factory):
     records += on_demand(whole) + on_demand(whole, label="7dgs")
     good = of_report.write(load(write_all(records, root, pictures=2)), root)
     (root / "bad").mkdir()
-    return {"good": good, "hostile": of_report.write(results(*hostile()), root / "bad")}
+    for name, psnr in (("alice", 20.0), ("bob", 30.0)):
+        study.write([make(model, "suzanne", 0, psnr + i) for i, model in enumerate(("3dgs", "4dgs"))], root / name)
+    (site, *_, pair) = of_site.write(merge.read([root / "alice", root / "bob"]), root / "site")
+    bad = of_report.write(results(*hostile()), root / "bad")
+    return {"good": good, "hostile": bad, "site": site, "pair": pair}
 
 
 @pytest.fixture
@@ -55,16 +61,17 @@ def visit(browser, pages):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ["good", "hostile"])
+@pytest.mark.parametrize("name", ["good", "hostile", "site", "pair"])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_it_opens_in_silence_on_any_screen(visit, name, width, scheme):
+def test_it_opens_in_silence_on_any_screen(visit, pages, name, width, scheme):
     """Catches a console error, a request that leaves the page, a record's script that runs, what makes a phone scroll
     sideways, a table that cannot be scrolled, numbers that do not stand under their header, and, by all rules of
     axe-core, text of too little contrast, controls without a name and headings out of order."""
     page = visit(name, width=width, scheme=scheme)
     page.wait_for_timeout(300)
     assert page.complaints == []
-    assert [url for url in page.asked if not url.startswith("data:")] == [page.url]
+    shared = [pages["site"].with_name("charts.js").as_uri()] if name == "pair" else []
+    assert [url for url in page.asked if not url.startswith("data:")] == [page.url, *shared]
     assert "owned" not in page.title()
     assert page.locator("img[src='x']").count() == 0
     page = visit(name, width=width, scheme=scheme, bypass_csp=True)  # axe-core is a script of another
@@ -157,6 +164,29 @@ def test_figures_answer(visit):
     assert labels() != before[1]
     page.reload()
     assert page.locator("#g0-frontier select.scene").input_value() == "suzanne"
+
+
+def test_a_table_of_a_site_is_sorted_and_filtered(visit):
+    """Catches a title that sorts numbers as texts, a group that loses its name, and a filter that hides other rows."""
+    page = visit("site")
+    rows = page.locator(".sortable >> nth=0 >> tr")
+
+    def column(i):
+        cells = rows.locator(f"td:nth-child({i})").all()
+        return [cell.text_content().strip() for cell in cells if cell.is_visible()]
+
+    assert column(4) == ["20.00", "30.00", "21.00", "31.00"]
+    title = page.locator(".sort", has_text=re.compile("^PSNR$")).first
+    title.click()
+    assert column(4) == ["31.00", "30.00", "21.00", "20.00"]
+    assert rows.locator("td:first-child").first.get_attribute("class") in (None, "")
+    title.click()
+    assert column(4) == ["20.00", "21.00", "30.00", "31.00"]
+    page.locator("label", has_text=re.compile("^contributor")).locator("select").select_option("bob")
+    assert column(3) == ["bob", "bob"]
+    assert "2 of 4 rows" in page.get_by_role("status").first.inner_text()
+    page.get_by_role("link", name="4dgs").last.click()
+    assert page.locator("h1").inner_text() == "4dgs on suzanne"
 
 
 def test_it_prints_and_has_its_tables_without_script(visit):

@@ -1,5 +1,6 @@
 "use strict";
-// Figures, a legend that hides models, the choice of a scene, the slider between images, and reloading of a live page.
+// Figures, a legend that hides models, the choice of a scene, sorting and filtering of tables, the slider between images,
+// and reloading of a live page.
 const each = (selector, act, root = document) => root.querySelectorAll(selector).forEach(act);
 const parsed = (id) => JSON.parse(document.getElementById(id).textContent);
 const specs = parsed("specs");
@@ -47,6 +48,67 @@ each("select.scene", (select) => {
     try { sessionStorage.setItem(kept, select.value); } catch { /* as above */ }
     each(".chart", update, select.closest("section"));
   });
+});
+
+const MOST_CHOICES = 60; // of a filter
+const shown = (cell) => cell.textContent.trim();
+each(".sortable", (box) => { // a click on a title sorts the rows, and a choice of a column hides all others
+  const [head, ...rows] = box.querySelectorAll("tr");
+  const titles = [...head.cells];
+  const value = (row, i) => {
+    const text = shown(row.cells[i]);
+    if (!titles[i].classList.contains("number")) return text;
+    return text === "never" ? Infinity : parseFloat(text.replaceAll(",", "")); // a missing number is NaN
+  };
+  const controls = document.createElement("div");
+  controls.className = "controls";
+  const count = document.createElement("span");
+  count.setAttribute("role", "status");
+  const filters = new Map(); // by column: its choice
+  const show = () => {
+    let above = null;
+    for (const row of box.querySelectorAll("tr:not(:first-child)")) {
+      row.hidden = [...filters].some(([i, select]) => select.value && shown(row.cells[i]) !== select.value);
+      if (row.hidden) continue;
+      row.cells[0].classList.toggle("repeated", shown(row.cells[0]) === above);
+      above = shown(row.cells[0]);
+    }
+    count.textContent = `${rows.filter((row) => !row.hidden).length} of ${rows.length} rows`;
+  };
+  const sort = (i) => {
+    const was = titles[i].getAttribute("aria-sort");
+    const isNumber = titles[i].classList.contains("number");
+    const down = was ? was === "ascending" : isNumber;
+    titles.forEach((title) => title.removeAttribute("aria-sort"));
+    titles[i].setAttribute("aria-sort", down ? "descending" : "ascending");
+    const order = (a, b) => {
+      const [x, y] = [value(a, i), value(b, i)];
+      if (!isNumber) return x.localeCompare(y) * (down ? -1 : 1);
+      return Number.isNaN(x) - Number.isNaN(y) || (x - y) * (down ? -1 : 1) || 0;
+    };
+    head.after(...[...box.querySelectorAll("tr:not(:first-child)")].sort(order));
+    show();
+  };
+  titles.forEach((title, i) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.className = "sort";
+    button.append(...title.childNodes);
+    button.addEventListener("click", () => sort(i));
+    title.append(button);
+    const choices = [...new Set(rows.map((row) => shown(row.cells[i])))].filter(Boolean).sort();
+    const isChoice = choices.length > 1 && choices.length < rows.length && choices.length <= MOST_CHOICES;
+    if (title.classList.contains("number") || !isChoice) return;
+    const [label, select] = [document.createElement("label"), document.createElement("select")];
+    select.append(new Option("all", ""), ...choices.map((choice) => new Option(choice, choice)));
+    select.addEventListener("change", show);
+    label.append(shown(title), select);
+    controls.append(label);
+    filters.set(i, select);
+  });
+  controls.append(count);
+  box.before(controls);
+  show();
 });
 
 const pictures = parsed("views");

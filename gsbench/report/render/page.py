@@ -4,7 +4,7 @@ import base64
 import functools
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,12 @@ from gsbench.report.sections import built
 
 FILE_NAME = "report.html"
 MOST_ROWS = 250  # of a table that the page shows; its CSV file has all
+MOST_SORTABLE = 5000  # of a table whose rows the reader filters
 MOST_FAULTS = 20  # damaged records that are listed
 TURNED = 13  # columns from which a table of few rows is shown with its columns as rows
+
+
+Links = Sequence[tuple[str, str]]  # texts and addresses
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,9 @@ class Article:
     title: str
     summary: str
     sections: list[Section]
-    series: list[str]  # the models of the figures
-    best: str  # the model that pictures show first
+    series: list[str] = field(default_factory=list)  # the models of the figures
+    best: str = ""  # the model that pictures show first
+    links: Links = ()  # to other pages about these runs
 
 
 def write(results: Results, folder: Path, *, reload: int = 0, more: Sequence[Section] = ()) -> Path:
@@ -55,7 +60,31 @@ def write(results: Results, folder: Path, *, reload: int = 0, more: Sequence[Sec
 
 def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Section] = ()) -> str:
     """Return the page as text; no script but its own can run in it, and none may evaluate text."""
-    articles = [_article(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
+    articles = [article(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
+    return rendered(title, articles, results.faults, more, reload=reload)
+
+
+def rendered(
+    title: str,
+    articles: Sequence[Article],
+    faults: Sequence[str] = (),
+    more: Sequence[Section] = (),
+    *,
+    reload: int = 0,
+    links: Links = (),
+    scripts_at: str = "",
+) -> str:
+    """Return the page of some articles as text.
+
+    Args:
+        title: the heading of the page.
+        articles: its articles.
+        faults: why records were left out.
+        more: sections that are not of one experiment.
+        reload: seconds after which an open page reloads itself; 0 for never.
+        links: other pages, named above all articles.
+        scripts_at: the address of `library` as a file, which many pages share; "" if the page has it in itself.
+    """
     look = styles(name for article in articles for name in article.series)
     keyed = [(f"{article.key}-{section.key}", section) for article in articles for section in article.sections]
     keyed += [(f"more-{section.key}", section) for section in more]
@@ -63,20 +92,22 @@ def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Sectio
         f"{key}-{i}": charts.spec(figure, look) for key, section in keyed for i, figure in enumerate(section.figures)
     }
     views = {key: list(map(asdict, section.images)) for key, section in keyed if section.key == "gallery"}
-    scripts = [library(), _asset("page.js")]
+    scripts = [_asset("page.js")] if scripts_at else [library(), _asset("page.js")]
     return _template().render(
         title=short(title)[:80] or "results",
         articles=articles,
         more=more,
+        links=links,
         look=look,
         markers=MARKERS,
         specs=specs,
         views=views,
-        faults=[short(fault) for fault in results.faults],
+        faults=[short(fault) for fault in faults],
         most_faults=MOST_FAULTS,
         reload=reload,
         hashes=" ".join(map(_hash, scripts)),
         scripts=[Markup(script) for script in scripts],
+        scripts_at=scripts_at if specs else "",
         css=Markup(_asset("page.css")),
         light=_variables(0),
         dark=_variables(1),
@@ -85,7 +116,7 @@ def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Sectio
 
 def figures(results: Results, folder: Path) -> list[Path]:
     """Write all figures of the page as PDF and SVG files to a folder, and return their paths."""
-    articles = [_article("", chapter) for chapter in results.chapters()]
+    articles = [article("", chapter) for chapter in results.chapters()]
     look = styles(name for article in articles for name in article.series)
     return [
         path
@@ -96,34 +127,39 @@ def figures(results: Results, folder: Path) -> list[Path]:
     ]
 
 
-def _article(key: str, chapter: Results) -> Article:
+def article(key: str, chapter: Results, sections: Sequence[Section] | None = None, *, links: Links = ()) -> Article:
+    """Return an article about one experiment, with all its sections or with some; its key begins the ids of these."""
     runs = chapter.runs
     counts = {"run": len(runs)} | {name: runs[name].nunique() for name in ("model", "scene", "seed")}
     words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
     summary = " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]])
     mean = runs.groupby("model").psnr_db.mean()
     best = "" if mean.isna().all() else str(mean.idxmax())
-    return Article(key, title_of(runs), summary, built(chapter), sorted(runs.series.unique()), best)
+    shown = built(chapter) if sections is None else sections
+    shown = [replace(of, title="Results") if of.key == "experiment" else of for of in shown]  # named by the article
+    return Article(key, title_of(runs), summary, shown, sorted(runs.series.unique()), best, links)
 
 
 def table(section: Section) -> dict[str, Any]:
-    """Return what the template shows as a table: rows of (text, class); turned if it is wide and short.
+    """Return what the template shows as a table: rows of (text, class, link); turned if it is wide and short.
 
     A column without any text is left out.
     """
-    shown = section.shown().iloc[:MOST_ROWS]
+    shown = section.shown().iloc[: MOST_SORTABLE if section.sortable else MOST_ROWS]
     columns = []
     for name, title in zip(section.shown_columns, shown, strict=True):
         if shown[title].ne("").any():
             kind = "number" if section.is_number(name) else ""
-            ranked = zip(shown[title], section.rank(name), strict=False)
-            columns.append([(title, kind), *((cell, f"{kind} best" if rank == 1 else kind) for cell, rank in ranked)])
-    turned = len(columns) > TURNED > len(shown)
+            links = section.table.get(f"{name} link", [""] * len(section.table))
+            cells = zip(shown[title], section.rank(name), links, strict=False)
+            marked = [(cell, f"{kind} best" if rank == 1 else kind, link) for cell, rank, link in cells]
+            columns.append([(title, kind, ""), *marked])
+    turned = len(columns) > TURNED > len(shown) and not section.sortable
     if columns and not turned:  # a group is named in its first row
-        texts = [text for text, _ in columns[0]]
+        texts = [text for text, _, _ in columns[0]]
         columns[0] = [
-            (text, "repeated" if text == above else kind)
-            for (text, kind), above in zip(columns[0], [None, *texts], strict=False)
+            (text, "repeated" if text == above else kind, link)
+            for (text, kind, link), above in zip(columns[0], [None, *texts], strict=False)
         ]
     rows = columns if turned else list(zip(*columns, strict=True))
     return {"rows": rows, "turned": turned, "more": len(section.table) - len(shown)}

@@ -7,7 +7,7 @@ import pandas as pd
 from gsbench.errors import printable
 from gsbench.measure.record import Renders
 from gsbench.report import paper, stats
-from gsbench.report.frame import Results, covered, title_of
+from gsbench.report.frame import TIMES, Results, covered, names_of, row, title_of, without
 from gsbench.report.section import COLUMNS, Column, Section, number, section
 
 SHOWN = (
@@ -35,12 +35,18 @@ IF_MEASURED = (
     "flicker_truth",
     "psnr_best_on_test_db",
 )
+ORIGIN = ["contributor", "machine", "git_commit"]  # in a merged set, all runs of a row have the same
 TEXT = (
     "Mean over seeds ± half the width of the 95 % interval over seeds. Bold (in a terminal *): the best mean of a "
     "scene and every mean that does not differ from it: the interval of their paired difference contains zero, or they "
     "look equal. “paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a "
     "V100, and whose LPIPS does not name its network. “paper, other data”: the scene here is a stand-in of the same "
     "name, so the two rows cannot be compared."
+)
+MERGED = (
+    "Mean over the seeds of one contributor, machine and commit ± half the width of the 95 % interval over seeds. "
+    "Bold: the best mean of a scene and every mean that does not differ from it. Minutes and FPS are those of the "
+    "row's machine and not ranked: compare them within one machine. Averages are of rows with all scenes."
 )
 
 
@@ -51,35 +57,54 @@ def experiment(chapter: Results, tests: pd.DataFrame) -> Section:
 
 
 def table(chapter: Results, asked: Sequence[str]) -> Section:
-    """Make the table with the given columns of `runs`, or with those that the runs have if none is given."""
-    runs, ok = chapter.runs, chapter.finished.runs
+    """Make the table with the given columns of `runs`, or with those that the runs have if none is given.
+
+    In a merged set (gsbench.report.merge) a row is of one contributor, machine and commit, and has its own times.
+    """
+    runs, ok = (_by_row(of) for of in (chapter.runs, chapter.finished.runs))
+    origin = [name for name in ORIGIN if "contributor" in runs]
     is_all = set(asked) in (set(), set(WITH_TRAIN))
     names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
     by_scene = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
     failed = runs[runs.status != "ok"]
     labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
     by_scene.append(pd.DataFrame({"scene": failed.scene, "label": labels}))
-    scenes = covered(runs)
+    whole = ok[ok.groupby("row").scene.transform("nunique") == runs.scene.nunique()] if origin else ok
+    scenes = covered(whole if origin else runs)
     if runs.scene.nunique() > 1 and scenes:
         where = f"average over {len(scenes)} of {runs.scene.nunique()} scenes"
-        by_scene.append(_means(ok[ok.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
+        by_scene.append(_means(whole[whole.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
     rows = pd.concat(by_scene, ignore_index=True)
-    rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
+    if not origin:
+        rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
     shown = [c for name in names for c in (name, f"{name} ±", f"{name} rank") if c in rows]
-    order = ["scene", "label", *shown, "seeds"]
+    order = ["scene", "label", *origin[:1], *shown, "seeds", *origin[1:]]
     rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
-    return Section("experiment", f"Results: {title_of(runs)}", TEXT, rows, notes=tuple(_notes(chapter)))
+    title, notes = f"Results: {title_of(runs)}", tuple(_notes(chapter))
+    columns = {"git_commit": Column("commit")}
+    return Section("experiment", title, MERGED if origin else TEXT, rows, columns, notes=notes, sortable=bool(origin))
+
+
+def _by_row(runs: pd.DataFrame) -> pd.DataFrame:
+    """Add what names a row of the table: the label; in a merged set also the origin, whose times then count."""
+    if "contributor" not in runs:
+        return runs.assign(row=runs.label)
+    times = pd.DataFrame([row(record) for record in runs.record], runs.index, TIMES, dtype=float)
+    label = names_of(runs.assign(variant=[without(variant, "from") for variant in runs.variant]))
+    runs = runs.assign(**times, timed_on=runs.machine, label=label, git_commit=runs.git_commit.str[:12])
+    return runs.assign(row=runs[["label", *ORIGIN]].agg("\n".join, axis=1))
 
 
 def _means(runs: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    """Return the means of each row of the table with their ranks."""
-    rows = stats.means(runs, ["label"], names)
+    """Return the means of each row of the table with their ranks; times of several machines have none."""
+    rows = stats.means(runs, ["row"], names)
     for name in names:
         column = COLUMNS.get(name) or Column(name)
-        if column.better:
-            ranks = stats.ranks(runs, "label", name, column.better == "higher", column.show)
-            rows[f"{name} rank"] = rows.label.map(ranks)
-    return rows
+        if column.better and not (name in TIMES and "contributor" in runs):
+            ranks = stats.ranks(runs, "row", name, column.better == "higher", column.show)
+            rows[f"{name} rank"] = rows.row.map(ranks)
+    named = [name for name in ("label", *ORIGIN) if name in runs]
+    return rows.merge(runs.drop_duplicates("row")[["row", *named]], validate="one_to_one")
 
 
 def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> Iterator[pd.DataFrame]:

@@ -139,6 +139,8 @@ def runs(chapter: Results, tests: pd.DataFrame) -> Section:
     )
     text = "A time is empty if the run was on another machine than most."
     table.insert(0, "run", [record.path.as_posix() for record in all_runs.record])
+    if "contributor" in all_runs:
+        table.insert(1, "contributor", all_runs.contributor)
     table = table.sort_values("status", key=lambda status: status == "ok", kind="stable")
     table = table if (all_runs.status != "ok").any() else table.drop(columns="reason")
     return Section("runs", "Every run", text, table.reset_index(drop=True), folded=True)
