@@ -30,6 +30,7 @@ from gsbench.measure.renders import HOW_TO, CheckedRenders, check_renders
 from gsbench.models.registry import is_registered
 from gsbench.process.ending import end_with
 from gsbench.process.memory import is_out_of_memory
+from gsbench.run import drift
 from gsbench.run.execution import summary
 from gsbench.run.identity import RunSpec, identify
 from gsbench.run.measuring import measure_images, protocol_of
@@ -114,8 +115,8 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
             instruction_set=kernels.instruction_set(),
             device=torch.cuda.get_device_name(config.device) if on_gpu else None,
         ),
-        metrics=measured.metrics,
-        missing=measured.missing,
+        metrics=measured.metrics | dict.fromkeys(drift.NAMES),
+        missing=measured.missing | dict.fromkeys(drift.NAMES, "needs the Gaussians, not their images"),
         per_view=measured.per_view,
         regions=measured.regions,
         cost=costs,

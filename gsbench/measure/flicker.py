@@ -83,6 +83,7 @@ class FlickerScores:
         moved: Mapping[str, Mask],  # the pixels that move, by the name of the view
     ) -> None:
         self.films: list[Film] = []
+        self.still: list[tuple[list[View], Mask]] = []  # the views of each film, and its static pixels
         self._film_of: dict[str, Film] = {}
         self.missing_because = NO_FILM
         for film in films_of(views):
@@ -91,6 +92,7 @@ class FlickerScores:
                 self.missing_because = "no pixel of the film stands still"
                 continue
             self.films.append(Film(len(film), still))
+            self.still.append((film, still))
             self._film_of |= dict.fromkeys((view.name for view in film), self.films[-1])
 
     def measured(self, images: Iterable[tuple[str, Tensor, Tensor]]) -> Iterator[tuple[str, Tensor, Tensor]]:

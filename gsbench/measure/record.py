@@ -47,6 +47,8 @@ METRICS = (
     "flicker",  # steps of 8 bits, of the error in static pixels from frame to frame: gsbench.measure.flicker
     "static_drift",  # the same from the first third of a film to the last
     "flicker_truth",  # of the ground truth itself
+    "drift_3d",  # in the user's unit of length, the path of Gaussians seen in static pixels: gsbench.run.drift
+    "drift_3d_px",  # the same in pixels
     "psnr_float32",  # dB, the most by which float32 changes `psnr` of a view, of three views (gsbench.stability)
     "psnr_background_only",  # dB of an image of the background alone, which is what a model that learned nothing gets
 )

@@ -37,6 +37,10 @@ RUNS = (
     RunColumn("flicker", "metrics.flicker", float, "steps of 8 bits by which errors of static pixels change a frame"),
     RunColumn("static_drift", "metrics.static_drift", float, "the same from the first third of a film to the last"),
     RunColumn("flicker_truth", "metrics.flicker_truth", float, "of the ground truth itself"),
+    RunColumn(
+        "drift_3d", "metrics.drift_3d", float, "path over a film of Gaussians seen in static pixels, user's unit"
+    ),
+    RunColumn("drift_3d_px", "metrics.drift_3d_px", float, "the same in pixels"),
     RunColumn("psnr_float32_db", "metrics.psnr_float32", float, "the most by which float32 changes the PSNR of a view"),
     RunColumn("psnr_background_only_db", "metrics.psnr_background_only", float, "of the background alone"),
     RunColumn("ssim", "metrics.ssim", float, "scikit-image, Gaussian window"),

@@ -48,6 +48,8 @@ COLUMNS = {
     "flicker": Column("flicker", 2, "lower"),
     "static_drift": Column("static drift", 2, "lower"),
     "flicker_truth": Column("flicker of the truth", 2),
+    "drift_3d": Column("3D drift", 4, "lower"),
+    "drift_3d_px": Column("3D drift, pixels", 2, "lower"),
     "psnr_best_on_test_db": Column("psnr_best_on_test (leaks)", 2),
     "psnr_val_db": Column("PSNR val", 2, "higher"),
     "train_min": Column("train min", None, "lower"),

@@ -21,6 +21,8 @@ from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import peak_memory, synchroniser, time_renders
 from gsbench.models.render import GraphedFrames
+from gsbench.run import drift
+from gsbench.run.drift import Still
 from gsbench.run.settings import lpips_weights
 from gsbench.scenes import Scene, View
 from gsbench.stability.float32_error import psnr_float32
@@ -52,6 +54,8 @@ class MeasuredImages:
     per_view: list[ViewScore]
     regions: dict[str, Region]
     images: dict[str, Pixels]  # by file name
+    still: Sequence[Still]  # films with their static pixels
+    no_film: str  # why there is none
 
 
 def measure_images(
@@ -77,6 +81,8 @@ def measure_images(
         regions.with_scores(quality.per_view),
         regions.of_record() | flicker.of_record(),
         {"pictures.png": strip(shown)} | flicker.pictures() if shown else {},
+        flicker.still,
+        flicker.missing_because,
     )
 
 
@@ -123,6 +129,8 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Meas
     metrics["psnr_float32"], why = psnr_float32(trainer.model, trainer.views, renderer.background, renderer.antialias)
     if why:
         missing["psnr_float32"] = why
+    metrics |= drift.of_films(trainer.model, measured.still, renderer.antialias, trainer.scene.placement.unit)
+    missing |= {} if measured.still else dict.fromkeys(drift.NAMES, measured.no_film)
     images = measured.images
     if images and with_effect_sets:
         first = views[0]

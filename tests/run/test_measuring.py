@@ -66,7 +66,8 @@ def test_views_at_the_cap_are_named() -> None:
 
 
 def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> None:
-    """Catches numbers of renders in 8 bits in place of floats, and a film that leaves no picture."""
+    """Catches numbers of renders in 8 bits in place of floats, a film that leaves no picture, and a static model whose
+    Gaussians move."""
     data = shutil.copytree(square, tmp_path / "data")
     path = data / "square/transforms_test.json"
     content = json.loads(path.read_text())
@@ -76,8 +77,11 @@ def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> N
     floats, folder = run_here(*overrides(data, tmp_path, "model=4dgs"))
     assert floats.status == "ok", floats.reason
     assert floats.metrics["flicker"] > 0 == floats.metrics["flicker_truth"]
+    assert floats.metrics["drift_3d"] > 0 < floats.metrics["drift_3d_px"]
     assert floats.regions["static"].views == 3
     assert (folder / "flicker.png").is_file()
+    static, _ = run_here(*overrides(data, tmp_path, "model=3dgs"))
+    assert static.metrics["drift_3d"] == 0 == static.metrics["drift_3d_px"]
     in_8_bits, _ = run_here(*overrides(data, tmp_path, "model=4dgs", "protocol.quantise=true"))
     assert in_8_bits.metrics["psnr"] != floats.metrics["psnr"]
     assert in_8_bits.metrics["flicker"] == floats.metrics["flicker"]
