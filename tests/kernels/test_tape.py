@@ -1,5 +1,6 @@
 """A tape's gradients against autograd's: the same bits, where operations are chained and where torch is in between."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -54,6 +55,15 @@ def gradients(of: GaussianModel) -> dict[str, Tensor]:
     taken = {name: p.grad for name, p in of.named_parameters() if p.grad is not None}
     of.zero_grad(set_to_none=True)
     return taken
+
+
+def test_a_tape_records_its_thread_alone() -> None:
+    """Catches calls of another thread on a tape, where autograd does not see them: a viewer beside a probe."""
+    fitting, (view,) = fitted("4dgs", 20), views(1)
+    with Tape(), ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(fitting.slice, CameraTime.of(view.camera, view.time)).result()
+    beside.opacities.sum().backward()
+    assert float(gradients(fitting)["splats.opacities"].abs().sum()) > 0
 
 
 def test_a_tape_runs_backwards_for_several_vectors() -> None:
