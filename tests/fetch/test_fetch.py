@@ -15,7 +15,7 @@ import pytest
 from gsbench.errors import InputError
 from gsbench.fetch.__main__ import fetch, main
 from gsbench.fetch.download import download
-from gsbench.fetch.sources import MIRROR, Source
+from gsbench.fetch.sources import Source
 
 PAYLOAD = bytes(range(256)) * 4000  # a megabyte, many chunks
 
@@ -142,7 +142,7 @@ def test_a_proxy_of_the_environment_is_asked(address: str, tmp_path: Path, monke
 
 def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     """Run the command against a mirror."""
-    monkeypatch.setenv(MIRROR, address)
+    monkeypatch.setenv("GSBENCH_MIRROR", address)
     monkeypatch.setenv("TORCH_HOME", str(to / "torch"))
     return main([*words, "--to", str(to / "data")])
 
@@ -252,7 +252,7 @@ def test_what_cannot_be_fetched_is_told(
         for words in (["dnerf"], ["dnerf", "--dry-run"]):
             assert fetched(mirror, tmp_path, monkeypatch, *words) == 2
             (line,) = capsys.readouterr().err.splitlines()
-            assert MIRROR in line
+            assert "GSBENCH_MIRROR" in line
             assert line.isprintable()
     for to in ("a\0b", "~nobody.of.that.name/x"):
         for words in (["dnerf"], ["--list"]):

@@ -135,16 +135,17 @@ def test_a_missing_image_is_named_before_anything_is_submitted(
     assert [path.parent for path in plan.find(tmp_path / "mini")] == [folder]
 
 
-def test_a_folder_that_cannot_be_bound_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["a,b", "a:b"])
+def test_a_folder_that_cannot_be_bound_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a folder that Apptainer would read as two."""
-    folder = tmp_path / "a,b"
+    folder = tmp_path / name
     folder.mkdir()
     monkeypatch.chdir(folder)
     plan.write(Plan("slurm", []), folder)
     (folder / "x.sif").touch()
     with hydra_with(None):
         config = compose_run(["+exp=mini", "scene=suzanne", "launch.container=x.sif"])
-    with pytest.raises(InputError, match="a,b': rename it"):
+    with pytest.raises(InputError, match=f"{name}': rename it"):
         in_container([config], folder)
 
 

@@ -29,6 +29,7 @@ GONE = {**HERE, "born": 1}  # a later process that was given the number of one t
 OTHER = {"host": "elsewhere"}
 JOB, IN_JOB = {"job": "7"}, {"job": "7_0", **GONE}
 DIVERGED = {"status": "diverged", "reason": "step 7: loss is nan", "metrics": None, "cost": None}
+DENIED = "/opt/python: Permission denied"
 SILENT = Queue({}, "squeue is not on this machine")
 
 
@@ -209,11 +210,9 @@ def test_a_lost_job_says_how_it_ended(
 @pytest.mark.parametrize(
     ("log", "cause"),
     [
-        (
-            "/opt/python: Permission denied\nsrun: error: n1: task 0: Exited with exit code 13\n",
-            "/opt/python: Permission denied",
-        ),
+        (f"{DENIED}\nsrun: error: n1: task 0: Exited with exit code 13\n", DENIED),
         ("srun: error: n1: task 0: Exited with exit code 13\n", "srun: error: n1: task 0: Exited with exit code 13"),
+        ("srun: error: n1: task 0: Exited with exit code 13\n" + DENIED, DENIED),
         ("loading\nRuntimeError: this\nsrun: error: n1: task 0: Exited with exit code 1\n", "RuntimeError: this"),
         ("step 5\nslurmd: error: Detected 1 oom_kill event\nstep 6", "slurmd: error: Detected 1 oom_kill event"),
         ("", "(empty)"),

@@ -116,6 +116,9 @@ def test_an_exact_view_has_no_change(run: Path) -> None:
     exactness = float32_error.measure(model, [empty], BLACK, "")
     assert (exactness.views[0].psnr, exactness.views[0].psnr_change) == (100.0, 0.0)
     assert "changes the mean PSNR by 0.0e+00 dB, that of one view by 0.0e+00 dB" in report.verdict(exactness)
+    views = [replace(exactness.views[0], psnr_change=change) for change in (-4e-5, 1e-5)]
+    verdict = report.verdict(replace(exactness, views=views))
+    assert "changes the mean PSNR by 1.5e-05 dB, that of one view by 4.0e-05 dB" in verdict
 
 
 # ---- which Gaussians, and why
