@@ -1,6 +1,7 @@
 """A frame of the viewer: its settings are its own, costs and the bound on float32 are right, two models share it."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -215,6 +216,17 @@ def test_both_precisions_have_the_settings_of_the_browser(agr: FrameRenderer) ->
         assert (plain.image != changed.image).any()
         assert changed.median < 0.1
     assert (agr.float32_error(camera, NOW).image == plain.image).all()
+
+
+def test_a_bound_leaves_the_frame_that_is_rendered_its_settings(agr: FrameRenderer) -> None:
+    """Catches a bound in its own thread that switches effects off in the middle of a frame."""
+    with ThreadPoolExecutor(1) as pool:
+        with agr._lock:  # a frame is being rendered
+            before = agr.run.model.active
+            bound = pool.submit(agr.float32_error, camera_of(0.5, agr), NOW._replace(sh_degree=0))
+            assert not wait([bound], 0.3).done
+            assert agr.run.model.active is before
+        bound.result()
 
 
 def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
