@@ -15,7 +15,7 @@ from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure.images import GAP, Pixels, in_a_row, inferno, to_bytes, write_text
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
-from gsbench.models.render import rasterize_slice
+from gsbench.models.render import rasterize_slice, render_slice
 from gsbench.scenes import Camera
 
 # RGB colours, as on the report's page: a Gaussian has the colour of the model with the same effects.
@@ -48,16 +48,18 @@ def draw(
         InputError: the model depends on time and `time` is None.
     """
     gaussians = model.slice(CameraTime.of(camera, time))
-    layers = (
-        (gaussians.colors, background),
+    legends = (
         (effect_set_colors(model), torch.ones_like(background)),
         (cost_colors(model, most_cost(model)), torch.zeros_like(background)),
     )
-    images = [
-        rasterize_slice(gaussians._replace(colors=colors), camera, behind, model.backend, antialias).image[0]
-        for colors, behind in layers
+    drawn = [
+        render_slice(model, gaussians, camera, background, antialias),
+        *(
+            rasterize_slice(gaussians._replace(colors=colors), camera, behind, model.backend, antialias)
+            for colors, behind in legends
+        ),
     ]
-    panels = [to_bytes(image.cpu().numpy()) for image in images]
+    panels = [to_bytes(output.image[0].cpu().numpy()) for output in drawn]
     panels[2] = inferno(panels[2][..., 0] / 255)
     return _arrange(panels, model.count_by_effects(), most_cost(model))
 

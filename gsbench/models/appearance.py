@@ -90,9 +90,14 @@ def sh_colors(
     orders: Tensor | None = None,  # [N] int32: the SH degree of each Gaussian if it is lower; None: `degree` for all
 ) -> Tensor:  # [N, 3]
     """Compute SH colours max(0, sum_lm beta_lm Y_lm(d) + 0.5), as in 3DGS and 7DGS eq. 2."""
+    return sh_features(coefficients, directions, degree, orders).clamp(min=0)
+
+
+def sh_features(coefficients: Tensor, directions: Tensor, degree: int, orders: Tensor | None = None) -> Tensor:
+    """Compute the sums of `sh_colors`, which may be negative, [N, 3]."""
     basis = _basis_within(directions, degree, orders)
     used = coefficients[:, : basis.shape[-1]]
-    return ((basis[..., None] * used).sum(1) + 0.5).clamp(min=0)
+    return (basis[..., None] * used).sum(1) + 0.5
 
 
 def sh_time_colors(

@@ -27,7 +27,7 @@ from gsbench.models.portable_math import exp, log, sqrt
 from gsbench.models.refinement import OCTAVES, Changes, DeepRefinement, Refinement
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import SH_C0, nearest_distances, size_of
-from gsbench.scenes.scene import Points
+from gsbench.scenes.scene import Camera, Points
 from gsbench.schedule import ActiveComponents
 
 Raw = dict[str, Tensor]  # raw parameters (before exp, sigmoid and normalisation) by name, N rows each
@@ -222,6 +222,23 @@ class GaussianModel(nn.Module, ABC):
                 raw["sh0"], raw["shN"], means, opacities, center=query.center, degree=degree, orders=self.orders
             )[0]
         return sh_colors(torch.cat([raw["sh0"], raw["shN"]], 1), unit(means - query.center), degree, self.orders)
+
+    def decode(
+        self,
+        blended: Tensor,  # [C, H, W, D]
+        camera: Camera,
+    ) -> Tensor:
+        """Turn what the rasterizer has blended of D numbers a Gaussian into images [C, H, W, 3]; here they are colours.
+
+        A model whose `shade` returns features [N, D], of which the first three are blended over the background and the
+        others over 0, overrides this method.
+        """
+        return blended
+
+    @property
+    def decodes(self) -> bool:
+        """Whether `decode` stands between the rasterizer and the image."""
+        return type(self).decode is not GaussianModel.decode
 
     # ---- what every model does
 

@@ -162,10 +162,12 @@ def has_gates(model: GaussianModel) -> TypeGuard[GatedModel]:
 
 def as_gated(model: GaussianModel) -> GatedModel:
     """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
-    if has_gates(model):
-        return model
     name = type(model).__name__
-    if isinstance(model, GatedModel):
+    if model.decodes:
+        cure = f"{name} decodes what is blended, so that its image is no sum over Gaussians: name another"
+    elif has_gates(model):
+        return model
+    elif isinstance(model, GatedModel):
         cure = (
             f"{name} inherits its methods for gates: see that they know all of its parameters, and write class "
             f"{name}(.., gates=True)"

@@ -1,4 +1,4 @@
-"""Define the layers of the networks that change Gaussians over time, and the encoding of what they read."""
+"""Define the layers of networks that change Gaussians over time or decode pixels, and the encoding of positions."""
 
 import math
 
@@ -17,12 +17,19 @@ def encode(x: Tensor, octaves: int) -> Tensor:
 class Linear(nn.Module):
     """A layer W x + b, with ReLU or without, whose weights start as those of torch.nn.Linear, drawn from the seed."""
 
-    def __init__(self, inputs: int, outputs: int, generator: torch.Generator, *, relu: bool = False) -> None:
+    bias: Tensor
+
+    def __init__(
+        self, inputs: int, outputs: int, generator: torch.Generator, *, relu: bool = False, bias: bool = True
+    ) -> None:
         super().__init__()
         self.relu = relu
         bound = 1 / math.sqrt(inputs)
         self.weight = nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator))
-        self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound, generator=generator))
+        if bias:
+            self.bias = nn.Parameter(torch.empty(outputs).uniform_(-bound, bound, generator=generator))
+        else:
+            self.register_buffer("bias", torch.zeros(outputs), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer to [N, inputs]."""

@@ -1,9 +1,11 @@
 """Render an image of a model, once or as a CUDA graph that is replayed for other cameras and times."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -20,16 +22,33 @@ from gsbench.scenes.scene import Camera
 def rasterize_slice(
     gaussians: Gaussians3D, camera: Camera, background: Tensor, backend: Backend, antialias: bool = False
 ) -> RasterOutput:
-    """Rasterize the 3D Gaussians of a model (with colours) for one camera, as `gsbench.raster.rasterize`."""
+    """Rasterize the 3D Gaussians of a model (with colours) for one camera, as `gsbench.raster.rasterize`.
+
+    The background [3] is that of the first three channels; behind further ones there is 0.
+    """
     view = camera.viewmat[None], camera.K[None], camera.width, camera.height
     return rasterize(
         *gaussians[:4],
         *view,
-        background=background,
+        background=_behind(gaussians, background),
         backend=backend,
         antialias=antialias,
         beta_exponents=gaussians.beta_exponents,
     )
+
+
+def _behind(gaussians: Gaussians3D, background: Tensor) -> Tensor:
+    """Return what is behind all channels of 3D Gaussians: the background [3], then zeros."""
+    further = gaussians.colors.shape[-1] - len(background)
+    return F.pad(background, (0, further)) if further else background
+
+
+def render_slice(
+    model: GaussianModel, gaussians: Gaussians3D, camera: Camera, background: Tensor, antialias: bool = False
+) -> RasterOutput:
+    """Render a slice of a model for one camera: rasterize it, and let the model decode what was blended."""
+    output = rasterize_slice(gaussians, camera, background, model.backend, antialias)
+    return replace(output, image=model.decode(output.image, camera))
 
 
 def render(
@@ -37,7 +56,7 @@ def render(
 ) -> Tensor:
     """Render the image [H, W, 3] of a model for a camera and a time in [0, 1], with its backend."""
     gaussians = model.slice(CameraTime.of(camera, time))
-    return rasterize_slice(gaussians, camera, background, model.backend, antialias).image[0]
+    return render_slice(model, gaussians, camera, background, antialias).image[0]
 
 
 MARGIN = 1.25  # room for intersections, as a multiple of what the first image needs
@@ -106,10 +125,12 @@ class GraphedFrames:
         view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
-            means, factors, opacities, colors, beta_exponents = self.model.slice(CameraTime.of(recorded, moment))
-            camera_tensors = recorded.viewmat[None], recorded.K[None], self.background
+            gaussians = self.model.slice(CameraTime.of(recorded, moment))
+            means, factors, opacities, colors, beta_exponents = gaussians
+            camera_tensors = recorded.viewmat[None], recorded.K[None], _behind(gaussians, self.background)
             inputs = RasterInputs(means, factors, opacities, colors[None], *camera_tensors, beta_exponents)
-            return draw_within(inputs, view, room)
+            blended, needed = draw_within(inputs, view, room)
+            return self.model.decode(blended, recorded), needed
 
         with torch.cuda.device_of(recorded.K):
             play, (image, needed) = capture(frame)

@@ -1,4 +1,4 @@
-"""Define Spacetime Gaussians, lite: 3D Gaussians that follow a cubic path, turn, and fade around a time of their own.
+"""Define Spacetime Gaussians, lite and full: 3D Gaussians on cubic paths that turn, and fade around their own times.
 
 Li et al., "Spacetime Gaussian Feature Splatting for Real-Time Dynamic View Synthesis", CVPR 2024, arXiv 2312.16812,
 with the constants of the authors' code.
@@ -10,19 +10,23 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsbench.kernels.slices import slice_free_time
 from gsbench.kernels.tensors import check_positive
+from gsbench.models.appearance import sh_features
 from gsbench.models.base import Raw
-from gsbench.models.camera_time import CameraTime, initial_times
+from gsbench.models.camera_time import CameraTime, initial_times, unit
 from gsbench.models.factors import sizes
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.moving import MovingGaussians3D
-from gsbench.models.portable_math import exp
+from gsbench.models.networks import Linear
+from gsbench.models.portable_math import exp, sigmoid
 from gsbench.models.registry import register
-from gsbench.scenes.scene import Points
+from gsbench.scenes.points import SH_C0
+from gsbench.scenes.scene import Camera, Points
 
+HIDDEN = 6  # units of the decoder
 LOG_ROOT_2 = 0.5 * math.log(2)  # exp(-(x / s)^2) has the standard deviation s / sqrt(2)
 
 
@@ -104,6 +108,63 @@ class SpacetimeModel(MovingGaussians3D, gates=True):
 
     def hold_lifetimes(self, least: float) -> None:
         self.splats["durations"].data.clamp_(min=math.log(least) + LOG_ROOT_2)
+
+
+@register("stg_full")
+class SpacetimeFeatureModel(SpacetimeModel):
+    """Spacetime Gaussians, full: a Gaussian has nine features, and a small network decodes the pixels they blend to,
+
+        blended = (base, view, e time)        pixel = sigmoid(base + V relu(U (view, e time, ray)))
+
+    A ray is the camera's centre and the unit vector to the pixel. As the image is decoded, the model has no gates.
+    """
+
+    decoder: nn.Sequential  # U and V, of an initialised model
+
+    def __init__(
+        self,
+        *,
+        saturate: bool = False,  # by a sigmoid, as the authors for N3V; false: clip, as for Technicolor
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.saturate = saturate
+
+    def initialise(self, points: Points, extent: float, generator: torch.Generator) -> None:
+        super().initialise(points, extent, generator)
+        hidden = Linear(3 + 3 + 6, HIDDEN, generator, relu=True, bias=False)
+        self.decoder = nn.Sequential(hidden, Linear(HIDDEN, 3, generator, bias=False))
+
+    def initial_colors(self, dc: Tensor) -> Raw:
+        """Return the colours of the points as features of base and view, and features of time that are zero."""
+        features = {"view_features": 0.5 + SH_C0 * dc, "time_features": torch.zeros_like(dc)}
+        return super().initial_colors(dc) | features
+
+    def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
+        """Return the features of 3D Gaussians that are blended, [N, 9]; they may be negative."""
+        coefficients = torch.cat([raw["sh0"], raw["shN"]], 1)
+        base = sh_features(coefficients, unit(means - query.center), self.active.sh_degree)
+        e = offset(raw, query).detach()
+        return torch.cat([base, raw["view_features"], e * raw["time_features"]], 1)
+
+    def decode(self, blended: Tensor, camera: Camera) -> Tensor:
+        base, features = blended.split([3, 6], -1)
+        rays = pixel_rays(camera).expand(*features.shape[:-1], 6)
+        decoded = self.decoder(torch.cat([features, rays], -1).flatten(0, -2)).view_as(base)
+        return sigmoid(base + decoded) if self.saturate else (base + decoded).clamp(0, 1)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        return super().groups() | {"decoder": list(self.decoder.parameters())}
+
+
+def pixel_rays(camera: Camera) -> Tensor:
+    """Return the camera's centre and the unit vector to the centre of each pixel, world space, [H, W, 6]."""
+    K = camera.K
+    x, y = (torch.arange(size, dtype=K.dtype, device=K.device) + 0.5 for size in (camera.width, camera.height))
+    (fx, _, cx), (_, fy, cy), _ = K
+    right, down, forward = camera.viewmat[:3, :3]
+    sight = ((x - cx) / fx)[:, None] * right + ((y - cy) / fy)[:, None, None] * down + forward
+    return torch.cat([camera.center.expand_as(sight), unit(sight)], -1)
 
 
 def offset(raw: Raw, query: CameraTime) -> Tensor:

@@ -188,7 +188,10 @@ class RenderedTwice(NamedTuple):
 
 
 def check_exactness(model: GaussianModel) -> None:
-    """Raise InputError if the images of a model have no bound on the error of float32: they need the CPU kernels."""
+    """Raise InputError if the images of a model have no bound on the error of float32.
+
+    They need the CPU kernels, and an image that is blended and not decoded.
+    """
     means = model.splats["means"]
     if means.device.type != "cpu":
         raise InputError(
@@ -200,6 +203,11 @@ def check_exactness(model: GaussianModel) -> None:
             "expected the CPU kernels, which have a float64 twin, but they are not built in this "
             "installation: reinstall with a C++20 compiler",
             docs="install.md#without-a-compiler",
+        )
+    if model.decodes:
+        raise InputError(
+            f"expected a model whose image is what is blended, {type(model).__name__} decodes it, and the bound on "
+            f"the error of float32 ends before that"
         )
 
 
@@ -225,8 +233,10 @@ def render_twice(
     """Render a view of a model in float32, and of its copy in float64.
 
     Raises:
-        InputError: the CPU kernels are not installed, or a Gaussian has a value that is not finite.
+        InputError: the model decodes what is blended, the CPU kernels are not installed, or a Gaussian has a value that
+            is not finite.
     """
+    check_exactness(model)
     single = model.slice(CameraTime.of(camera, time))
     image = rasterize_slice(single, camera, background, model.backend, antialias).image[0]
     gaussians = double.slice(CameraTime.of(float64_camera(camera), time))

@@ -14,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
 from gsbench.measure.speed import StageClock
 from gsbench.models import CameraTime, GaussianModel
-from gsbench.models.render import rasterize_slice
+from gsbench.models.render import render_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.divergence import DivergedError
@@ -202,9 +202,7 @@ class Step:
                 gaussians = self.model.slice(query)
             with stages("raster"):
                 try:
-                    output = rasterize_slice(
-                        gaussians, view.camera, self.background, self.model.backend, self.antialias
-                    )
+                    output = render_slice(self.model, gaussians, view.camera, self.background, self.antialias)
                 except InputError as error:  # the rasterizer checks its inputs, so it is the first to see NaN
                     if all(tensor.isfinite().all() for tensor in gaussians if tensor is not None):
                         raise

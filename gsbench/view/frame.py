@@ -19,7 +19,7 @@ from gsbench.measure.images import STEPS, Pixels, inferno, rounding_image, to_by
 from gsbench.measure.speed import Laps
 from gsbench.models import GaussianModel
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.render import rasterize_slice
+from gsbench.models.render import rasterize_slice, render_slice
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
@@ -190,12 +190,14 @@ class FrameRenderer:
             run.model.active = self._active(request)
             gaussians = run.model.slice(query)
             watch.end(SLICE)
+            background, antialias = self._background(request), run.config.raster.antialias
             if request.colours in self._colors:
                 gaussians = gaussians._replace(colors=self._colors[request.colours])
-            background = self._background(request)
-            image = rasterize_slice(gaussians, camera, background, run.model.backend, run.config.raster.antialias).image
+                output = rasterize_slice(gaussians, camera, background, run.model.backend, antialias)
+            else:
+                output = render_slice(run.model, gaussians, camera, background, antialias)
             watch.end(RASTER)
-            return image[0], watch.ms
+            return output.image[0], watch.ms
 
     def _background(self, request: FrameRequest) -> Tensor:
         """Return the background colour of a frame, [3]; colours with a legend keep the background of that legend."""

@@ -75,9 +75,15 @@ def trained_of(model: GaussianModel, query: CameraTime, *, keep_harmonics: bool 
     otherwise each Gaussian has the constant colour that is seen from the query's viewpoint.
 
     Raises:
-        InputError: spherical harmonics are requested from a model whose geometry or colours depend on the viewpoint in
-            another way, no Gaussian is drawn, or one is not finite.
+        InputError: the model decodes what is blended, spherical harmonics are requested from a model whose geometry or
+            colours depend on the viewpoint in another way, no Gaussian is drawn, or one is not finite.
     """
+    if model.decodes:
+        raise InputError(
+            f"expected a model whose Gaussians have colours, {type(model).__name__} decodes features after they are "
+            f"blended, for which a PLY has no field: use --images or --video",
+            docs="viewing.md#export",
+        )
     if keep_harmonics and not has_harmonics(model):
         raise InputError(
             f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it",

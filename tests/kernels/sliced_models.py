@@ -32,7 +32,7 @@ OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {  # the options of each model 
     ),
     "7dgs_nodir": ({}, {"factor_order": "paper"}, {"off_diagonal": "row_scaled"}, {"scheme": "cholesky"}),
     **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static"), ({},)),
-    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ({},)),
+    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg", "stg_full"), ({},)),
 }
 CASES = [(name, options) for name, every in OPTIONS.items() for options in every]
 SPREADS = {"betas": 0.7, "coupling": 0.5, "velocities": 0.5, "skew": 0.3, "directions": 0.7, "opacities": 2.0}

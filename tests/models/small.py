@@ -12,7 +12,7 @@ from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gated import has_gates
 from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
 from gsbench.models.refinement import Changes, DeepRefinement
-from gsbench.scenes.scene import Points
+from gsbench.scenes.scene import Camera, Points
 from gsbench.schedule import ActiveComponents
 
 N = 24
@@ -68,6 +68,14 @@ EVERY = VARIANTS | {
 
 def seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def pinhole(width: int, height: int) -> Camera:
+    """A camera at CAMERA that looks along z, in float64."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = -CAMERA
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(viewmat, K, width, height)
 
 
 def started(model: GaussianModel, count: int = N, seed: int = 0) -> GaussianModel:

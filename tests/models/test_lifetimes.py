@@ -16,7 +16,7 @@ IN_TIME = {
     "4dgs": ("scales", 3, -20.0),
     "dbs": ("precision", -1, 20.0),
     "dgs": ("precision", -1, 20.0),
-    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg"), ("durations", 0, -20.0)),
+    **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg", "stg_full"), ("durations", 0, -20.0)),
     "ubs": ("scales", -1, -20.0),
 }
 TIMED = [
@@ -26,7 +26,7 @@ TIMED = [
     or ("time" in registry.find(name).observes and issubclass(registry.find(name), CholeskyModel))
 ]
 # Nothing else dims these: they are visible in the whole of their intervals.
-EXACT = ("7dgs_nodir", "freetime", "sharptime", "stg")
+EXACT = ("7dgs_nodir", "freetime", "sharptime", "stg", "stg_full")
 LEAST = 0.04
 
 

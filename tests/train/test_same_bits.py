@@ -41,6 +41,7 @@ SLOW = (
     "ndgs",
     "sharptime",
     "stg",
+    "stg_full",
     "ubs",
 )
 

@@ -49,10 +49,12 @@ NOW = FrameRequest(0.4)
 needs_kernels = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
 
 
-def renderer(backend: Backend = AUTO, effect_sets: EffectSets | None = None) -> FrameRenderer:
-    """Of 7DGS with AGR, in the midst of a training."""
-    model = lively("7dgs_agr", count=80, backend=backend).float()
-    model.set_active(ActiveComponents(3, True, True))
+def renderer(
+    backend: Backend = AUTO, effect_sets: EffectSets | None = None, variant: str = "7dgs_agr"
+) -> FrameRenderer:
+    """Of 7DGS with AGR or of another model, in the midst of a training."""
+    model = lively(variant, count=80, backend=backend).float()
+    model.set_active(ActiveComponents(3, model.agr, True))
     model.effect_sets = effect_sets
     scene = SceneDescription("small", "0", 4.0, [0.0, 0.0, 0.0], True, SIZE, SIZE, list(UP), [0.0] * 3, 1.0)
     run = LoadedRun(model.requires_grad_(False), Config(), scene, 1, Path("7dgs/seed0"))
@@ -114,10 +116,15 @@ def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
         assert (early.render(here, NOW).image == changed[name]).all()
 
 
-@pytest.mark.parametrize("effect_sets", [None, of_every_effect_set()], ids=["without effect sets", "with effect sets"])
-def test_colours_are_those_of_the_picture_of_effect_sets(effect_sets: EffectSets | None) -> None:
-    """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background."""
-    gated = renderer(effect_sets=effect_sets)
+@pytest.mark.parametrize(
+    ("variant", "effect_sets"),
+    [("7dgs_agr", None), ("7dgs_agr", of_every_effect_set()), ("stg_full", None)],
+    ids=["without effect sets", "with effect sets", "decoded"],
+)
+def test_colours_are_those_of_the_picture_of_effect_sets(variant: str, effect_sets: EffectSets | None) -> None:
+    """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background, and
+    an image that is not decoded, or a legend that is."""
+    gated = renderer(effect_sets=effect_sets, variant=variant)
     camera = camera_of(0.5, gated)
     panels = picture.draw(gated.run.model, camera, 0.4, BLACK)[picture.LINE :]
     factor = -(-picture.LEAST_WIDTH // SIZE)
@@ -236,6 +243,8 @@ def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypat
     on_gpu: Any = SimpleNamespace(splats={"means": torch.empty(2, 3, device="meta")}, backend=AUTO)
     with pytest.raises(InputError, match="--device cpu"):
         check_exactness(on_gpu)
+    with pytest.raises(InputError, match="SpacetimeFeatureModel decodes it"):
+        renderer(variant="stg_full").float32_error(camera_of(0.5, agr), NOW)
     monkeypatch.setattr(kernels, "available", lambda: False)
     with pytest.raises(InputError, match="reinstall"):
         check_exactness(agr.run.model)

@@ -35,11 +35,11 @@ class WeighedImage:
         """Render the view; `background` is its colour, [3]."""
         with torch.no_grad():
             gaussians = model.slice(CameraTime.of(view.camera, view.time))
-        self._colors = gaussians.colors.detach().requires_grad_()  # [N, 3]
+        self._colors = gaussians.colors.detach().requires_grad_()  # [N, D]
         gaussians = gaussians._replace(colors=self._colors)
         with torch.enable_grad(), Tape() as self._tape:
             self._output = rasterize_slice(gaussians, view.camera, background, model.backend, antialias).image
-        self.image = self._output.detach()[0]  # [H, W, 3]
+        self.image = model.decode(self._output, view.camera)[0].detach()  # [H, W, 3]
 
     def weights(self, pixels: Tensor) -> Tensor:
         """Return for each Gaussian the sum of its blend weights times the factors `pixels` [H, W], [N]."""
