@@ -26,38 +26,47 @@ struct Left {
     int64_t row, step;
 };
 
-// Adds A B to sums that begin at `begin(column)`, for R rows of A, from row r on, and a panel of B; finish(sum, row,
-// column) stores them.
-template <int R, class Begin, class Finish>
+// Adds A B to sums that begin at `begin(column)`, for R rows of A, from row r on, and V vectors of a panel of B;
+// finish(sum, row, column) stores them.
+template <int R, int V, class Begin, class Finish>
 GSB_HD inline void multiply_tile(const Left& A, int64_t r, const float* panel, int64_t inner, int column, Begin begin,
                                  Finish finish) {
     const float* a = A.start + r * A.row;
-    Vec sums[R][TILE_VECTORS];
-    GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) {
+    Vec sums[R][V];
+    GSB_UNROLL for (int v = 0; v < V; ++v) {
         const Vec first = begin(column + v * LANES);
         GSB_UNROLL for (int k = 0; k < R; ++k) sums[k][v] = first;
     }
     for (int64_t i = 0; i < inner; ++i) {
-        Vec b[TILE_VECTORS];
-        GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) b[v] = Vec::load(panel + i * PANEL + v * LANES);
+        Vec b[V];
+        GSB_UNROLL for (int v = 0; v < V; ++v) b[v] = Vec::load(panel + i * PANEL + v * LANES);
         GSB_UNROLL for (int k = 0; k < R; ++k) {
             const Vec x(a[k * A.row + i * A.step]);
-            GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) sums[k][v] += x * b[v];
+            GSB_UNROLL for (int v = 0; v < V; ++v) sums[k][v] += x * b[v];
         }
     }
     GSB_UNROLL for (int k = 0; k < R; ++k) {
-        GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) finish(sums[k][v], r + k, column + v * LANES);
+        GSB_UNROLL for (int v = 0; v < V; ++v) finish(sums[k][v], r + k, column + v * LANES);
     }
 }
 
-// Computes the product for `rows` rows of A and the panel of B whose first column is `column`.
+// Computes the product for the rows of A from r on and V vectors of a panel, R rows at a time, and fewer at the end.
+template <int R, int V, class Begin, class Finish>
+void multiply_rows(const Left& A, int64_t r, int64_t rows, const float* panel, int64_t inner, int column, Begin begin,
+                   Finish finish) {
+    for (; r + R <= rows; r += R) multiply_tile<R, V>(A, r, panel, inner, column, begin, finish);
+    if constexpr (R > 1) multiply_rows<R / 2, V>(A, r, rows, panel, inner, column, begin, finish);
+}
+
+// Computes the product for `rows` rows of A and the panel of B whose first column is `column` of `columns`.
 template <class Begin, class Finish>
-void multiply(const Left& A, int64_t rows, const float* panel, int64_t inner, int column, Begin begin, Finish finish) {
-    int64_t r = 0;
-    for (; r + TILE_ROWS <= rows; r += TILE_ROWS) {
-        multiply_tile<TILE_ROWS>(A, r, panel, inner, column, begin, finish);
+void multiply(const Left& A, int64_t rows, const float* panel, int64_t inner, int column, int columns, Begin begin,
+              Finish finish) {
+    if (columns - column > LANES) {
+        multiply_rows<TILE_ROWS, TILE_VECTORS>(A, 0, rows, panel, inner, column, begin, finish);
+    } else {
+        multiply_rows<TILE_ROWS, 1>(A, 0, rows, panel, inner, column, begin, finish);
     }
-    for (; r < rows; ++r) multiply_tile<1>(A, r, panel, inner, column, begin, finish);
 }
 
 // Returns how many of the sixteen columns from `column` on there are: zero or fewer if none.
@@ -133,7 +142,7 @@ void linear(const LinearArgs& a, const Layer& out) {
                 if (a.relu) y = select(y < Vec(0.0f), Vec(0.0f), y);  // NaN stays
                 if (n > 0) store_first(y, out.y + (first + row) * a.K + column, n);
             };
-            multiply({a.x + first * a.C, a.C, 1}, rows, transposed.data() + k * a.C, a.C, k, begin, finish);
+            multiply({a.x + first * a.C, a.C, 1}, rows, transposed.data() + k * a.C, a.C, k, a.K, begin, finish);
         }
     }
 }
@@ -155,13 +164,13 @@ void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGr
         for (int c = 0; c < a.C; c += PANEL) {
             if (out.x) {
                 fill_panel([&](int64_t k) { return a.weight + k * a.C; }, a.K, c, a.C, panel);
-                multiply({G, a.K, 1}, count, panel, a.K, c, at_zero, [&](Vec x, int64_t row, int column) {
+                multiply({G, a.K, 1}, count, panel, a.K, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
                     const int n = lanes_of(column, a.C);
                     if (n > 0) store_first(x, out.x + int64_t{chunk[row]} * a.C + column, n);
                 });
             }
             fill_panel([&](int64_t i) { return a.x + int64_t{chunk[i]} * a.C; }, count, c, a.C, panel);
-            multiply({G, 1, a.K}, a.K, panel, count, c, at_zero, [&](Vec x, int64_t row, int column) {
+            multiply({G, 1, a.K}, a.K, panel, count, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
                 const int n = lanes_of(column, a.C);
                 if (n > 0) store_first(x, g_weight + row * a.C + column, n);
             });

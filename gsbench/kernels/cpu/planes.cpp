@@ -81,11 +81,6 @@ GSB_HD inline void find_cells(const PlaneArgs& a, const Level& level, int kind, 
     }
 }
 
-// Loads and stores n channels; masked stores of all sixteen would take longer.
-GSB_HD inline Vec load(const float* p, int n) { return n == LANES ? Vec::load(p) : load_some(p, n); }
-GSB_HD inline void store(Vec x, float* p, int n) { n == LANES ? x.store(p) : store_first(x, p, n); }
-GSB_HD inline void add(Vec x, float* p, int n) { store(load(p, n) + x, p, n); }
-
 // A sample of a plane, and its derivatives along columns and rows.
 struct Sample {
     Vec value, along, across;
@@ -93,8 +88,8 @@ struct Sample {
 
 GSB_HD inline Sample sample(const float* nodes, const Cell& cell, int64_t next, int n) {
     const float* p = nodes + cell.first;
-    const Vec a = load(p, n), b = load(p + next, n) - a;
-    const Vec c = load(p + cell.row, n), d = load(p + cell.row + next, n) - c;
+    const Vec a = load_some(p, n), b = load_some(p + next, n) - a;
+    const Vec c = load_some(p + cell.row, n), d = load_some(p + cell.row + next, n) - c;
     const Vec top = a + Vec(cell.along.share) * b, bottom = c + Vec(cell.along.share) * d, across = bottom - top;
     return {top + Vec(cell.across.share) * across, b + Vec(cell.across.share) * (d - b), across};
 }
@@ -103,10 +98,10 @@ GSB_HD inline void add_sample(Vec g, float* nodes, const Cell& cell, int64_t nex
     float* p = nodes + cell.first;
     const Vec bottom = g * Vec(cell.across.share), top = g - bottom;
     const Vec right = top * Vec(cell.along.share), bottom_right = bottom * Vec(cell.along.share);
-    add(top - right, p, n);
-    add(right, p + next, n);
-    add(bottom - bottom_right, p + cell.row, n);
-    add(bottom_right, p + cell.row + next, n);
+    add_first(top - right, p, n);
+    add_first(right, p + next, n);
+    add_first(bottom - bottom_right, p + cell.row, n);
+    add_first(bottom_right, p + cell.row + next, n);
 }
 
 }  // namespace
@@ -125,9 +120,9 @@ void sample_planes(const PlaneArgs& a, const Features& out) {
                 for (int c = 0; c < a.C; c += LANES) {
                     const int n = a.C - c < LANES ? a.C - c : LANES;
                     const int64_t at = (first + i) * F + l * a.C + c;
-                    Vec y = a.factors ? load(a.factors + at, n) : Vec(1.0f);
+                    Vec y = a.factors ? load_some(a.factors + at, n) : Vec(1.0f);
                     for (const Cell& cell : cells[i]) y = y * sample(a.nodes + c, cell, a.C, n).value;
-                    store(y, out.features + at, n);
+                    store_first(y, out.features + at, n);
                 }
             }
         }
@@ -150,17 +145,17 @@ void sample_planes_backward(const PlaneArgs& a, const FeatureGrads& grads, const
             for (int64_t i = 0; i < count; ++i) find_cells(a, levels[l], kind, first + i, c, n, cells[i], out.nodes);
             for (int64_t i = 0; i < count; ++i) {
                 const int64_t at = (first + i) * F + l * a.C + c;
-                const Vec g = load(grads.features + at, n);
+                const Vec g = load_some(grads.features + at, n);
                 if (bits(g == Vec(0.0f)) == ALL_LANES) {  // as of a Gaussian behind others
-                    if (a.factors) store(g, out.factors + at, n);
+                    if (a.factors) store_first(g, out.factors + at, n);
                     fill_zero(by_axis, AXES, first + i, first + i + 1);
                     continue;
                 }
-                const Vec factor = a.factors ? load(a.factors + at, n) : Vec(1.0f);
+                const Vec factor = a.factors ? load_some(a.factors + at, n) : Vec(1.0f);
                 Sample samples[PLANES];
                 for (int k = 0; k < PLANES; ++k) samples[k] = sample(a.nodes, cells[i][k], a.C, n);
                 const Vec first_two = samples[0].value * samples[1].value;
-                if (a.factors) store(g * Vec(first_two * samples[2].value), out.factors + at, n);
+                if (a.factors) store_first(g * Vec(first_two * samples[2].value), out.factors + at, n);
                 const Vec by_product = g * factor, by_two = by_product * samples[2].value;
                 const Vec by_sample[PLANES] = {by_two * samples[1].value, by_two * samples[0].value, by_product * first_two};
                 Vec by[AXES] = {Vec(0.0f), Vec(0.0f), Vec(0.0f), Vec(0.0f)};

@@ -247,15 +247,19 @@ GSB_HD inline void store_columns(const Vec (&x)[W], float* p) {
     }
 }
 
-// Loads the first n floats of p, and zero to the other lanes.
-GSB_HD inline Vec load_some(const float* p, int n) { return _mm512_maskz_loadu_ps(first(n), p); }
+// Loads the first n floats of p, and zero to the other lanes. With a mask, it may wait for stores to reach the cache.
+GSB_HD inline Vec load_some(const float* p, int n) {
+    return n == LANES ? Vec::load(p) : Vec(_mm512_maskz_loadu_ps(first(n), p));
+}
 
 // Returns the first n bytes as floats, and zero in the other lanes.
 GSB_HD inline Vec load_bytes(const uint8_t* p, int n) {
     return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_maskz_loadu_epi8(first(n), p)));
 }
 
-GSB_HD inline void store_first(Vec x, float* p, int n) { _mm512_mask_storeu_ps(p, first(n), x.v); }
+GSB_HD inline void store_first(Vec x, float* p, int n) {
+    n == LANES ? x.store(p) : _mm512_mask_storeu_ps(p, first(n), x.v);
+}
 
 // Writes base + k for each bit k that is set, in order, and returns their number; up to 16 entries are overwritten.
 GSB_HD inline int append_bits(uint32_t bits, uint32_t base, uint32_t* out) {
