@@ -88,6 +88,20 @@ def test_directions_of_cameras_side_by_side() -> None:
     np.testing.assert_allclose(basis[:, 1:4], expected, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("miss", "depth", "meets"), [(0.0, 4, True), (1.9, 4, True), (2.1, 4, False), (0.0, -4, False)]
+)
+def test_the_centre_is_where_optical_axes_nearly_meet(miss: float, depth: float, meets: bool) -> None:
+    """Catches a centre of cameras that look past each other, or away from it: each of two axes passes it at `miss`."""
+    poses = [torch.eye(4), torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])]  # along z and x
+    for pose, side in zip(poses, (1, -1), strict=True):
+        pose[:3, 3] = torch.tensor([0.0, side * miss, depth])
+    views = [View("a", Camera(pose, torch.eye(3), 1, 1), 0.0, torch.zeros(1, 1, 3)) for pose in poses]
+    center = static_fit_residuals.center_of(views)
+    assert (center is not None) == meets
+    assert center is None or torch.allclose(center, torch.zeros(3), atol=1e-6)
+
+
 def test_imports_are_no_seconds_of_the_screen() -> None:
     """Catches a screen that is charged for what torch imports with a process's first optimizer, once 1.1 s of 1.5."""
     code = """

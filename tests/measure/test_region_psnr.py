@@ -73,6 +73,7 @@ def test_objects_are_those_of_masks_or_of_alpha() -> None:
     assert of_objects(masked).masks["0"].sum() == 9 * WIDTH
     assert "masks" in of_objects([view("0", (10, 10))]).missing
     assert of_objects(views).digest != of_objects(masked).digest
+    assert len(bytes.fromhex(of_objects(views).digest)) == 32  # SHA-256
 
 
 def test_psnr_is_of_the_region_alone() -> None:

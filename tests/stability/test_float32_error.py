@@ -149,6 +149,10 @@ def test_why_a_gaussian_is_hard() -> None:
     shift[:3, :3] = camera.viewmat[:3, :3]
     rows = torch.arange(5)
     assert float32_error.reasons(exact, camera, rows) == [[], ["flat"], ["huge"], ["opaque"], []]
+    wide = exact._replace(factors=exact.factors * torch.tensor([1, 1, 1, 1, 11.0])[:, None, None])
+    assert float32_error.reasons(wide, camera, rows)[4] == ["huge"]
+    profiles = wide._replace(beta_exponents=torch.full((5,), 4.0, dtype=torch.float64))  # which end at their axes
+    assert float32_error.reasons(profiles, camera, rows)[4] == []
     moved = float32_error.reasons(far_away, float32_error.Camera(shift, camera.K, 32, 32), rows)
     assert all("far" in words for words in moved)
 
