@@ -59,11 +59,16 @@ def test_values_out_of_a_range_or_no_choice_are_refused(dotted, config):
 
 
 def test_rates_of_any_name_have_a_range(config):
-    """Catches a negative learning rate."""
+    """Catches a negative learning rate, and a log-linear decay from or to zero."""
     broken = copy.deepcopy(config)
     broken.model.lr["means"].start = -1
     with pytest.raises(InputError, match=r"^model\.lr\.means\.start: expected at least 0, got -1"):
         check_settings(broken)
+    for field in ("start", "end"):
+        broken = copy.deepcopy(config)
+        setattr(broken.model.lr["means"], field, 0.0)
+        with pytest.raises(InputError, match=r"^model\.lr\.means: expected start >= 0, and start > 0 with end > 0"):
+            check_settings(broken)
 
 
 def test_a_rate_that_ends_early_needs_an_end(config):

@@ -72,6 +72,7 @@ def test_floats_of_an_own_run_have_its_numbers(trained, square, tmp_path, capsys
     assert [view.name for view in record.per_view] == ["test/r_0", "test/r_1"]
     assert [view.psnr for view in record.per_view] == pytest.approx([view.psnr for view in ours.per_view], abs=1e-6)
     assert record.regions == ours.regions
+    assert (record.experiment, record.dataset, record.seed) == (ours.experiment, ours.dataset, ours.seed)
     assert {key: record.protocol[key] for key in ours.protocol if key != "backend"} == {
         key: value for key, value in ours.protocol.items() if key != "backend"
     }

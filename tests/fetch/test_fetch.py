@@ -238,7 +238,8 @@ def test_what_cannot_be_fetched_is_told(
     """Catches a name, a mirror or a folder that is typed wrong, and a folder of Google Drive taken for a file."""
     assert fetched("", tmp_path, monkeypatch, "pbr", "dnrf") == 2
     err = capsys.readouterr().err.splitlines()
-    assert "download it in a browser" in err[0]
+    by_hand = f"download it in a browser (the Data link of gaozhongpai.github.io/7dgs) and unpack it into {tmp_path}"
+    assert f"{by_hand}/data/pbr" in err[0]
     assert "Did you mean 'dnerf'" in err[1]
     for mirror in (
         "ftp://x",

@@ -16,8 +16,10 @@ from worlds import brightening, filmed, moving, small_mover, still
 from gsbench.errors import InputError
 from gsbench.gates import __main__ as command
 from gsbench.gates import permutation_test, static_fit_residuals
+from gsbench.gates.messages import of_screen
 from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import LEAST_FREE, screen_time
+from gsbench.measure.record import TimeScreen
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Camera, Scene, View
 
@@ -76,6 +78,12 @@ def test_a_scene_without_views_is_refused() -> None:
     """Catches a stack trace where a split is empty."""
     with pytest.raises(InputError, match="expected training views"):
         screen_time(replace(timeless(), train=[]))
+
+
+@pytest.mark.parametrize(("decision", "kept"), [("on", ""), ("undecided", ", so time is kept"), ("off", "")])
+def test_the_answer_in_words(decision: str, kept: str) -> None:
+    """Catches time that is said to be kept where it is not."""
+    assert of_screen(TimeScreen(decision, "why", None, None, None, 0.0)) == f"time is {decision}{kept}: why"
 
 
 def test_directions_of_cameras_side_by_side() -> None:

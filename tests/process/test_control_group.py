@@ -104,3 +104,10 @@ def test_the_group_counts_in_what_is_available(monkeypatch):
     """Catches a limit that is read and not used."""
     monkeypatch.setattr(memory, "left_by_control_groups", lambda: 12345)
     assert memory.available() == 12345
+
+
+def test_what_cannot_be_read_is_no_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a system without /proc whose memory counts as used up."""
+    monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 30)
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError()))
+    assert memory.available() is None

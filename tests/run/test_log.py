@@ -27,7 +27,7 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 @pytest.fixture
 def packages(monkeypatch: pytest.MonkeyPatch) -> dict[str, MagicMock]:
     """Mocks of the packages of all trackers, which note every call; each run of theirs has an id of its own."""
-    ids = map("made{}".format, itertools.count())
+    ids = map("made_anew_{}".format, itertools.count())
     mocks = {name: MagicMock() for name in (*TRACKERS, "torch.utils.tensorboard")}
     mocks["wandb"].init.side_effect = lambda id=None, **_: MagicMock(
         id=id or next(ids), log=mocks["wandb"].log, finish=mocks["wandb"].finish
@@ -125,7 +125,8 @@ def sent_to(name: str, packages: dict[str, MagicMock]) -> tuple[dict[int, dict[s
 
 
 @pytest.mark.parametrize(
-    ("name", "ended"), [("tensorboard", call()), ("wandb", call(exit_code=0)), ("mlflow", call("made0", "FINISHED"))]
+    ("name", "ended"),
+    [("tensorboard", call()), ("wandb", call(exit_code=0)), ("mlflow", call("made_anew_0", "FINISHED"))],
 )
 def test_a_tracker_is_sent_the_curve_and_the_results(
     name: str, ended: object, packages: dict[str, MagicMock], square: Path, tmp_path: Path
@@ -156,13 +157,23 @@ def test_a_resumed_run_has_the_same_id(name: str, packages: dict[str, MagicMock]
         ids.append((tmp_path / ID_FILE).read_text())
     (tmp_path / ID_FILE).write_text("../../other")
     RunLog(run_in(tmp_path, name), trainer(step=10)).end(None)
-    assert [*ids, (tmp_path / ID_FILE).read_text()] == ["made0", "made0", "made1", "made2"]
+    assert [*ids, (tmp_path / ID_FILE).read_text()] == [
+        "made_anew_0",
+        "made_anew_0",
+        "made_anew_1",
+        "made_anew_2",
+    ]
     client = packages["mlflow"].MlflowClient()
     if name == "mlflow":
-        assert client.update_run.call_args_list == [call("made0", status="RUNNING")]
-        assert client.set_terminated.call_args == call("made2", "KILLED")
+        assert client.update_run.call_args_list == [call("made_anew_0", status="RUNNING")]
+        assert client.set_terminated.call_args == call("made_anew_2", "KILLED")
     else:
-        assert [words["id"] for _, words in packages[name].init.call_args_list] == [None, "made0", None, None]
+        assert [words["id"] for _, words in packages[name].init.call_args_list] == [
+            None,
+            "made_anew_0",
+            None,
+            None,
+        ]
         assert packages[name].finish.call_args == call(exit_code=1)
 
 

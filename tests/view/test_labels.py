@@ -91,6 +91,9 @@ def test_each_side_of_the_edge_has_its_label(grey: int) -> None:
     assert not right[:, -100:].any()
     assert both.max() == 255
     assert np.median(both[:20, 301:400]) <= 90  # paper
+    equal = labelled(np.zeros((300, 600, 3), np.uint8), 600, ("words", "words"))[..., 0].astype(float).sum(1)
+    middle = np.flatnonzero(equal)[[0, -1]].sum() // 2
+    assert equal[:middle].sum() > 1.1 * equal[middle:].sum()  # the first row is bold
     alone = labelled(image, 600, ROWS)
     assert (alone[:, :400] == grey).all()
     assert (alone[:, 599 - 299 : 599] == both[:, :299]).all() or (alone[:, 400:599] == both[:, 100:299]).all()
