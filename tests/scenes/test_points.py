@@ -20,7 +20,8 @@ from gsbench.scenes.points import frustum_points, nearest_distances, random_poin
 from gsbench.scenes.scene import Camera, Scene, View
 
 VERTEX = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint"}
+KINDS |= {"i1": "char", "i2": "short", "i4": "int"}
 
 
 def ply(vertices: np.ndarray, encoding: str = "binary_little_endian") -> bytes:
@@ -44,11 +45,13 @@ def save(tmp_path: Path, data: bytes) -> Path:
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-1e6, 1e6, width=32)),
     st.sampled_from(["ascii", "binary_little_endian", "binary_big_endian"]),
+    st.sampled_from(sorted(KINDS)),
     st.integers(0, 255),
 )
-def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, red: int) -> None:
-    """Catches swapped columns, a wrong stride, lost digits and a colour off by its scale, in each encoding."""
-    vertices = np.zeros(len(means), VERTEX)
+def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, kind: str, red: int) -> None:
+    """Catches swapped columns, a wrong stride, a column of another width, lost digits and a colour off by its scale, in
+    each encoding."""
+    vertices = np.zeros(len(means), [*VERTEX[:3], ("other", kind), *VERTEX[3:]])
     vertices["x"], vertices["y"], vertices["z"] = means.T
     vertices["red"], vertices["blue"] = red, 255
     points = read_ply(save(tmp_path, ply(vertices, encoding)))

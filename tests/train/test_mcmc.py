@@ -76,7 +76,7 @@ def test_dead_gaussians_move_to_living_ones(name: str) -> None:
     """Catches copies that are not all of the source, a limit that is passed, and moments that stay with old rows."""
     model = moved(started(build(name, **OPTIONS[name]), 40))
     with torch.no_grad():
-        model.splats["opacities"][:] = 1.0
+        model.splats["opacities"][:30] = torch.linspace(-2, 1, 30)  # logits
         model.splats["opacities"][30:] = -8.0  # dead
     before = copy.deepcopy(model.splats.state_dict())
     density, moments = rule(model)
@@ -87,8 +87,9 @@ def test_dead_gaussians_move_to_living_ones(name: str) -> None:
     assert sources[:30] == list(range(30))
     assert all(s < 30 for s in sources)
     copied = torch.tensor(sources).bincount() > 1
-    assert (model.splats["opacities"][:30][copied] < 1.0).all()
-    assert (model.splats["opacities"][:30][~copied] == 1.0).all()
+    less = model.splats["opacities"][:30] < before["opacities"][:30]
+    assert torch.equal(less, copied)
+    assert torch.equal(model.splats["opacities"][:30][~copied], before["opacities"][:30][~copied])
     assert moments.fresh[40]  # of the last call, the growth
     sh0 = model.splats["sh0"].detach()
     assert torch.equal(sh0, before["sh0"][sources])
