@@ -82,7 +82,7 @@ def images(files: list[tuple[str, Path | None]]) -> list[Image]:
 
     If the images do not fit, they are compressed more, then the last ones are left out.
     """
-    read = [(caption, cv2.imread(str(path), cv2.IMREAD_COLOR)) for caption, path in files if path]
+    read = [(caption, cv2.imread(str(path), cv2.IMREAD_COLOR)) for caption, path in files if path and path.is_file()]
     pixels = [(caption, np.asarray(data, np.uint8)) for caption, data in read if data is not None]
     for quality in (90, 75, 60):
         shown = [Image(printable(c)[:200], _encode(p, IMAGE_SIDE, quality), p.shape[1], p.shape[0]) for c, p in pixels]
