@@ -90,7 +90,8 @@ def _by_row(runs: pd.DataFrame) -> pd.DataFrame:
     if "contributor" not in runs:
         return runs.assign(row=runs.label)
     times = pd.DataFrame([row(record) for record in runs.record], runs.index, TIMES, dtype=float)
-    label = names_of(runs.assign(variant=[without(variant, "from") for variant in runs.variant]))
+    variant = runs.variant.map(lambda text: without(text, "from"))
+    label = names_of(runs.assign(variant=variant)) if variant.nunique() > 1 else runs.model
     runs = runs.assign(**times, timed_on=runs.machine, label=label, git_commit=runs.git_commit.str[:12])
     return runs.assign(row=runs[["label", *ORIGIN]].agg("\n".join, axis=1))
 
