@@ -24,6 +24,7 @@ NARROW = {
     "hexplane": [
         f"model.options.{option}" for option in ("resolution=8", "time_resolution=6", "channels=4", "width=8")
     ],
+    "scgs": [f"model.options.{option}" for option in ("nodes=16", "width=24", "depth=2")],
 }  # networks small enough for a test
 
 

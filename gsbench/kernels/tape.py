@@ -114,7 +114,8 @@ class _Gradients:
         by_ends = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
         for end, by_end in zip(ends, by_ends, strict=True):
             if by_end is not None:
-                self._add(end, by_end.clone())  # torch may return two gradients that share memory
+                # torch may return two gradients that share memory, or one of a transposed layout.
+                self._add(end, by_end.clone(memory_format=torch.contiguous_format))
 
     def _add(self, x: Tensor, gradient: Tensor) -> None:
         before = self.by_id.get(id(x))

@@ -4,6 +4,7 @@ Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene 
 arXiv 2309.13101, with the constants of the authors' code.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
 TIME_FEATURES = 30  # outputs of the time network
+OUTPUTS = (3, 3, 4)  # numbers in dp, ds and dr
 
 
 @register("deformable")
@@ -86,10 +88,17 @@ class DeformationField(nn.Module):
     """
 
     def __init__(
-        self, width: int, depth: int, octaves: int, time_octaves: int, time_network: bool, generator: torch.Generator
+        self,
+        width: int,
+        depth: int,
+        octaves: int,
+        time_octaves: int,
+        time_network: bool,
+        generator: torch.Generator,
+        outputs: Sequence[int] = OUTPUTS,
     ) -> None:
         super().__init__()
-        self.octaves, self.time_octaves = octaves, time_octaves
+        self.octaves, self.time_octaves, self.outputs = octaves, time_octaves, outputs
         features = 1 + 2 * time_octaves
         self.of_time: nn.Module = nn.Identity()
         if time_network:
@@ -97,14 +106,14 @@ class DeformationField(nn.Module):
             self.of_time, features = nn.Sequential(first, last), TIME_FEATURES
         inputs = 3 * (1 + 2 * octaves) + features
         self.hidden = HiddenLayers(inputs, width, depth, generator)
-        self.head = Linear(width, 3 + 3 + 4, generator)
+        self.head = Linear(width, sum(outputs), generator)
 
     def forward(
         self,
         positions: Tensor,  # [N, 3] world units
-        time: Tensor,  # [] in [0, 1]
+        time: Tensor,  # [] or [N] in [0, 1]
     ) -> tuple[Tensor, ...]:
-        """Return shifts of means [N, 3], changes of scales [N, 3] (both world units) and of unit quaternions [N, 4]."""
-        features = self.of_time(encode(time.reshape(1, 1), self.time_octaves))
+        """Return shifts [N, 3], changes of scales [N, 3] (both world units) and of quaternions [N, 4], or `outputs`."""
+        features = self.of_time(encode(time.reshape(-1, 1), self.time_octaves))
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
-        return collect_gradients(self.head(self.hidden(inputs))).split([3, 3, 4], -1)
+        return collect_gradients(self.head(self.hidden(inputs))).split(self.outputs, -1)

@@ -191,7 +191,7 @@ def test_clones_and_children_are_canonical_and_share_the_field() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("model", ["deformable", "hexplane"])
+@pytest.mark.parametrize("model", ["deformable", "hexplane", "scgs"])
 def test_a_field_trains_to_the_same_bits_for_any_number_of_threads(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a repetition of a recorded step, or a penalty, that uses all threads, only felt with one view."""
     monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
