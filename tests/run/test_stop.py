@@ -13,7 +13,7 @@ from forked import Forked
 from tiny_run import overrides, run_here
 
 from gsbench.errors import InputError
-from gsbench.measure.atomic import HOST
+from gsbench.measure import atomic
 from gsbench.run import progress, stop
 from gsbench.train import checkpoint
 
@@ -89,14 +89,17 @@ def test_a_run_reports_once_an_interval(tmp_path: Path, monkeypatch: pytest.Monk
         assert progress.read(tmp_path / progress.FILE_NAME).step == step
 
 
-def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches folders that fill with parts of checkpoints, and a part that another process is just writing removed."""
     words = overrides(square, tmp_path, "model=3dgs", "train.iterations=3", "protocol.pictures=0")
     _, folder = run_here(*words)
     dead = subprocess.Popen(["true"])
     dead.wait()
-    parts = [folder / f".record.json.{HOST}.{pid}.0123abcd.tmp" for pid in (dead.pid, os.getpid())]
-    for part in parts:
-        part.write_bytes(b"{")
+    parts = []
+    for pid in (dead.pid, os.getpid()):
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "getpid", lambda pid=pid: pid)
+            parts.append(atomic._beside(folder / "record.json"))
+        parts[-1].write_bytes(b"{")
     run_here(*words)
     assert [part.exists() for part in parts] == [False, True]

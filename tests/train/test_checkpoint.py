@@ -137,6 +137,13 @@ class Exploit:
         return (os.mkdir, ("owned",))
 
 
+@pytest.mark.parametrize("state", [None, [], {}, {"seen": 1}, {"seen": torch.zeros(3)}, {"seen": torch.zeros(2).int()}])
+def test_a_tensor_of_a_checkpoint_is_the_one_expected(state: object) -> None:
+    """Catches a stack trace for a part of another kind, and a tensor that broadcasts or is converted."""
+    with pytest.raises(InputError, match="checkpoint: expected 'seen' as "):
+        checkpoint.tensor(state, "seen", (2,), torch.float32)
+
+
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", pickle.dumps(Exploit()), json.dumps({}).encode()])
 def test_a_file_that_is_no_checkpoint_is_refused(
