@@ -167,6 +167,10 @@ class EffectsConfig:
         None, "lifetime above which Gaussians become static after densification, as in 3D-4DGS", unit="clips", low=0
     )
     compare: bool = key(False, "choose for model=auto by val PSNR, after 70 % of the steps", absent=False)
+    most_seconds: float | None = key(None, "most seconds until then", unit="s", low=0, needs="effects.compare")
+    most_frame_ms: float | None = key(
+        None, "most milliseconds of a frame then", unit="ms", low=0, needs="effects.compare"
+    )
 
 
 @dataclass

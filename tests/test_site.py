@@ -16,6 +16,7 @@ from report.records import but
 from tiny_run import ROOT, environment
 
 from gsbench.measure.record import Record
+from gsbench.measure.speed import RenderTimes
 from gsbench.report import blocks, study
 
 LINK = re.compile(r'<a\b[^>]*?\shref="([^"]*)"')
@@ -27,6 +28,9 @@ DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 def test_a_page_is_what_code_and_records_say(page):
     """Catches a model, a key, a default or a published record that was changed without its page."""
     assert (ROOT / page).read_text() == tables.filled(page), "write it anew by docs/site/tables.py"
+
+
+DEARER = {"train_cpu_s": 1000.0, "render_ms": RenderTimes(0.0, 100.0, 200.0)}
 
 
 def copied(to: Path, name: str, change: Callable[[Record], Record] = lambda record: record) -> None:
@@ -49,18 +53,28 @@ def row_of(block: str, name: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
+def prices_of_a_field(published: Path) -> list[float]:
+    """What a field gains in place of time, direction and AGR, dB, and its seconds and milliseconds."""
+    row = row_of(blocks.worth(published), "a field instead of these")
+    return [float(cell.split()[0].strip("*")) for cell in (row[1], *row[3:])]
+
+
 def test_the_tables_follow_from_the_records(tmp_path):
     """Catches a best model, a price or a loss of choosing another one that stays when the records change."""
     for name in ("frontier", "suite", "dnerf100"):
         copied(tmp_path, name)
-    before = blocks.suite_choices(tmp_path)
+    before, prices = blocks.suite_choices(tmp_path), prices_of_a_field(tmp_path)
     assert row_of(blocks.cost(tmp_path), "4,000")[5].startswith("**28.32**")
     copied(tmp_path, "frontier", lambda r: better(r, 20 * ((r.model, r.variant) == ("3dgs", "iterations=4000"))))
     assert row_of(blocks.cost(tmp_path), "4,000")[1].startswith("**37.27**")
+    copied(tmp_path, "dnerf100", lambda r: but(better(r, 2.0), cost=DEARER) if r.model == "hexplane" else r)
     copied(tmp_path, "suite", lambda r: better(r, 20 * ((r.scene, r.model, r.variant) == ("suzanne", "3dgs", ""))))
     assert row_of(blocks.suite_kinds(tmp_path), "direction: `6dgs` - `3dgs`")[2].startswith("-3.48 ±")  # -0.14 - 20 / 6
     lost = [float(row_of(text, "7DGS")[1]) for text in (before, blocks.suite_choices(tmp_path))]
     assert lost[0] - lost[1] == pytest.approx((20 + 20.85 - 24.72) / 9, abs=0.02)  # without playroom and lego100
+    after = prices_of_a_field(tmp_path)
+    assert after == pytest.approx([prices[0] + 2, 1000 - 11, 100 - 1], abs=2), "those of 7dgs are 11 s and 1 to 2 ms"
+    assert row_of(blocks.worth(tmp_path), "a field")[2] == "–", "on the other scenes, no field is published"
 
 
 def test_the_tables_name_every_model_and_key():

@@ -221,7 +221,8 @@ class Gating(Hook):
         if self.screen is None and self.config.effects.gate == "off":
             return {}
         comparison = self.training.hook(Choices).chosen.comparison
-        return {"on_demand": OnDemand(self.screen, self.gates, self.notes, self.direction, comparison)}
+        notes = [] if has_gates(self.model) else [f"gates cannot simplify {self.config.model.name}"]
+        return {"on_demand": OnDemand(self.screen, self.gates, self.notes + notes, self.direction, comparison)}
 
 
 @torch.no_grad()

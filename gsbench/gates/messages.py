@@ -17,28 +17,25 @@ def of_screen(screen: TimeScreen) -> str:
 
 
 def of_comparison(comparison: ModelComparison) -> str:
-    """Return the PSNR on val of each candidate of model=auto, and which of them was chosen."""
+    """Return which candidate of model=auto was chosen, and a table of all."""
     return (
-        f"PSNR on val after {comparison.iteration} iterations: {_of_candidates(comparison.candidates)}; "
-        f"{comparison.chosen} is trained to the end{_tie(comparison.candidates)}"
+        f"{comparison.chosen} is trained to the end, chosen after {comparison.iteration} iterations"
+        f"{_tie(comparison.candidates)}\n{_table(comparison.candidates)}"
     )
 
 
 def of_lengths(choice: LengthChoice) -> str:
-    """Return the PSNR on val of each length that was trained, and which of them is kept."""
-    return (
-        f"PSNR on val: {_of_candidates(choice.tried)}; the training of {choice.kept} iterations is kept"
-        f"{_tie(choice.tried)}"
-    )
+    """Return which length is kept, and a table of all that were trained."""
+    return f"the training of {choice.kept} iterations is kept{_tie(choice.tried)}\n{_table(choice.tried)}"
 
 
-def _of_candidates(candidates: list[Candidate]) -> str:
-    return ", ".join(
-        f"{x.name} {'-' if x.psnr_val is None else format(x.psnr_val, '.2f')} dB"
-        if x.reason is None
-        else f"{x.name} failed"
-        for x in candidates
-    )
+def _table(candidates: list[Candidate]) -> str:
+    width = max(len(x.name) for x in candidates)
+    lines = [f"{'':{width}}  PSNR on val, dB  training, s  ms a frame"]
+    for x in candidates:
+        psnr, frame = ("-" if value is None else f"{value:.2f}" for value in (x.psnr_val, x.frame_ms))
+        lines.append(f"{x.name:{width}}  {psnr:>15}  {x.seconds:>11.1f}  {frame:>10}  {x.reason or ''}".rstrip())
+    return "\n".join(lines)
 
 
 def _tie(candidates: list[Candidate]) -> str:

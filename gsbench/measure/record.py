@@ -173,12 +173,13 @@ class Direction:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One training of a comparison: its PSNR on val, and the seconds until this was measured."""
+    """One training of a comparison: its PSNR on val, the seconds until this was measured, and the time of a frame."""
 
     name: str  # the label of the model, such as "7dgs_noagr", or the length, such as "iterations=1000"
-    psnr_val: float | None  # dB; None: not a number, or the training failed
+    psnr_val: float | None  # dB; None: not a number, or the training did not reach the comparison
     seconds: float
-    reason: str | None = None  # why the training failed: it diverged, or no Gaussian was left
+    reason: str | None = None  # why it cannot be chosen: it diverged, no Gaussian was left, or it exceeds the budget
+    frame_ms: float | None = None  # the median at the views of val; None: not measured
 
 
 @dataclass(frozen=True)

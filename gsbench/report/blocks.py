@@ -11,7 +11,7 @@ from gsbench.report.frame import Results, load, names_of
 from gsbench.report.intervals import Values, estimate
 from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
-from gsbench.report.section import Column, Section, number
+from gsbench.report.section import EMPTY, Column, Section, number
 from gsbench.report.sections import tested
 from gsbench.report.sections.effects import is_single
 from gsbench.report.sections.lengths import by_length
@@ -31,10 +31,13 @@ CHANGES = {
     "direction": ("6dgs", "3dgs"),
     "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
     "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
+    "a field": ("hexplane", "3dgs"),
+    "a field instead of these": ("hexplane", "7dgs"),
     "7DGS instead of 4DGS": ("7dgs", "4dgs"),
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
-EFFECTS = list(CHANGES)[:4]
+EFFECTS = list(CHANGES)[:6]
+PRICES = {"train_cpu_s": Column("CPU s", 1, signed=True), "frame_ms": Column("ms a frame", 2, signed=True)}
 CHOICES = {
     "4dgs": "4DGS",
     "7dgs_noagr": "7DGS without AGR",
@@ -113,11 +116,13 @@ def gain_text(scenes: list[Values]) -> str:
     """Return a difference ± half its interval over scenes, bold if significant, and on how many scenes it is positive.
 
     Args:
-        scenes: for each scene the differences [seeds, views].
+        scenes: for each scene the differences [seeds, views]; without scenes, the text is a dash.
     """
+    if not scenes:
+        return EMPTY
     gain = estimate(scenes)
     mean = bold(number(gain.mean, 2, signed=True), int(gain.half_over_scenes < abs(gain.mean)))
-    return f"{mean} ± {number(gain.half_over_scenes, 2)}, {gain.gaining} of {gain.scenes}"
+    return f"{mean} ± {number(gain.half_over_scenes, 2)}, {gain.gaining}/{gain.scenes}"
 
 
 # ---- mini and frontier
@@ -184,7 +189,8 @@ def ablation(published: Path) -> str:
 def suite_kinds(published: Path) -> str:
     """Return what each effect changes in PSNR, by kind of scene, with the models that are compared."""
     table = by_kind(published, list(CHANGES), list(KINDS))
-    return block(table.rename(lambda name: f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}"))
+    names = {name: f"{name}: {' - '.join(f'`{model}`' for model in CHANGES[name])}" for name in CHANGES}
+    return block(table.rename(names))
 
 
 def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFrame:
@@ -196,6 +202,15 @@ def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFram
         for title in titles
     }
     return pd.DataFrame(columns, pd.Index(names, name="effect"))
+
+
+def worth(published: Path) -> str:
+    """Return what effects gain, and what they cost on D-NeRF: mean differences of runs with the same scene and seed."""
+    table = by_kind(published, EFFECTS, [DNERF, "all dynamic"])
+    for quantity in PRICES:
+        costs = {DNERF: stats.grids(only(published, "dnerf100"), quantity)}
+        table[quantity] = [estimate(_gains(costs, DNERF, name)).mean for name in EFFECTS]
+    return block(table, **PRICES)
 
 
 def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
@@ -307,7 +322,7 @@ def dnerf100_signs(published: Path) -> str:
         rows[f"`{a}` - `{b}`"] = {
             "here": gain_text(list(gains.values())),
             "paper": number(expected.mean(), 2, signed=True),
-            "same sign": f"{same} of {len(gains)}",
+            "same sign": f"{same}/{len(gains)}",
         }
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
@@ -374,7 +389,7 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 
 README: dict[str, Callable[[Path], str]] = {
     "cost": cost,
-    "worth": lambda published: block(by_kind(published, EFFECTS, [DNERF, "all dynamic"])),
+    "worth": worth,
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
     "dnerf100_signs": dnerf100_signs,
 }

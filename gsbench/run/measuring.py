@@ -19,7 +19,7 @@ from gsbench.measure.images import Pixels, strip
 from gsbench.measure.quality import evaluate, evenly
 from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
-from gsbench.measure.speed import peak_memory, synchroniser, time_renders
+from gsbench.measure.speed import RenderTimes, peak_memory, synchroniser, time_renders
 from gsbench.models.render import GraphedFrames
 from gsbench.run import drift
 from gsbench.run.drift import Still
@@ -106,12 +106,7 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Meas
     """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
     views = trainer.views
     measured = measure_images(views, map(trainer.render, views), trainer.scene.background, config)
-    frame, note = frames(trainer, views[0])
-    times = time_renders(
-        lambda i: frame(views[i % len(views)]),
-        count=max(config.protocol.renders, len(views)),
-        synchronise=synchroniser(config.device),
-    )
+    times, note = time_frames(trainer, views)
     cost = Cost(
         train_s=sum(trainer.stages.seconds.values()),
         stage_s=trainer.stages.state_dict(),
@@ -150,6 +145,13 @@ def _beside_truth(
         if i in chosen:
             shown.append((render.cpu().numpy(), truth.cpu().numpy()))
         yield view.name, render, truth
+
+
+def time_frames(trainer: Trainer, views: Sequence[View]) -> tuple[RenderTimes, dict[str, str]]:
+    """Time frames of a trained model at some views in turn, and return the note of `frames` too."""
+    frame, note = frames(trainer, views[0])
+    count, synchronise = max(trainer.config.protocol.renders, len(views)), synchroniser(trainer.config.device)
+    return time_renders(lambda i: frame(views[i % len(views)]), count, synchronise=synchronise), note
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:

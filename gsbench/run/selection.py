@@ -2,7 +2,7 @@
 
 For model=auto, a test whether the scene changes with time decides between a candidate with time ("moving") and one
 without ("static"). With effects.compare=true, and if the scene may move, all candidates are trained to 70 % of their
-steps, and the best on val is trained to the end.
+steps, and the best on val, of those within the budget, is trained to the end.
 
 For train.lengths a run is trained at several lengths, each from the start. Long trainings of small scenes overfit.
 Learning rates fall to the end of a training, so that to stop it early is worth little: a training that was planned to
@@ -24,7 +24,8 @@ from gsbench.gates.screen import import_compiler, screen_time
 from gsbench.measure.exact_views import rank
 from gsbench.measure.record import Candidate, LengthChoice, ModelComparison, TimeScreen
 from gsbench.measure.speed import Effort
-from gsbench.run import fitting, progress
+from gsbench.models.gated import has_gates
+from gsbench.run import fitting, measuring, progress
 from gsbench.run.identity import RunSpec
 from gsbench.run.settings import HOW_TO, candidates, is_auto, with_candidate
 from gsbench.run.setup import build, build_with_placeholders, check_scene
@@ -44,9 +45,15 @@ def plain(spec: RunSpec, config: Config) -> dict[str, Any]:
 
     The checkpoint of a run has those of the training that is kept, so that its schedule is that of its length.
     """
-    length = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
+    train = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
     model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)
-    return spec.plain | {"train": spec.plain["train"] | length, "model": model, "agr": config.agr}
+    groups = {"train": train, "effects": {"gate": config.effects.gate}}
+    changed = {name: spec.plain[name] | values for name, values in groups.items()}
+    return spec.plain | changed | {"model": model, "agr": config.agr}
+
+
+class OverBudgetError(InputError):
+    """A candidate takes more seconds or milliseconds a frame than the user allows."""
 
 
 @dataclass(frozen=True)
@@ -126,22 +133,37 @@ class Candidates:
         """
         spec, run, trainer = self.spec, self._run(name), self.trainer(name)
         done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
-        error = None
+        error = frame_ms = None
         try:
             fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
             fitting.fit(
                 trainer,
                 run,
                 run.plain,
+                follow=lambda: self._check_seconds(trainer),
                 until=until,
                 reporter=lambda: progress.Reporter(spec.folder, spec.overrides, steps, done, seconds),
             )
-        except (DivergedError, fitting.NoGaussianError) as raised:
+            frame_ms = measuring.time_frames(trainer, self.scene.val)[0].p50
+            self._check_frame(frame_ms)
+        except (DivergedError, fitting.NoGaussianError, OverBudgetError) as raised:
             error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
             error.__context__ = None
-        psnr = None if error or trainer.curve.last is None else trainer.curve.last.psnr_val
-        candidate = Candidate(name, psnr, sum(trainer.stages.seconds.values()), one_line(error) if error else None)
-        return Result(candidate, until, trainer.effort, error)
+        psnr = None if frame_ms is None or trainer.curve.last is None else trainer.curve.last.psnr_val
+        taken, reason = sum(trainer.stages.seconds.values()), one_line(error) if error else None
+        return Result(Candidate(name, psnr, taken, reason, frame_ms), until, trainer.effort, error)
+
+    def _check_seconds(self, trainer: Trainer) -> None:
+        """Raise OverBudgetError if the training took too long by its last measurement on val."""
+        most, last = self.spec.config.effects.most_seconds, trainer.curve.last
+        if most is not None and last is not None and last.seconds > most:
+            raise OverBudgetError(f"more than effects.most_seconds={most:g} after {last.iteration} iterations")
+
+    def _check_frame(self, frame_ms: float) -> None:
+        """Raise OverBudgetError if a frame takes too long."""
+        most = self.spec.config.effects.most_frame_ms
+        if most is not None and frame_ms > most:
+            raise OverBudgetError(f"more than effects.most_frame_ms={most:g}")
 
     def _run(self, name: str) -> RunSpec:
         """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
@@ -162,11 +184,11 @@ class Result:
     candidate: Candidate
     steps: int  # after which its PSNR on val is measured
     effort: Effort
-    error: DivergedError | fitting.NoGaussianError | None = None  # why the training failed
+    error: DivergedError | fitting.NoGaussianError | OverBudgetError | None = None  # why it cannot be chosen
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Return the value by which candidates are compared: none that failed is above one that did not."""
+        """Return the value by which candidates are compared: none that cannot be chosen is above one that can."""
         return self.error is None, rank(self.candidate.psnr_val)
 
 
@@ -179,14 +201,20 @@ def best(results: Sequence[Result]) -> Result:
     """Return the `highest` result.
 
     Raises:
-        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
+        DivergedError, NoGaussianError, OverBudgetError: no candidate can be chosen; the error is that of the first.
     """
     top, first = highest(results), results[0]
     if top.error is not None and first.error is not None:
         raise type(first.error)(
-            f"all {len(results)} candidates failed; {first.candidate.name}: {first.candidate.reason}"
+            f"none of {len(results)} candidates can be chosen; {first.candidate.name}: {first.candidate.reason}"
         )
     return top
+
+
+def gated_if_possible(config: Config) -> Config:
+    """Return settings without gates if these cannot simplify the model, such as a field."""
+    ungated = replace(config, effects=replace(config.effects, gate="off"))
+    return config if has_gates(build(ungated)) else ungated
 
 
 def check_candidates(config: Config, scene: Scene) -> None:
@@ -200,8 +228,9 @@ def check_candidates(config: Config, scene: Scene) -> None:
             f"scene.val_every=8 takes every eighth training view",
             docs=HOW_TO,
         )
-    for name, settings in candidates(config).items():
+    for name, candidate in candidates(config).items():
         try:
+            settings = gated_if_possible(candidate)
             check_scene(build(settings), scene, settings)
             check_rates(build_with_placeholders(settings, scene.extent).groups(), settings.model)
         except InputError as error:
@@ -257,7 +286,7 @@ def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: 
 
     Raises:
         InputError: a checkpoint is damaged.
-        DivergedError, NoGaussianError: all candidates failed; the error is that of the first.
+        DivergedError, NoGaussianError, OverBudgetError: no candidate can be chosen; the error is that of the first.
         Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
     """
 
@@ -265,7 +294,8 @@ def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: 
         comparison = choices_in(state).comparison
         return None if comparison is None else comparison.chosen
 
-    trainings = Candidates(spec, scene, start, candidates(spec.config))
+    settings = {name: gated_if_possible(candidate) for name, candidate in candidates(spec.config).items()}
+    trainings = Candidates(spec, scene, start, settings)
     return trainings.chosen(chosen_in, lambda: _trained_models(trainings, model))
 
 

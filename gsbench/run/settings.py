@@ -35,6 +35,11 @@ def check_settings(config: Config) -> None:
 def check_compare(config: Config) -> None:
     """Raise InputError if the settings ask to compare models on val and cannot have this."""
     if not config.effects.compare:
+        for name in ("most_seconds", "most_frame_ms"):
+            if getattr(config.effects, name) is not None:
+                raise InputError(
+                    f"effects.{name}: expected effects.compare=true, whose candidates it limits", docs=HOW_TO
+                )
         return
     if not is_auto(config):
         raise InputError(

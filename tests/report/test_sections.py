@@ -25,7 +25,7 @@ from records import (
 
 from gsbench.measure.curve import Point
 from gsbench.measure.images import write_png
-from gsbench.measure.record import LengthChoice, Record, Region
+from gsbench.measure.record import Candidate, LengthChoice, ModelComparison, OnDemand, Record, Region
 from gsbench.measure.speed import RenderTimes
 from gsbench.report import frame, stats
 from gsbench.report import sections as of_report
@@ -210,6 +210,26 @@ def test_seconds_of_another_machine_are_nowhere():
         numbers = numbers.drop(columns=["gaussians", "gaussians ±", "before"], errors="ignore").to_numpy(float)
         assert not (numbers[np.isfinite(numbers)] > 2000).any(), section.key
         assert "777" not in " ".join(section.notes)
+
+
+def test_the_candidates_of_a_choice_on_val_have_their_prices():
+    """Catches a price of another candidate or machine, and a field that is more accurate at hidden costs."""
+    choices = {
+        0: [Candidate("7dgs", 30.0, 10.0, None, 1.0), Candidate("hexplane", 31.0, 90.0, None, 10.0)],
+        1: [Candidate("7dgs", 30.4, 12.0, None, 3.0), Candidate("hexplane", 31.4, 90.0, "too slow", 12.0)],
+        2: [Candidate("7dgs", 30.2, 777.0, None, 777.0), Candidate("hexplane", None, 777.0, "diverged")],
+    }
+    of = {
+        seed: OnDemand(comparison=ModelComparison(700, "7dgs" if seed == 1 else "hexplane", tried))
+        for seed, tried in choices.items()
+    }
+    runs = [but(run("auto", seed), on_demand=of[seed], provenance={"device": f"CPU {seed // 2}"}) for seed in of]
+    table = sections(*runs, run("4dgs"))["candidates"].table.set_index("candidate")
+    expected = {"7dgs": [30.2, 11.0, 2.0, 1, 3], "hexplane": [31.2, 90.0, 11.0, 2, 3]}
+    for name, row in table[["psnr_val_db", "train_s", "frame_ms", "chosen", "seeds"]].iterrows():
+        assert row.tolist() == pytest.approx(expected[name]), name
+    assert table.why.dropna().to_dict() == {"hexplane": "too slow"}
+    assert "candidates" not in sections(run("4dgs"))
 
 
 # ---- curves and targets

@@ -12,12 +12,13 @@ import pytest
 import torch
 from interrupted import Killed, assert_same_bits, bits, counted_steps, run_through_kills
 from tiny_run import overrides, run_here, write_moving_square
-from tiny_training import compose, moving_square
+from tiny_training import NARROW, compose, moving_square
 
 from gsbench.errors import InputError
 from gsbench.measure.record import FILE_NAME, Candidate, Record, TimeScreen
+from gsbench.measure.speed import RenderTimes
 from gsbench.report.sections.curves import events
-from gsbench.run import load, log, progress, selection
+from gsbench.run import load, log, measuring, progress, selection
 from gsbench.run.identity import RunSpec
 from gsbench.run.selection import FOLDER, choose_model, length_name, lengths
 from gsbench.run.settings import candidates, label_of
@@ -47,19 +48,21 @@ class Choice(NamedTuple):
 RUN = ("train.checkpoint_minutes=0", "protocol.pictures=0", "train.sh_every=10000")
 OF_MODELS = (*RUN, "train.iterations=30", "train.curve_points=10")
 OF_LENGTHS = (*RUN, "model=7dgs", "train.curve_points=2")
+FIELD = "model.compared.moving_field"
 SLOW = "model.candidates.moving.lr.opacities.start=1e-4"  # so that another candidate than the first wins
+NARROW_FIELD = [option.replace("model", FIELD, 1) for option in NARROW["hexplane"]]
 MODELS = Choice(
-    ("model=auto", "effects.compare=true", SLOW, *OF_MODELS),
-    ("model=4dgs", "effects.gate=both", *OF_MODELS),
-    ("7dgs", "4dgs", "7dgs_noagr", "6dgs"),
-    "4dgs",
+    ("model=auto", "effects.compare=true", SLOW, *NARROW_FIELD, *OF_MODELS),
+    ("model=hexplane", *NARROW["hexplane"], *OF_MODELS),
+    ("7dgs", "hexplane", "4dgs", "7dgs_noagr", "6dgs"),
+    "hexplane",
     21,
     30,
-    3 * 21 + 30,
-    3 * 21 + 30,
-    {"midway": 17, "chosen": 4 * 21 + 1},
-    failing=("4dgs", "6dgs"),
-    then="7dgs_noagr",
+    4 * 21 + 30,
+    4 * 21 + 30,
+    {"midway": 17, "chosen": 5 * 21 + 1},
+    failing=("hexplane", "6dgs"),
+    then="4dgs",
 )
 LENGTHS = Choice(
     (*OF_LENGTHS, "train.iterations=80", "train.lengths=4"),
@@ -119,6 +122,11 @@ def logged(folder: Path) -> list[int]:
     return [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()]
 
 
+def untimed(candidate: Candidate) -> Candidate:
+    """A candidate without what its machine took."""
+    return replace(candidate, seconds=0.0, frame_ms=None)
+
+
 def screen(decision: str, seconds: float = 0.0) -> TimeScreen:
     return TimeScreen(decision, "of the test", None, None, None, seconds)
 
@@ -167,7 +175,7 @@ def test_a_kill_repeats_no_step(
     assert steps["all"] == choice.steps
     (*best, tried), (*best_before, before) = chosen_in(record), chosen_in(whole[0])
     assert best == best_before
-    assert [replace(each, seconds=0.0) for each in tried] == [replace(each, seconds=0.0) for each in before]
+    assert [*map(untimed, tried)] == [*map(untimed, before)]
     assert record.metrics == whole[0].metrics
     assert_same_bits(bits(folder), bits(whole[1]))
     assert not (folder / FOLDER).exists()
@@ -224,7 +232,7 @@ def test_a_candidate_that_fails_loses(
     monkeypatch.setattr(Trainer, "train_step", lambda _: (_ for _ in ()).throw(DivergedError("all")))
     failed, _ = run_here(*overrides(square, tmp_path / "all", *choice.words))
     assert (failed.status, failed.on_demand, failed.length_choice) == ("diverged", None, None)
-    assert f"candidates failed; {choice.names[0]}: all" in str(failed.reason)
+    assert f"candidates can be chosen; {choice.names[0]}: all" in str(failed.reason)
 
 
 # ---- model=auto
@@ -287,17 +295,59 @@ def test_candidates_are_those_of_the_settings() -> None:
     by_label = candidates(compose("auto", 10, "effects.compare=true"))
     assert {label: (config.model.name, config.agr, config.model.gate) for label, config in by_label.items()} == {
         "7dgs": ("7dgs", True, "both"),
+        "hexplane": ("hexplane", False, "both"),
         "4dgs": ("4dgs", False, "both"),
         "7dgs_noagr": ("7dgs", False, "both"),
         "6dgs": ("6dgs", False, "both"),
     }
-    assert list(candidates(compose("auto", 10, "agr=false"))) == ["7dgs_noagr", "4dgs", "6dgs"]
+    assert list(candidates(compose("auto", 10, "agr=false"))) == ["7dgs_noagr", "hexplane", "4dgs", "6dgs"]
     changed = compose("auto", 10, "agr=false", "model.compared.moving_noagr.lr.means.start=1")
     with pytest.raises(InputError, match="two are '7dgs_noagr'"):
         candidates(changed)
     changed.model.compared = {"wrong": {"nam": "3dgs"}}
     with pytest.raises(InputError, match=r"model\.compared\.wrong: "):
         candidates(changed)
+
+
+@pytest.mark.parametrize(("most", "best"), [(5.0, "hexplane"), (4.9, "4dgs")])
+def test_a_field_is_chosen_without_gates_and_within_the_budget(
+    most: float,
+    best: str,
+    square: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a field that gates refuse or that is loaded with them, slower frames than are allowed, and prices that
+    are not in the record or not printed."""
+    ms = {"7dgs": 2.0, "hexplane": 5.0}
+    times = lambda trainer, _: (RenderTimes(0.0, ms.get(trainer.config.model.name, 1.0), 9.0), {})  # noqa: E731
+    monkeypatch.setattr(measuring, "time_frames", times)
+    words = ("model=auto", "effects.compare=true", f"effects.most_frame_ms={most}", *NARROW_FIELD, *OF_MODELS)
+    record, folder = run_here(*overrides(square, tmp_path, *words))
+    chosen, _, tried = chosen_in(record)
+    by_name = {each.name: each for each in tried}
+    assert (chosen, {name: each.frame_ms for name, each in by_name.items()}) == (
+        best,
+        {"7dgs": 2.0, "hexplane": 5.0, "4dgs": 1.0, "7dgs_noagr": 2.0, "6dgs": 1.0},
+    )
+    assert max(tried, key=lambda each: each.psnr_val or 0.0).name == "hexplane", "else no budget is needed"
+    config = load.load_run(folder).config
+    assert (config.model.name, config.effects.gate) == (best, "off" if best == "hexplane" else "both")
+    assert ("gates cannot simplify hexplane" in record.on_demand.notes) == (best == "hexplane")
+    assert by_name["hexplane"].reason == (None if best == "hexplane" else "more than effects.most_frame_ms=4.9")
+    field = by_name["hexplane"]
+    row = f"hexplane {field.psnr_val:.2f} {field.seconds:.1f} 5.00 {field.reason or ''}".split()
+    assert row in [line.split() for line in capsys.readouterr().err.splitlines()]
+
+
+def test_candidates_end_where_their_seconds_do(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a candidate that trains on although it cannot be chosen, and one that is chosen nevertheless."""
+    steps, words = counted_steps(monkeypatch), ("effects.most_seconds=1e-9", *MODELS.words)
+    record, _ = run_here(*overrides(square, tmp_path, *words))
+    assert (record.status, steps["all"]) == ("failed", 5 * 3), "a tenth of 30 iterations each"
+    expected = "none of 5 candidates can be chosen; 7dgs: more than effects.most_seconds=1e-09 after 3 iterations"
+    assert expected in str(record.reason)
 
 
 # ---- train.lengths

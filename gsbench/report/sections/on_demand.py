@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from gsbench.gates.messages import EFFECT_SETS, of_comparison
+from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure.record import Gate, Record
 from gsbench.report.frame import Results, names_of
 from gsbench.report.intervals import over_seeds
@@ -38,7 +38,7 @@ SHOWN = {
     "mb_before": Column("MB before"),
     "mb": COLUMNS["model_mb"],
 }
-TEXTS = ["decision", "why", "compared", "split", "checked_on"]  # of a run, beside SHOWN
+TEXTS = ["decision", "why", "split", "checked_on"]  # of a run, beside SHOWN
 LOSSES = ["predicted", "evaluated", "checked"]  # dB: predicted, on the evaluated views, and on those of the check
 
 
@@ -93,7 +93,6 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
             "seeds": groups.size(),
             "screen": groups.decision.agg(_counted),
             "why": groups.why.first(),
-            "compared": groups.compared.first(),
             "gated": groups.before.count(),
             "measured on": groups["measured on"].first(),
         }
@@ -113,9 +112,8 @@ def _counted(decisions: pd.Series) -> str:
 def _numbers(r: Record, *, is_timed: bool) -> dict[str, Any]:
     """Return numbers and texts of a run as its record has them; times of another machine are left out."""
     assert r.on_demand is not None
-    gates, screen, comparison = r.on_demand.gates, r.on_demand.screen, r.on_demand.comparison
+    gates, screen = r.on_demand.gates, r.on_demand.screen
     row: dict[str, Any] = {"ends": bool(gates) and gates[-1].step is None}
-    row |= {"compared": of_comparison(comparison)} if comparison else {}
     if screen:
         row |= {"decision": screen.decision, "why": screen.reason, "p": screen.p, "free": screen.free}
         row |= {"screen_s": screen.seconds} if is_timed else {}
