@@ -180,3 +180,20 @@ def test_a_published_name_stays_below_the_data_root(folder):
     """Catches a config that reads files outside of data.root."""
     with pytest.raises(InputError, match="scene: expected a name"):
         scene_folder(composed(f"scene.released_as={folder}"))
+
+
+def test_ex4dgs_learns_as_its_authors_have_it():
+    """Catches rates that depend on the run's length or the scene's size where the authors' do not, or that fall,
+    another number of dynamic Gaussians at the end, and opacities that are reset."""
+    config = composed("model=ex4dgs", "+recipe=authors_ex4dgs")
+    fixed = {"velocities": 1e-4, "key_quats": 1e-3, "windows": 1e-3, "fades": 1e-4, "quats": 1e-5, "scales": 5e-3}
+    for settings in (config, composed("model=ex4dgs", "+recipe=authors_ex4dgs", "train.iterations=4000")):
+        for share in (0.0, 0.5):
+            of_run = rates(settings, share)
+            assert {name: of_run[name] for name in fixed} == fixed
+            assert of_run["key_means"] == pytest.approx(5 * 1.6e-4)
+    s = Schedule(config.train, 3, config.agr)
+    rounds = [step for step in range(40_000) if s.densifies(step)]
+    assert (rounds[0] + 1, rounds[-1] + 1, len(rounds), list(s.resets_after)) == (600, 30_000, 99, [])
+    assert (1 - config.model.options["dynamic_share"]) ** len(rounds) == pytest.approx(0.98**36, abs=0.01)
+    assert config.raster.antialias

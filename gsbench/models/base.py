@@ -118,6 +118,14 @@ class GaussianModel(nn.Module, ABC):
         """Return the raw parameters in which clones of Gaussians differ from these; by default none."""
         return {}
 
+    def before_density(self, centers: Tensor, drawn: Tensor) -> None:
+        """Change raw parameters before a round of density control; by default do nothing.
+
+        Args:
+            centers: of the cameras of the step's views, [V, 3].
+            drawn: which Gaussians these views see, [V, N] bool.
+        """
+
     def penalty(self) -> Tensor | None:
         """Return a term of the loss that depends on the parameters alone, [], or None.
 
@@ -395,8 +403,7 @@ class GaussianModel(nn.Module, ABC):
     @torch.no_grad()
     def split_rows(self, rows: Tensor, generator: torch.Generator) -> None:
         """Replace the copies `rows` [M] of split Gaussians by their children; two copies are next to each other."""
-        raw = {name: self.splats[name].data[rows] for name in ("means", *self.centers, *self.geometry)}
-        for name, value in self.split(raw, generator).items():
+        for name, value in self.split(self.raw_of(rows), generator).items():
             self.splats[name].data[rows] = value
 
     @torch.no_grad()

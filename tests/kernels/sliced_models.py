@@ -33,6 +33,7 @@ OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {  # the options of each model 
     "7dgs_nodir": ({}, {"factor_order": "paper"}, {"off_diagonal": "row_scaled"}, {"scheme": "cholesky"}),
     **dict.fromkeys(("4dgs", "3dgs", "ubs", "ubs_static", "dgs", "dbs", "dbs_static"), ({},)),
     **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg", "stg_full"), ({},)),
+    "ex4dgs": ({"dynamic_share": 0.5, "intervals": 2},),
 }
 CASES = [(name, options) for name, every in OPTIONS.items() for options in every]
 SPREADS = {"betas": 0.7, "coupling": 0.5, "velocities": 0.5, "skew": 0.3, "directions": 0.7, "opacities": 2.0}
@@ -108,6 +109,7 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
 def _moving(model: MovingGaussians3D, g: torch.Generator) -> Raw:
     N = 45
     model.initialise(Points(torch.randn(N, 3, generator=g), torch.rand(N, 3, generator=g)), 1.0, g)
+    model.before_density(CENTER[None], torch.ones(1, N, dtype=torch.bool))
     names = dict.fromkeys(("means", *model.geometry, *model.centers, *model.moving, "opacities"))
     raw = {key: model.splats[key].detach() for key in names}
     raw = {key: x + SPREADS.get(key, 0.3) * torch.randn(x.shape, generator=g) for key, x in raw.items()}

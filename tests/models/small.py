@@ -53,8 +53,9 @@ def halves(name: str) -> dict[str, float]:
     return {key: 0.5 for key, p in options_of(name).items() if p.annotation is float}
 
 
-# Networks small enough for a test.
+# Networks and paths small enough for a test.
 NARROW: dict[str, dict[str, Any]] = {
+    "ex4dgs": {"intervals": 2},
     "hexplane": {"channels": 3, "resolution": 5, "time_resolution": 4, "width": 6},
     "scgs": {"nodes": 8, "width": 6, "depth": 2},
 }
@@ -96,8 +97,9 @@ def last_layer(refinement: Changes) -> tuple[nn.Parameter, nn.Parameter]:
 
 
 def moved(model: GaussianModel, seed: int = 0) -> GaussianModel:
-    """The model in float64, with every raw parameter moved and networks that say something."""
+    """The model in float64 after a round, with every raw parameter moved and networks that say something."""
     model, g = model.double(), seeded(seed + 1)
+    model.before_density(CAMERA[None], torch.ones(1, len(model), dtype=torch.bool))
     with torch.no_grad():
         for parameter in model.splats.values():
             parameter += 0.3 * torch.randn(parameter.shape, generator=g, dtype=torch.float64)

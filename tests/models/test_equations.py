@@ -259,7 +259,7 @@ def test_precision_is_positive_and_couples_no_time() -> None:
     torch.testing.assert_close(L, torch.tensor(expected))
 
 
-@pytest.mark.parametrize("name", ["dgs", "freetime", "freetime_plus", "sharptime", "stg"])
+@pytest.mark.parametrize("name", ["dgs", "ex4dgs", "freetime", "freetime_plus", "sharptime", "stg"])
 def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
     """Catches weights that are forgotten, and an opacity or a mean that is the one of a single view."""
     model, queries = lively(name, 100), [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]

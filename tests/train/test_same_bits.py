@@ -35,6 +35,7 @@ SLOW = (
     "dbs",
     "deformable_narrow",
     "dgs",
+    "ex4dgs",
     "freetime",
     "freetime_plus",
     "hexplane",

@@ -16,7 +16,7 @@ from gsbench.train.step import Step
 
 MODELS = (
     *("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_noagr", "7dgs_nodir"),
-    *("dbs", "deformable", "dgs", "freetime", "freetime_plus", "hexplane", "ndgs", "scgs", "sharptime"),
+    *("dbs", "deformable", "dgs", "ex4dgs", "freetime", "freetime_plus", "hexplane", "ndgs", "scgs", "sharptime"),
     *("stg", "stg_full", "ubs"),
 )
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 
+import torch
 from tqdm import tqdm
 
 from gsbench.config import Config
@@ -54,11 +55,14 @@ class DensityControl:
         self._is_full = False  # whether the limit was reached
 
     def accumulate(self, step: int, views: Sequence[View], results: Sequence[ViewResult]) -> None:
-        """Accumulate the gradients of a step, while Gaussians are densified."""
+        """Accumulate the gradients of a step, while Gaussians are densified, and prepare the model for a round."""
         if step < self.schedule.densify_stop:
             for view, result in zip(views, results, strict=True):
                 width, height = view.camera.width, view.camera.height
                 self.rule.accumulate(result.drawn, result.g_means2d, width, height, len(views))
+        if self.schedule.densifies(step):
+            centers = torch.stack([view.camera.center for view in views])
+            self.rows.model.before_density(centers, torch.cat([result.drawn for result in results]))
 
     def after_update(self, step: int, optimizer: Optimizer) -> None:
         """Add noise, densify, thin and sort the Gaussians as the schedule says."""
