@@ -22,7 +22,16 @@ from gsbench.report.section import Column, Section
 
 MODELS = ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
 SUCCESSORS = ("dgs", "ubs", "dbs", "freetime", "freetime_plus", "sharptime")
-RIVALS = ("stg", "hexplane", "deformable", "deformable_narrow", "scgs")
+RIVALS = ("stg", "stg_full", "ex4dgs", "hexplane", "deformable", "deformable_narrow", "scgs")
+OWED = {  # measured beside the rows of the paper's Table 2, by the method's name there
+    "3dgs": "3DGS",
+    "4dgs": "4DGS",
+    "hexplane": "4DGaussians",
+    "stg": "STG",
+    "stg_full": "STG",
+    "ex4dgs": "Ex4DGS",
+    "7dgs": "7DGS",
+}
 BESIDE_7DGS = (*SUCCESSORS, "7dgs", "7dgs_noagr", "4dgs", *RIVALS)  # the measured rows of the table of successors
 SUCCESSOR_SCENES = {name: list(paper.PROTOCOLS[name].scenes) for name in ("D-NeRF", "7DGS-PBR")}
 TABLE_1 = ["psnr_db", "psnr_best_on_test_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians"]
@@ -50,8 +59,9 @@ TEXT_OTHER = (
 TEXT_SEEDS = "Finished seeds of each model at the paper's protocol. Valid intervals need three."
 TEXT_POOLS = "Runs with one protocol share a row. “Differs in”: the settings that are not the paper's."
 TEXT_2 = (
-    "Rows of the paper's Table 2, and measured averages over all scenes of a data set at the paper's protocol. LPIPS "
-    "of D-NeRF and 7DGS-PBR is of a network that the paper does not name; of Technicolor it is AlexNet's."
+    "Rows of the paper's Table 2, and measured averages over all scenes of a data set at the paper's protocol; without "
+    "all scenes, there is no average. Technicolor's images must be asked for from their authors. LPIPS of D-NeRF and "
+    "7DGS-PBR is of a network that the paper does not name; of Technicolor it is AlexNet's."
 )
 SOURCES_2 = {
     "quoted": "quoted by the 7DGS paper (Table 2) from earlier publications",
@@ -82,14 +92,14 @@ AT_THE_END = ("ubs", "4dgaussians")  # sources whose PSNR is of the last iterati
 COMPUTED = "the mean is computed here from the published scenes"
 
 
-def of_the_paper(results: Results) -> pd.DataFrame:
-    """Return the runs on data of the 7DGS paper or on stand-ins for them, with their recipe and how they depart.
+def of_the_paper(results: Results, models: Sequence[str] = MODELS) -> pd.DataFrame:
+    """Return the runs of some models on data of the 7DGS paper or on stand-ins, their recipe and how they depart.
 
     `departs` names the settings in which a run differs from the paper's protocol; "" if there are none. `pool` names
     runs with one protocol, which may share a table: (data of the paper, data, experiment, size of the images beside the
     paper's, filter, iterations).
     """
-    runs = results.runs[results.runs.model.isin(MODELS)]
+    runs = results.runs[results.runs.model.isin(models)]
     named = [str(record.protocol.get("paper_dataset")) for record in runs.record]
     runs = runs[pd.Series(named, runs.index, dtype=object).isin(list(paper.PROTOCOLS))]
     pools = [
@@ -106,7 +116,7 @@ def of_the_paper(results: Results) -> pd.DataFrame:
     recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
     sizes = [printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record]
     return runs.assign(
-        order=runs.model.map(MODELS.index),
+        order=runs.model.map(models.index),
         departs=runs.record.map(departure),
         recipe=[",".join(word for word in recipe.split(",") if word != "protocol=published") for recipe in recipes],
         pool=pd.Series(pools, runs.index, dtype=object),
@@ -193,19 +203,41 @@ def _once(runs: pd.DataFrame, by: Sequence[str] = RECIPE) -> pd.DataFrame:
     return ok.drop_duplicates(["scene", *by, "seed"], keep="last")
 
 
-def table2(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return the paper's averages over each of its data sets, and those of models that finished all its scenes."""
-    tables = []
-    for dataset, protocol in paper.PROTOCOLS.items():
-        tables.append(_quoted(dataset))
-        at_paper = _at_paper(runs, dataset)
-        if (at_paper.status == "ok").any():
-            means = stats.means(_once(of_one_machine(at_paper)), RECIPE, TABLE_2)
-            means = means[means.scenes == len(protocol.scenes)]
-            named = {"method": means.model, "source": "measured, experiment " + means.experiment}
-            tables.append(means.assign(dataset=dataset, **named))
+def table2(results: Results) -> pd.DataFrame:
+    """Return the paper's averages over each of its data sets, and below each those of the same method measured here.
+
+    A measured average is over all scenes. A model of `OWED` without one has a row that says how many it has finished.
+    """
+    runs = of_the_paper(results, [*dict.fromkeys((*MODELS, *OWED))])
+    tables = [_beside(_quoted(dataset), _measured(runs, dataset)) for dataset in paper.PROTOCOLS]
     names = ["dataset", "method", "source", "recipe", "seeds", *(name + end for name in TABLE_2 for end in ("", " ±"))]
     return pd.concat(tables, ignore_index=True).reindex(columns=names)
+
+
+def _measured(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
+    """Return the measured rows of Table 2 for a data set, those of `OWED` also without numbers."""
+    scenes, runs = paper.PROTOCOLS[dataset].scenes, _at_paper(runs, dataset)
+    finished = runs[runs.status == "ok"]
+    rows = pd.DataFrame({"model": [], "experiment": []}, dtype=object)
+    if len(finished):
+        rows = stats.means(_once(of_one_machine(finished)), RECIPE, TABLE_2)
+        rows = rows[rows.scenes == len(scenes)]
+    rows = rows.assign(source="measured: " + rows.model + ", experiment " + rows.experiment)
+    lacking = [model for model in OWED if model not in set(rows.model)]
+    counts = [finished[finished.model == model].scene.nunique() for model in lacking]
+    reasons = [
+        f"not measured: {model}, {count} of {len(scenes)} scenes finished"
+        for model, count in zip(lacking, counts, strict=True)
+    ]
+    rows = pd.concat([rows, pd.DataFrame({"model": lacking, "source": reasons})], ignore_index=True)
+    return rows.assign(dataset=dataset, method=[(OWED | NAMES).get(model, model) for model in rows.model])
+
+
+def _beside(quoted: pd.DataFrame, measured: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of both; a measured row follows the quoted ones of its method."""
+    rows = pd.concat([quoted, measured], ignore_index=True)
+    methods = [*dict.fromkeys(rows.method)]
+    return rows.sort_values("method", key=lambda of: of.map(methods.index), kind="stable", ignore_index=True)
 
 
 def _quoted(dataset: str) -> pd.DataFrame:
@@ -318,7 +350,7 @@ def sections(results: Results) -> dict[str, list[Section]]:
     runs = of_the_paper(results)
     return {
         "table1": [*_sections1(runs), pools(runs)],
-        "table2": list(_sections2(runs)),
+        "table2": list(_sections2(results)),
         "table_successors": list(_sections_of_successors(results)),
     }
 
@@ -393,8 +425,8 @@ def _heading(runs: pd.DataFrame) -> str:
     return printable(f"{dataset}: experiment {experiment}, {sizes}{resized}, {steps:,} iterations")
 
 
-def _sections2(runs: pd.DataFrame) -> Iterator[Section]:
-    rows = table2(runs)
+def _sections2(results: Results) -> Iterator[Section]:
+    rows = table2(results)
     for dataset, protocol in paper.PROTOCOLS.items():
         of = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
         notes = tuple(f"{name}: {text}" for name, text in SOURCES_2.items() if f"paper, {name}" in set(of.source))
@@ -416,8 +448,7 @@ def _sections_of_successors(results: Results) -> Iterator[Section]:
 
 def numbers(results: Results) -> dict[str, pd.DataFrame]:
     """Return the tables by the names of their files."""
-    runs = of_the_paper(results)
-    return {"table1": table1(runs), "table2": table2(runs), "table_successors": successors(results)}
+    return {"table1": table1(of_the_paper(results)), "table2": table2(results), "table_successors": successors(results)}
 
 
 def write(results: Results, folder: Path) -> None:
