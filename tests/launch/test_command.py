@@ -29,6 +29,14 @@ ABLATIONS = {  # what each changes of 7DGS as it is; of another model, only its 
     "cholesky": {"model.options.scheme": "cholesky"},
     "raw_off_diagonal": {"model.options.off_diagonal": "raw"},
     "row_scaled": {"model.options.off_diagonal": "row_scaled"},
+    "deep_agr_encoded": {
+        "model.options.agr_depth": 4,
+        "model.options.agr_width": 64,
+        "model.options.agr_mean_octaves": 10,
+        "model.lr.refinement.start": 8e-4,
+        "model.lr.refinement.end": 1.6e-6,
+        "model.lr.refinement.per_run": True,
+    },
 }
 
 

@@ -113,7 +113,7 @@ def test_the_last_of_equal_candidates_is_taken(scores: list[float | None], chose
     assert best(results) is results[chosen]
     failed = result("failed", None, DivergedError("step 5"))
     assert highest([*results, failed]) is results[chosen]
-    with pytest.raises(DivergedError, match="all 2 candidates failed; failed: step 5"):
+    with pytest.raises(DivergedError, match="none of 2 candidates can be chosen; failed: step 5"):
         best([failed, replace(failed, candidate=replace(failed.candidate, name="other"))])
 
 
