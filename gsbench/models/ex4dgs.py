@@ -14,7 +14,7 @@ from torch import Tensor
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import collect_gradients
-from gsbench.kernels.tensors import check_number
+from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.factors import sizes
@@ -62,7 +62,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        check_number(intervals, "intervals", 1, 1024)
+        check_whole(intervals, "intervals", 1, 1024)
         check_number(dynamic_share, "dynamic_share", 0, 1)
         check_number(velocity_penalty, "velocity_penalty", 0)
         check_number(key_penalty, "key_penalty", 0)

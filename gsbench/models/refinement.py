@@ -52,14 +52,14 @@ class Changes(nn.Module, ABC):
         | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
     ) -> list[Tensor]:
         """Return the raw parameters plus the outputs of the networks at a time."""
-        if rows is not None:
-            resting = [x[:rows] for x in values]
-            moved = Changes.forward(self, resting, time)
-            if intervals is not None:
-                awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
-                moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
-            return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
-        return [x + added for x, added in zip(values, self.added(values, time), strict=True)]
+        resting = values if rows is None else [x[:rows] for x in values]
+        moved = [x + added for x, added in zip(resting, self.added(resting, time), strict=True)]
+        if rows is None:
+            return moved
+        if intervals is not None:
+            awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
+            moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
+        return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
 
 
 class Refinement(Changes):
