@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -43,6 +45,8 @@ from gsbench.train import losses
 KEYS = ("exp", "scene", "data", "protocol", "seed", "device", "results")
 RECORDED = ("experiment", "seed", "device", "data", "scene", "protocol")  # keys of a config that the record has
 NAMED = 5  # files that a line names
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # of the scales, from the finest (Wang et al. 2003)
+MS_SSIM_LEAST_SIDE = 161  # pixels: a window of 11 fits into the coarsest scale, a sixteenth of the size
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -193,7 +197,7 @@ def _departures(renders: CheckedRenders) -> dict[str, Any]:
 def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, float]:
     """Return the means of the metrics of other papers over views, and of tOF over films.
 
-    A metric is left out if the images are too small for it, or if there is no film.
+    A metric is left out if an image is too small for it, or if there is no film.
     """
     films = [[view.name for view in film] for film in films_of(views)]
     is_filmed = set(itertools.chain(*films))
@@ -204,7 +208,8 @@ def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, f
             values.append(of_other_papers(image, truth))
         if view.name in is_filmed:
             frames[view.name] = grey_of(image), grey_of(truth)
-    means = {name: fmean(of_view[name] for of_view in values) for name in (values or [{}])[0]}
+    names = [name for name in (values or [{}])[0] if all(name in of_view for of_view in values)]
+    means = {name: fmean(of_view[name] for of_view in values) for name in names}
     flows = [tof(*zip(*(frames[name] for name in film), strict=True)) for film in films]
     known = [flow for flow in flows if flow is not None]
     return means | ({"tof_farneback": fmean(known)} if known else {})
@@ -215,12 +220,13 @@ def of_other_papers(render: Tensor, truth: Tensor) -> dict[str, float]:  # [H, W
 
     `ssim_padded` is that of 3DGS and of SSIM1 of STG, with a zero-padded Gaussian window. `ssim_uniform` is
     scikit-image's default, with a uniform window of 7 pixels; it takes data_range 2 for floats where none is named, as
-    in `ssim_uniform_range2`, SSIM2 of STG. DSSIM is (1 - SSIM) / 2.
+    in `ssim_uniform_range2`, SSIM2 of STG. DSSIM is (1 - SSIM) / 2. `ms_ssim`, which 4DGaussians reports, is left out
+    if a side is shorter than MS_SSIM_LEAST_SIDE.
     """
     a, b = (image.detach().double().clamp(0, 1) for image in (render, truth))
+    arrays = a.cpu().numpy(), b.cpu().numpy()
     uniform = [
-        float(structural_similarity(a.cpu().numpy(), b.cpu().numpy(), channel_axis=-1, data_range=data_range))
-        for data_range in (1.0, 2.0)
+        float(structural_similarity(*arrays, channel_axis=-1, data_range=data_range)) for data_range in (1.0, 2.0)
     ]
     padded = float(losses.structural_similarity(a, b))
     return {
@@ -230,7 +236,38 @@ def of_other_papers(render: Tensor, truth: Tensor) -> dict[str, float]:  # [H, W
         "dssim1": (1 - padded) / 2,
         "dssim2": (1 - uniform[1]) / 2,
         "psnr_color_corrected": psnr(_color_corrected(a, b), b),
-    }
+    } | ({"ms_ssim": multiscale_ssim(*arrays)} if min(arrays[0].shape[:2]) >= MS_SSIM_LEAST_SIDE else {})
+
+
+def multiscale_ssim(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:  # [H, W, 3] in [0, 1], each
+    """Compute MS-SSIM (Wang et al. 2003) as the package pytorch-msssim does, whose numbers papers print.
+
+    It is a product over scales of the contrasts and structures, and of the luminance of the coarsest; the mean over
+    channels. A scale has means of 2 x 2 pixels of the one before, after a row or column of zeros where a side is odd.
+    """
+    C1, C2 = 0.01**2, 0.03**2
+    product = np.ones(a.shape[-1])
+    for scale, weight in enumerate(MS_SSIM_WEIGHTS):
+        if scale:
+            a, b = _halved(a), _halved(b)
+        mean_a, mean_b, aa, bb, ab = map(_windowed, (a, b, a * a, b * b, a * b))
+        similarity = (2 * (ab - mean_a * mean_b) + C2) / (aa - mean_a**2 + bb - mean_b**2 + C2)
+        if scale == len(MS_SSIM_WEIGHTS) - 1:
+            similarity *= (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
+        product *= similarity.mean((0, 1)).clip(0) ** weight
+    return float(product.mean())
+
+
+def _windowed(image: NDArray[np.float64]) -> NDArray[np.float64]:  # [H, W, 3] -> [H - 10, W - 10, 3]
+    """Return the means in the Gaussian windows of 11 pixels that lie inside an image."""
+    return gaussian_filter(image, sigma=(1.5, 1.5, 0), truncate=3.5)[5:-5, 5:-5]
+
+
+def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:  # [H, W, 3]
+    """Return the means of 2 x 2 pixels, where zeros stand before the first row or column of an odd number."""
+    height, width = image.shape[:2]
+    even = np.pad(image, ((height % 2, 0), (width % 2, 0), (0, 0)))
+    return even.reshape(len(even) // 2, 2, -1, 2, image.shape[-1]).mean((1, 3))
 
 
 def _color_corrected(render: Tensor, truth: Tensor) -> Tensor:  # [H, W, 3] float64, each

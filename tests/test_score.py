@@ -131,6 +131,27 @@ def test_the_ssim_of_other_papers():
     assert {name: values[name] for name in expected} == pytest.approx(expected, abs=1e-8)
 
 
+def test_multiscale_ssim():
+    """Catches another window, weight, luminance or halving of MS-SSIM: values of pytorch-msssim 1.0.0 with a float64
+    window, for even and odd sides and for a channel whose contrast is negative."""
+    expected = {(176, 200): (0.9915429809093, 0.6638476603031), (161, 213): (0.9917184990649, 0.6639061663550)}
+    for (height, width), values in expected.items():
+        y, x = (grid / 24 for grid in np.mgrid[:height, :width])
+        a = 0.5 + 0.3 * np.sin(7 * x + 2 * y) * np.cos(5 * y)
+        b = (a + 0.05 * np.sin(31 * x * y + 0.5)).clip(0, 1)
+        for channels, value in zip(((b, b, b), (b, a, 1 - a)), values, strict=True):
+            images = (torch.from_numpy(np.stack(image, -1)) for image in (channels, (a, a, a)))
+            assert of_other_papers(*images)["ms_ssim"] == pytest.approx(value, abs=1e-12)
+    sizes = [(161, 170), (160, 300)]
+    pictures = [torch.rand(height, width, 3) for width, height in sizes]
+    cameras = [Camera(torch.eye(4), torch.eye(3), *size) for size in sizes]
+    views = [View(str(i), cameras[i], 0, picture) for i, picture in enumerate(pictures)]
+    assert of_other_papers(pictures[0], pictures[0])["ms_ssim"] == 1
+    metrics = other_metrics(views, SimpleNamespace(images=lambda: pictures))
+    assert "ssim_padded" in metrics
+    assert "ms_ssim" not in metrics
+
+
 def test_flow_is_that_of_whole_films():
     """Catches frames that a film loses, views of no film, and the sum of films: one of two renders stands still, and a
     third film is too short."""

@@ -66,6 +66,7 @@ RUNS = (
     RunColumn("ssim_padded", "parts.score.ssim_padded", float, "of gsbench.score: SSIM of 3DGS, zero-padded Gaussian"),
     RunColumn("ssim_uniform", "parts.score.ssim_uniform", float, "SSIM with a uniform window of 7, scikit-image's"),
     RunColumn("ssim_uniform_range2", "parts.score.ssim_uniform_range2", float, "the same with data_range 2"),
+    RunColumn("ms_ssim", "parts.score.ms_ssim", float, "MS-SSIM over five scales, as pytorch-msssim"),
     RunColumn("tof_farneback", "parts.score.tof_farneback", float, "tOF (Farneback), pixels: `gsbench.score`"),
     RunColumn("dssim1", "parts.score.dssim1", float, "(1 - ssim_padded) / 2"),
     RunColumn("dssim2", "parts.score.dssim2", float, "(1 - ssim_uniform_range2) / 2"),
