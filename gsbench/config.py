@@ -104,7 +104,7 @@ class DensifyConfig:
     stop: int = key(15_000, "last step", low=0)
     every: int = key(100, "least steps between two rounds", low=1)
     rounds: int | None = key(None, "most rounds; null: 36", low=1)
-    reset_every: int = key(3_000, "steps between opacity resets", low=1)
+    reset_every: int | None = key(3_000, "steps between opacity resets; null: none", low=1)
     grad_threshold: float = key(2e-4, "least mean gradient of a 2D mean, per half image", low=0)
     clone_below: float = key(0.01, "clone if the largest scale is below this share of the extent, else split", low=0)
     prune_above: float = key(0.1, "prune above this share, after an opacity reset", low=0)

@@ -60,9 +60,11 @@ class Schedule:
         self.densify_stop = self.scaled(densify.stop)
         window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
         self.densify_every = max(densify.every, math.ceil(window / rounds))
-        every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
         # The numbers of finished steps after which opacities are reset, none close to the end of densification.
-        self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
+        self.reset_every, self.resets_after = math.inf, range(0)
+        if densify.reset_every is not None:
+            every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)
+            self.resets_after = range(every, self.densify_stop - every // 2 + 1, every)
 
     def scaled(self, step: int) -> int:
         """Scale a step of the settings to the length of this run; at least 1."""

@@ -53,6 +53,13 @@ def test_intervals_never_fall_below_what_they_wait_for() -> None:
     assert all(step + 1 + s.reset_every // 2 <= s.densify_stop for step in resets)
 
 
+def test_no_resets_at_all() -> None:
+    """Catches a run without resets that lowers opacities, or that prunes large Gaussians as if it had."""
+    s = Schedule(TrainConfig(densify=DensifyConfig(reset_every=None)), sh_degree=3, agr=True)
+    assert not s.resets_after
+    assert not any(s.resets(step) or s.has_reset(step) for step in (0, 2_999, 6_000, 29_999))
+
+
 def test_growth_follows_the_resolution() -> None:
     """Catches a limit that a quarter of the width fills with Gaussians, and one that full resolution does not have."""
     s = Schedule(TrainConfig(coarse=[[4, 3_000], [2, 14_900]], densify=DensifyConfig()), sh_degree=3, agr=True)
