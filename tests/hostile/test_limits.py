@@ -150,7 +150,11 @@ def test_a_record_with_endless_entries_is_refused(part: str, tmp_path: Path) -> 
 
 def test_a_limit_of_the_address_space_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches an export of 16384 x 16384 pixels under `ulimit -v` that ends in a stack trace."""
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (1, 1))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 20, 1))
+    needed = memory.LEAST_ADDRESS_SPACE >> 20
+    assert f"limited to 1 MiB of address space (ulimit -v), and torch needs {needed} MiB" in (
+        memory.too_little_address_space() or ""
+    )
     assert memory.available() == 0
     with pytest.raises(InputError, match=r"0\.0 GiB are available: lower"):
         memory.require(1 << 30, "frames", "lower --width")

@@ -22,6 +22,8 @@ def test_tables_always_have_their_columns(records):
     assert all(tables.runs[of.name].dtype == of.kind for of in RUNS if of.kind in (int, float, bool))
     assert list(tables.views)[:3] == ["run", "view", "psnr_db"]
     assert next(iter(tables.curves)) == "run"
+    others = {name for name in tables.runs if not name.startswith(("protocol_", "stage_"))}
+    assert others == {*(column.name for column in RUNS), "path", "record"}
     assert len(tables.finished.runs) == sum(record.status == "ok" for record in records)
 
 

@@ -450,6 +450,15 @@ def test_a_binary_file_of_another_length_is_refused(part: str, cut: int, more: b
             READERS[part](colmap.ModelFile(Path(f"{part}.bin"), data))
 
 
+@pytest.mark.parametrize("number", [-1, 99])
+def test_a_number_that_is_no_model_is_refused(number: int) -> None:
+    """Catches a number that counts from the end of the list of models, as -1 does in Python."""
+    data = bytearray(BINARY["cameras"])
+    data[12:16] = number.to_bytes(4, "little", signed=True)  # after the count and the camera's number
+    with pytest.raises(InputError, match=f"model {number}"):
+        colmap.read_cameras(colmap.ModelFile(Path("cameras.bin"), bytes(data)))
+
+
 @pytest.mark.parametrize("part", READERS)
 @given(at=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=8))
 def test_changed_bytes_are_an_input_error_or_finite(part: str, at: int, value: bytes) -> None:

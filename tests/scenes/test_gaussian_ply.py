@@ -125,6 +125,7 @@ REFUSED = [
     (rows(1, "trbf_center", "trbf_scale"), "trbf_center, trbf_scale are of Spacetime Gaussians"),
     (rows(1, *(f"motion_{i}" for i in range(9))), "motion_0..8 are of Spacetime Gaussians"),
     (rows(1, "omega_0", "omega_1", "nx"), "omega_0..1 are of Spacetime Gaussians"),
+    (rows(1, "f_t_0", "f_t_1", "nx"), "f_t_0..1 are of Spacetime Gaussians"),
     (rows(1, "beta"), "beta are of Beta Splatting"),
     (rows(1, "sb_params_0", "sb_params_1"), "sb_params_0..1 are of Beta Splatting"),
     (rows(1, "t", "scale_t", "rot_r_0", "rot_r_1"), "t, scale_t, rot_r_0..1 are of 4DGS"),

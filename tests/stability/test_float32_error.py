@@ -88,6 +88,7 @@ def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFix
     text = capsys.readouterr().out
     rows = [line for line in text.splitlines() if line.startswith("| orbit")]
     assert len(rows) == 10
+    assert text.startswith("Views: 10 on an orbit around the median of the means, ")
     assert all(row.endswith("| - | - | - |") and "0.0e+00" not in row for row in rows)
     assert "Rounding to 8 bits changes an image" in text
     assert (tmp_path / "out/third party.exactness.png").exists()
@@ -187,11 +188,11 @@ def small_model(name: str = "7dgs", backend: str = "cpu") -> GaussianModel:
     return model
 
 
-def with_factors(log_diagonal: Sequence[float], motion: float = 0.0) -> GaussianModel:
-    """A model in float64 whose factors have this diagonal, and correlations of about this size."""
+def with_factors(log_diagonal: Sequence[float], motion: float = 0.0, shape: float = 0.0) -> GaussianModel:
+    """A model in float64 whose factors have this diagonal, and entries of about these sizes below it."""
     model = small_model()
     model.splats["log_diagonal"].data[:] = torch.tensor(log_diagonal)
-    sizes = {"motion": motion, "coupling": motion / 1e3}
+    sizes = {"motion": motion, "coupling": motion / 1e3, "shape": shape}
     for kind in KINDS:
         model.splats[kind].data.normal_(0, sizes.get(kind, 0.0), generator=generator(0))
     return model.double()
@@ -207,6 +208,8 @@ def test_condition_numbers() -> None:
         assert numbers == pytest.approx([math.exp(decades)] * len(float32_error.PERCENTILES))
     assert set(plain.indefinite.values()) == {0.0}
     assert 1e-9 < min(plain.error.values()) <= max(plain.error.values()) < 1e-5  # of float32
+    turned = float32_error.conditioning(with_factors([0.5, -0.5, 1.0, 0.0, -1.0, 0.5, -0.5], motion=0.3, shape=0.4))
+    assert max(turned.error.values()) < 1e-5  # of a covariance that is not diagonal
     hard = float32_error.conditioning(with_factors([0.0, 0.0, 0.0, 0.0, -11.5, -11.5, -11.5], motion=1e3))
     assert min(hard.indefinite.values()) > 0.5
     assert min(hard.error.values()) > 1
