@@ -37,6 +37,7 @@ class DataConfig:
     initial_lambda_t: float = key(0.5, "its initial lambda_t", absent=0.5)
     initial_points: int = key(100_000, "random points, if needed", low=4)
     initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see", low=1e-6, high=1e6)
+    near: float | None = key(None, "least depth, user's units; null: 0.01 trained units", low=1e-6, high=1e6)
 
 
 @dataclass

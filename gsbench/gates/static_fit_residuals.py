@@ -17,7 +17,7 @@ from gsbench.models.camera_time import CameraTime, unit
 from gsbench.models.gaussians3d import Gaussians3DModel
 from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
-from gsbench.scenes import Camera, Points, Scene, View
+from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.points import frustum_points
 
 LONG_SIDE = 40  # least length in pixels of the longer side of a fitted image, if the image is not smaller
@@ -87,7 +87,7 @@ def smaller(view: View) -> View:
     K[:2] /= factor
     return replace(
         view,
-        camera=Camera(camera.viewmat, K, width, height),
+        camera=replace(camera, K=K, width=width, height=height),
         pixels=F.avg_pool2d(image, factor)[0].permute(1, 2, 0).contiguous(),
     )
 

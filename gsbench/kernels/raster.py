@@ -18,6 +18,8 @@ TILE_PIXELS = TILE * TILE
 MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
 ROOM = 2.0  # the memory for tile intersections of a recording, as a multiple of what its first image needs
 GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity; of a Beta profile its exponent too
+NEAR, FAR = 0.01, 1e10  # default range of depths; a Gaussian whose mean is outside is culled
+EPS2D = 0.3  # default number that is added to the diagonal of projected covariances, pixels^2
 LOWER = "use a smaller image, fewer cameras at once or fewer Gaussians"  # where memory does not suffice
 
 

@@ -14,7 +14,7 @@ from gsbench.kernels.raster import RasterInputs, Viewport
 from gsbench.models.base import GaussianModel
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.gaussian_batch import Gaussians3D
-from gsbench.raster import EPS2D, FAR, NEAR, RasterOutput, rasterize
+from gsbench.raster import EPS2D, FAR, RasterOutput, rasterize
 from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
 
@@ -31,6 +31,7 @@ def rasterize_slice(
         *gaussians[:4],
         *view,
         background=_behind(gaussians, background),
+        near=camera.near,
         backend=backend,
         antialias=antialias,
         beta_exponents=gaussians.beta_exponents,
@@ -122,7 +123,7 @@ class GraphedFrames:
         room = 1 + int(MARGIN * drawn.info.pairs)
         recorded = camera.clone()
         moment = None if time is None else recorded.K.new_full((), time)
-        view = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, self.antialias)
+        view = Viewport(camera.width, camera.height, camera.near, FAR, EPS2D, self.antialias)
 
         def frame() -> tuple[Tensor, Tensor]:
             gaussians = self.model.slice(CameraTime.of(recorded, moment))

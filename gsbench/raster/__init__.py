@@ -4,15 +4,12 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import CPU, CUDA, Backend, resolve
-from gsbench.kernels.raster import RasterInputs, Viewport
+from gsbench.kernels.raster import EPS2D, FAR, NEAR, RasterInputs, Viewport
 from gsbench.kernels.tensors import check_tensor
 from gsbench.raster import native, reference
 from gsbench.raster.interface import RasterInfo, RasterOutput, check_arguments
 
 __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
-
-NEAR, FAR = 0.01, 1e10  # default range of depths; a Gaussian whose mean is outside is culled
-EPS2D = 0.3  # default number that is added to the diagonal of projected covariances, pixels^2
 
 
 def rasterize(

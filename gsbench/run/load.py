@@ -75,6 +75,11 @@ class LoadedRun:
     step: int  # finished steps; fewer than config.train.iterations if the run was interrupted
     folder: Path
 
+    @property
+    def near(self) -> float:
+        """The near plane of its cameras, world units."""
+        return self.scene.placement.near_to_standard(self.config.data.near)
+
 
 def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> LoadedRun:
     """Load the model, the settings and a description of the scene from the folder of a run.

@@ -79,6 +79,8 @@ def load_scene(config: Config) -> Scene:
         repair=config.data.repair,
         leave_out=config.scene.leave_out,
     )
+    if config.data.near is not None:
+        scene = scene.with_near(config.data.near)
     if config.scene.val_every is not None:
         scene = scene.with_val(config.scene.val_every)
     return scene.to(config.device)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.raster import NEAR
 
 UP = (0.0, 0.0, 1.0)  # in Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 STANDARD = 4.0  # the distance of cameras from what they look at, in the coordinates of a training; D-NeRF's
@@ -21,6 +22,7 @@ class Camera:
     K: Tensor  # [3, 3] intrinsics in pixels
     width: int
     height: int
+    near: float = NEAR  # depth, in world units; Gaussians whose mean is nearer are not drawn
     center: Tensor = field(init=False, compare=False, repr=False)  # [3] the position in world space
 
     def __post_init__(self) -> None:
@@ -29,7 +31,7 @@ class Camera:
 
     def clone(self) -> "Camera":
         """Return the same camera in memory of its own, which `overwrite` may change."""
-        return Camera(self.viewmat.clone(), self.K.clone(), self.width, self.height)
+        return replace(self, viewmat=self.viewmat.clone(), K=self.K.clone())
 
     def overwrite(self, other: "Camera") -> None:
         """Write the values of another camera, with images of the same size, to the memory of this one."""
@@ -39,7 +41,7 @@ class Camera:
 
     def to(self, device: str) -> "Camera":
         """Return a copy of the camera whose tensors are on `device`."""
-        return Camera(self.viewmat.to(device), self.K.to(device), self.width, self.height)
+        return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,10 @@ class Placement:
         """Convert positions to the user's coordinates."""
         return positions.double() * self.unit + positions.new_tensor(self.center, dtype=torch.float64)
 
+    def near_to_standard(self, near: float | None) -> float:
+        """Convert a near plane from the user's units to those of the training; None is the rasterizer's default."""
+        return NEAR if near is None else near / self.unit
+
     def viewmat_to_standard(
         self,
         viewmat: Tensor,  # [4, 4] float64, world to camera in the user's coordinates
@@ -153,6 +159,15 @@ class Scene:
     def has_time(self) -> bool:
         """Whether every training view has a time."""
         return all(view.time is not None for view in self.train)
+
+    def with_near(self, near: float) -> "Scene":  # in the user's units
+        """Return a copy of the scene whose cameras have a near plane."""
+        depth = self.placement.near_to_standard(near)
+        train, val, test = (
+            [replace(view, camera=replace(view.camera, near=depth)) for view in views]
+            for views in (self.train, self.val, self.test)
+        )
+        return replace(self, train=train, val=val, test=test)
 
     def with_val(self, every: int) -> "Scene":
         """Return a copy of the scene in which every n-th training view is a validation view, from the n-th on.

@@ -19,7 +19,7 @@ from gsbench.models.gated import JointModel
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
 from gsbench.models.slicing import reduce, subtract
-from gsbench.raster import EPS2D, FAR, NEAR
+from gsbench.raster import EPS2D, FAR
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U, exact_image
 from gsbench.raster.reference import project
 from gsbench.scenes.scene import Camera, View
@@ -218,7 +218,7 @@ def float64_model(model: GaussianModel) -> GaussianModel:
 
 def float64_camera(camera: Camera) -> Camera:
     """Return a camera whose matrices are float64; its position is computed in float64 too."""
-    return Camera(camera.viewmat.double(), camera.K.double(), camera.width, camera.height)
+    return replace(camera, viewmat=camera.viewmat.double(), K=camera.K.double())
 
 
 @torch.inference_mode()
@@ -259,6 +259,7 @@ def float64_image(
         camera.width,
         camera.height,
         background=background,
+        near=camera.near,
         antialias=antialias,
     )
 
@@ -297,7 +298,7 @@ def reasons(
     means, factors, opacities = (part[rows] for part in gaussians[:3])
     exponents = None if gaussians.beta_exponents is None else gaussians.beta_exponents[rows]
     exact = float64_camera(camera)
-    viewport = Viewport(camera.width, camera.height, NEAR, FAR, EPS2D, False)
+    viewport = Viewport(camera.width, camera.height, camera.near, FAR, EPS2D, False)
     splats = project(means, factors, opacities, exact.viewmat, exact.K, viewport, exponents)
     axes = torch.linalg.svdvals(factors)
     moved = U * (means.norm(dim=-1) + exact.center.norm()) * exact.K[0, 0] / splats.depths

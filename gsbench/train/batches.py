@@ -2,11 +2,12 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 
-from gsbench.scenes import Camera, View
+from gsbench.scenes import View
 
 
 class Batches:
@@ -72,4 +73,4 @@ def reduced(view: View, factor: int) -> View:
     mean = F.avg_pool2d(image.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0).contiguous()
     K = camera.K.clone()
     K[:2] /= factor
-    return View(view.name, Camera(camera.viewmat, K, width, height), view.time, mean)
+    return View(view.name, replace(camera, K=K, width=width, height=height), view.time, mean)

@@ -170,7 +170,8 @@ class FrameRenderer:
             except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
                 raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
             antialias = run.config.raster.antialias
-            reference = float64_image(gaussians, single, camera, self._background(request), antialias)
+            planes = replace(camera, near=run.near)
+            reference = float64_image(gaussians, single, planes, self._background(request), antialias)
             bound, undecided = STEPS * reference.bound, float(reference.undecided.double().mean())
             return Float32Error(
                 rounding_image(bound.numpy()),
@@ -183,7 +184,7 @@ class FrameRenderer:
     def _timed_image(self, camera: Camera, request: FrameRequest) -> tuple[Tensor, dict[str, float]]:
         """Return the image of a camera, [H, W, 3], and the milliseconds of each stage."""
         run, device = self.run, self.run.config.device
-        camera = camera.to(device)
+        camera = replace(camera.to(device), near=run.near)
         center = camera.center if request.center is None else request.center.to(device)
         query = CameraTime.at(center, request.time)
         with self._lock, torch.inference_mode(), StageWatch(device) as watch:

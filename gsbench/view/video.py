@@ -5,6 +5,7 @@ import os
 import secrets
 from collections.abc import Generator, Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -70,7 +71,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     K = camera.K.clone()
     K[:2] *= scale
     K[1, 2] += (height - scale * camera.height) / 2
-    return Camera(camera.viewmat, K, width, height)
+    return replace(camera, K=K, width=width, height=height)
 
 
 def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator[Pixels, None, None]:
@@ -82,7 +83,7 @@ def frames(run: LoadedRun, shots: list[Shot], supersample: int = 1) -> Generator
     with torch.inference_mode(), tqdm(shots, desc=run.scene.name, unit="frame") as bar:
         for camera, time in bar:
             width, height, n = camera.width, camera.height, supersample
-            fine = resized(camera, n * width, n * height).to(run.config.device)
+            fine = replace(resized(camera, n * width, n * height), near=run.near).to(run.config.device)
             image = render(run.model, fine, time, background, run.config.raster.antialias)
             yield to_bytes(image.reshape(height, n, width, n, 3).mean((1, 3)).cpu().numpy())
 

@@ -50,7 +50,10 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
             for model in ("3dgs", "6dgs")
         ),
         ("3dgs", "train.coarse=[[2,3000],[4,15000]]", PAIRS),
-        *(("3dgs", f"train.coarse={pairs}", PAIRS) for pairs in ("[[1,3000]]", "[[]]", "[[4,3000,1]]", "[[4,3000],[2,3000]]")),
+        *(
+            ("3dgs", f"train.coarse={pairs}", PAIRS)
+            for pairs in ("[[1,3000]]", "[[]]", "[[4,3000,1]]", "[[4,3000],[2,3000]]")
+        ),
         ("3dgs", "train.coarse=[[2,3000]]", "train.coarse, after the factor 2: expected images of at least 11 pixels"),
     ],
 )

@@ -21,6 +21,7 @@ from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.placement import place_and_size
 from gsbench.scenes.points import far_outside, size_of
 from gsbench.scenes.scene import STANDARD, Points
+from gsbench.view import video
 
 COUNT = 16
 MOVES = {
@@ -218,6 +219,22 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
     assert started.status == "ok", started.reason
     means = load_run(folder).model.splats["means"]
     torch.testing.assert_close(means, trained["plain"].means, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("near", [None, 1.0, 300.0, 600.0])
+def test_a_near_plane_is_in_the_users_units(near: float | None, tmp_path: Path) -> None:
+    """Catches a near plane in units of the training, and a training, a measurement or a loaded run without it.
+
+    The cameras are at 400 from the square, whose half size is 150.
+    """
+    data = moved_square(tmp_path / "data", 100.0, (0.0, 0.0, 0.0))
+    words = overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=5", f"data.near={near or 'null'}")
+    record, folder = run_here(*words)
+    is_cut, run = near == 600, load_run(folder)
+    assert (record.metrics["psnr"] == record.metrics["psnr_background_only"]) == is_cut
+    assert record.metrics["psnr_float32"] < 0.01  # dB: the float64 image is cut too
+    (image,) = video.frames(run, [(video.around(run, 0.0, 0.3), 0.5)])
+    assert (image == image[0, 0]).all() == is_cut
 
 
 def test_points_that_no_camera_sees_are_refused(tmp_path: Path) -> None:
