@@ -62,8 +62,8 @@ class GaussianModel(nn.Module, ABC):
         agr: bool = False,  # whether AGR, the adaptive Gaussian refinement of 7DGS, changes the Gaussians over time
         agr_octaves: int = OCTAVES,  # frequencies of AGR's time encoding
         agr_depth: int | None = None,  # of one deeper network in the place of AGR's; None: AGR as published
-        agr_width: int = 64,  # of that network
-        agr_mean_octaves: int = 0,  # of its encoding of means
+        agr_width: int | None = None,  # of that network's hidden layers; None: 64
+        agr_mean_octaves: int | None = None,  # of its encoding of means; None: they are read as they are
         sh_degree: int = 3,  # of the colours, 0 to 3
         backend: Backend = AUTO,  # the implementation that computes conditional 3D Gaussians, colours and AGR
     ) -> None:
@@ -75,14 +75,15 @@ class GaussianModel(nn.Module, ABC):
         self.log_lambda = nn.ParameterDict()  # ln lambda_t, ln lambda_d of the models that have them
         self.refinement: Changes | None = None
         check_whole(agr_octaves, "agr_octaves", 0, 32)
-        check_whole(agr_width, "agr_width", 1, 4096)
-        check_whole(agr_mean_octaves, "agr_mean_octaves", 0, 32)
         self.new_refinement: Callable[..., Changes] = Refinement
         if agr_depth is not None:
+            width, octaves = 64 if agr_width is None else agr_width, agr_mean_octaves or 0
             check_whole(agr_depth, "agr_depth", 1, 64)
-            self.new_refinement = partial(
-                DeepRefinement, width=agr_width, depth=agr_depth, mean_octaves=agr_mean_octaves
-            )
+            check_whole(width, "agr_width", 1, 4096)
+            check_whole(octaves, "agr_mean_octaves", 0, 32)
+            self.new_refinement = partial(DeepRefinement, width=width, depth=agr_depth, mean_octaves=octaves)
+        elif (agr_width, agr_mean_octaves) != (None, None):
+            raise InputError("agr_width, agr_mean_octaves: expected agr_depth too, as they describe its network")
         self.agr = agr
         self.agr_octaves = agr_octaves
         self.sh_degree = sh_degree

@@ -103,6 +103,8 @@ def test_wrong_options_are_refused(name: str) -> None:
         ("ndgs", {"lambda_d": 0.2}, r"joint_gate: expected lambda_d equal to lambda_t, got 0.2 and 0.5"),
         ("dgs", {"coupling": "texts"}, "coupling 'texts'"),
         ("freetime", {"duration": 0.0}, "duration"),
+        ("7dgs", {"agr_width": 32}, "expected agr_depth too"),
+        ("7dgs", {"agr_mean_octaves": 10}, "expected agr_depth too"),
         ("ubs", {"modulation": "white"}, "modulation 'white'"),
     ],
 )
