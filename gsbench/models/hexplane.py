@@ -7,7 +7,7 @@ constants of the authors' code. The planes are those of HexPlane (Cao and Johnso
 import math
 from collections.abc import Sequence
 from functools import reduce
-from itertools import starmap
+from itertools import accumulate, starmap
 from typing import Any, ClassVar
 
 import torch
@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.backends import CPU
-from gsbench.kernels.planes import sample_planes
+from gsbench.kernels.fields import heads, sample_planes
 from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
@@ -156,12 +156,11 @@ class Planes(nn.Module):
         From the lowest to the highest corner of the box, coordinates fall from 1 to -1. Time is used as it is, so only
         the second half of the nodes along t is read, as in the authors' code.
         """
+        if CPU.serves(positions):
+            size = self.of_space.shape[1], len(self.shapes), *self.nodes
+            return sample_planes(positions, self.high, self.low, time, self.of_space, self.of_time, *size)[0]
         # NaN would end the process in the gradient of grid_sample.
         coordinates = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num()
-        if CPU.serves(coordinates):
-            size = len(self.shapes), *self.nodes
-            (in_space,) = sample_planes(coordinates, self.of_space, None, None, *size)
-            return sample_planes(coordinates, self.of_time, in_space, time, *size)[0].flatten(1)
         at = dict(zip("xyzt", (*coordinates.unbind(-1), time.expand(len(coordinates))), strict=True))
 
         def sample(axes: str, plane: Tensor) -> Tensor:
@@ -190,6 +189,8 @@ class Planes(nn.Module):
 class Network(nn.Module):
     """The network of 4DGaussians (section 4.3): a layer, then heads of two more layers each."""
 
+    ends: Tensor  # [heads] int32: the number of outputs up to the end of each head
+
     def __init__(
         self,
         inputs: int,
@@ -208,8 +209,15 @@ class Network(nn.Module):
         self.heads = nn.ModuleList(
             nn.Sequential(layer(width, width, relu=True), layer(width, last)) for last in outputs
         )
+        ends = torch.tensor(list(accumulate(outputs)), dtype=torch.int32)
+        self.register_buffer("ends", ends, persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:  # [N, inputs] -> [N, sum of outputs]
         """Return the outputs of all heads, side by side."""
+        if CPU.serves(features):
+            weights, biases, last_weights, last_biases = zip(*(head.parameters() for head in self.heads), strict=True)
+            hidden = torch.stack(weights), torch.stack(biases)
+            last = torch.cat(last_weights), torch.cat(last_biases)
+            return heads(features, self.first.weight, self.first.bias, *hidden, *last, self.ends)[0]
         hidden = self.first(features)
         return torch.cat([head(hidden) for head in self.heads], -1)

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsbench.kernels.backends import CPU
-from gsbench.kernels.linear import linear as kernel
+from gsbench.kernels.fields import linear as kernel
 
 
 def _in_float64(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:

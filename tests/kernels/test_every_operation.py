@@ -41,6 +41,7 @@ VALUES: dict[str, Tensor] = {
     "ids": torch.arange(N, dtype=torch.int32).repeat(C * TILES),
     "opacities": torch.full((N,), 0.5),
     "orders": torch.full((N,), 5, dtype=torch.int32),
+    "ends": torch.tensor([1, 1, 2, 3], dtype=torch.int32),
 }
 LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
     "one row for all, stride 0": lambda x: x[:1].expand(x.shape),

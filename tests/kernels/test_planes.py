@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.planes import sample_planes
+from gsbench.kernels.fields import sample_planes
 from gsbench.models.hexplane import Planes
 
 
@@ -62,8 +62,9 @@ def test_positions_at_the_border_have_the_gradient_of_inside_or_none() -> None:
 
 def test_nodes_that_do_not_fit_are_refused() -> None:
     """Catches nodes that the kernel would read past their end, and numbers of them that overflow."""
-    with pytest.raises(InputError, match=r"expected nodes of shape \[47, 'C'\], got \[46, 2\]"):
-        sample_planes(torch.zeros(1, 3), torch.zeros(46, 2), None, None, 1, 5, 4, 3, 6)
+    tensors = torch.zeros(1, 3), torch.zeros(3), torch.ones(3), torch.zeros(()), torch.zeros(47, 2), torch.zeros(71, 2)
+    with pytest.raises(InputError, match=r"expected of_time of shape \[72, 2\], got \[71, 2\]"):
+        sample_planes(*tensors, 2, 1, 5, 4, 3, 6)
     for levels, nodes in ((0, 5), (9, 5), (1, 1), (1, 1 << 20)):
         with pytest.raises(InputError, match="expected 1 to 8 levels of 2 to 4096 nodes"):
-            sample_planes(torch.zeros(1, 3), torch.zeros(46, 2), None, None, levels, nodes, 4, 3, 6)
+            sample_planes(*tensors, 2, levels, nodes, 4, 3, 6)

@@ -113,17 +113,37 @@ struct LinearGrads {
 };
 GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
 
-// Planes of features over two of the axes x, y, z (time null), or over one of them and t; on a GPU torch samples them.
+// A network of a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each; head h has
+// the outputs from ends[h - 1] to ends[h] of all K.
+struct HeadsArgs {
+    int64_t N;
+    int C, H, heads, K;
+    const float *x, *first_weight, *first_bias;  // [N, C] [H, C] [H]
+    const float *hidden_weight, *hidden_bias;    // [heads, H, H] [heads, H]
+    const float *last_weight, *last_bias;        // [K, H] [K]
+    const int32_t* ends;                         // [heads]
+    int threads;
+};
+GSB_FIELDS(HeadsArgs, INPUTS, N, C, H, heads, K, x, first_weight, first_bias, hidden_weight, hidden_bias, last_weight,
+           last_bias, ends, threads)
+
+struct HeadsGrads {
+    float *x, *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias;  // zero on entry, but x
+};
+GSB_FIELDS(HeadsGrads, GRADS, x, first_weight, first_bias, hidden_weight, hidden_bias, last_weight, last_bias)
+
+// Planes of features over two of the axes x, y, z and over one of them and t; on a GPU torch samples them.
 constexpr int MOST_LEVELS = 8;
 
 struct PlaneArgs {
     int64_t N;
     int C, levels, x, y, z, t;          // nodes along each axis in the first level; of x, y, z, the next has twice as many
-    const float *coordinates, *nodes;   // [N, 3] [M, C]
-    const float *factors, *time;        // [N, levels C] []; null: ones, planes of space
+    const float *positions, *first, *last;      // [N, 3] [3] [3] of the points, of the first and the last nodes
+    const float *time, *of_space, *of_time;     // [] in [-1, 1], [M, C] [T, C] nodes
     int threads;
 };
-GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, t, coordinates, nodes, factors, time, threads)
+GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, t, positions, first, last, time, of_space,
+           of_time, threads)
 
 struct Features {
     float* features;  // [N, levels C]
@@ -136,9 +156,9 @@ struct FeatureGrads {
 GSB_FIELDS(FeatureGrads, GIVEN, features)
 
 struct PlaneGrads {
-    float *coordinates, *nodes, *factors;  // nodes: zero on entry
+    float *positions, *of_space, *of_time;  // of nodes: zero on entry
 };
-GSB_FIELDS(PlaneGrads, GRADS, coordinates, nodes, factors)
+GSB_FIELDS(PlaneGrads, GRADS, positions, of_space, of_time)
 
 }  // namespace gsb
 
@@ -150,6 +170,8 @@ GSB_FIELDS(PlaneGrads, GRADS, coordinates, nodes, factors)
     kernel(exact_image, ExactArgs, ExactPicture)   \
     kernel(linear, LinearArgs, Layer)              \
     kernel(linear_backward, LinearArgs, LayerState, LayerGrads, LinearGrads) \
+    kernel(heads, HeadsArgs, Layer)                \
+    kernel(heads_backward, HeadsArgs, LayerGrads, HeadsGrads) \
     kernel(sample_planes, PlaneArgs, Features)     \
     kernel(sample_planes_backward, PlaneArgs, FeatureGrads, PlaneGrads)
 

@@ -5,6 +5,7 @@
 // Rows whose gradient is zero, such as those of Gaussians behind others, are left out of the backward pass.
 #include "buffer.h"
 #include "isa.h"
+#include "matrices.h"
 #include "rows.h"
 
 namespace gsb {
@@ -12,75 +13,6 @@ inline namespace GSB_ISA {
 namespace {
 
 constexpr int64_t CHUNK = 256;  // rows, which stay in cache
-// A tile of a product has as many sums as keep the processor busy: each waits for its previous addition.
-#if defined(__AVX512F__)
-constexpr int TILE_ROWS = 8, TILE_VECTORS = 2;
-#else
-constexpr int TILE_ROWS = 4, TILE_VECTORS = 1;
-#endif
-constexpr int PANEL = TILE_VECTORS * LANES;  // columns
-
-// The left matrix of a product, A[r][i] = start[r * row + i * step].
-struct Left {
-    const float* start;
-    int64_t row, step;
-};
-
-// Adds A B to sums that begin at `begin(column)`, for R rows of A, from row r on, and V vectors of a panel of B;
-// finish(sum, row, column) stores them.
-template <int R, int V, class Begin, class Finish>
-GSB_HD inline void multiply_tile(const Left& A, int64_t r, const float* panel, int64_t inner, int column, Begin begin,
-                                 Finish finish) {
-    const float* a = A.start + r * A.row;
-    Vec sums[R][V];
-    GSB_UNROLL for (int v = 0; v < V; ++v) {
-        const Vec first = begin(column + v * LANES);
-        GSB_UNROLL for (int k = 0; k < R; ++k) sums[k][v] = first;
-    }
-    for (int64_t i = 0; i < inner; ++i) {
-        Vec b[V];
-        GSB_UNROLL for (int v = 0; v < V; ++v) b[v] = Vec::load(panel + i * PANEL + v * LANES);
-        GSB_UNROLL for (int k = 0; k < R; ++k) {
-            const Vec x(a[k * A.row + i * A.step]);
-            GSB_UNROLL for (int v = 0; v < V; ++v) sums[k][v] += x * b[v];
-        }
-    }
-    GSB_UNROLL for (int k = 0; k < R; ++k) {
-        GSB_UNROLL for (int v = 0; v < V; ++v) finish(sums[k][v], r + k, column + v * LANES);
-    }
-}
-
-// Computes the product for the rows of A from r on and V vectors of a panel, R rows at a time, and fewer at the end.
-template <int R, int V, class Begin, class Finish>
-void multiply_rows(const Left& A, int64_t r, int64_t rows, const float* panel, int64_t inner, int column, Begin begin,
-                   Finish finish) {
-    for (; r + R <= rows; r += R) multiply_tile<R, V>(A, r, panel, inner, column, begin, finish);
-    if constexpr (R > 1) multiply_rows<R / 2, V>(A, r, rows, panel, inner, column, begin, finish);
-}
-
-// Computes the product for `rows` rows of A and the panel of B whose first column is `column` of `columns`.
-template <class Begin, class Finish>
-void multiply(const Left& A, int64_t rows, const float* panel, int64_t inner, int column, int columns, Begin begin,
-              Finish finish) {
-    if (columns - column > LANES) {
-        multiply_rows<TILE_ROWS, TILE_VECTORS>(A, 0, rows, panel, inner, column, begin, finish);
-    } else {
-        multiply_rows<TILE_ROWS, 1>(A, 0, rows, panel, inner, column, begin, finish);
-    }
-}
-
-// Returns how many of the sixteen columns from `column` on there are: zero or fewer if none.
-GSB_HD inline int lanes_of(int column, int columns) { return columns - column < LANES ? columns - column : LANES; }
-
-// Returns a `begin` of sums that start at a bias, and one of sums that start at zero.
-auto at_bias(const float* bias, int columns) {
-    return [=](int column) {
-        const int n = lanes_of(column, columns);
-        return n > 0 ? load_some(bias + column, n) : Vec(0.0f);
-    };
-}
-constexpr auto at_zero = [](int) { return Vec(0.0f); };
-
 // Writes the columns from `column` on of the rows row(0), row(1), .. to a panel, with zeros beside the last column.
 template <class Row>
 void fill_panel(Row row, int64_t rows, int column, int columns, float* panel) {
@@ -99,18 +31,6 @@ void fill_transposed(const LinearArgs& a, Buffer<float>& panels) {
         float* column = panels.data() + k / PANEL * PANEL * a.C + k % PANEL;
         for (int c = 0; c < a.C; ++c) column[c * PANEL] = a.weight[k * a.C + c];
     }
-}
-
-// Writes the rows that have a gradient to `rows`, and returns their number.
-int64_t rows_with_gradient(const LinearArgs& a, const float* g, int32_t* rows) {
-    Buffer<bool> has(static_cast<size_t>(a.N));
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
-    for (int64_t i = 0; i < a.N; ++i) has[static_cast<size_t>(i)] = !all_zero(g, a.K, i, 1);
-    int64_t count = 0;
-    for (int64_t i = 0; i < a.N; ++i) {
-        if (has[static_cast<size_t>(i)]) rows[count++] = static_cast<int32_t>(i);
-    }
-    return count;
 }
 
 // Writes the gradients of W x + b in `count` rows to G [count, K]: with ReLU, zero where y is zero.
@@ -142,14 +62,14 @@ void linear(const LinearArgs& a, const Layer& out) {
                 if (a.relu) y = select(y < Vec(0.0f), Vec(0.0f), y);  // NaN stays
                 if (n > 0) store_first(y, out.y + (first + row) * a.K + column, n);
             };
-            multiply({a.x + first * a.C, a.C, 1}, rows, transposed.data() + k * a.C, a.C, k, a.K, begin, finish);
+            multiply({a.x + first * a.C, a.C, 1}, rows, {transposed.data() + k * a.C, PANEL}, a.C, k, a.K, begin, finish);
         }
     }
 }
 
 void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGrads& grads, const LinearGrads& out) {
     Buffer<int32_t> rows(static_cast<size_t>(a.N));
-    const int64_t total = rows_with_gradient(a, grads.y, rows.data());
+    const int64_t total = rows_with_gradient(grads.y, a.N, a.K, a.threads, rows.data());
     const int64_t weights = int64_t{a.K} * a.C, panel_rows = a.K > CHUNK ? a.K : CHUNK;
     // Of each thread: gradients of a chunk before the ReLU, a panel, and gradients of the weights and biases.
     const int64_t scratch_size = (CHUNK + 1) * a.K + panel_rows * PANEL + weights;
@@ -164,13 +84,13 @@ void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGr
         for (int c = 0; c < a.C; c += PANEL) {
             if (out.x) {
                 fill_panel([&](int64_t k) { return a.weight + k * a.C; }, a.K, c, a.C, panel);
-                multiply({G, a.K, 1}, count, panel, a.K, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
+                multiply({G, a.K, 1}, count, {panel, PANEL}, a.K, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
                     const int n = lanes_of(column, a.C);
                     if (n > 0) store_first(x, out.x + int64_t{chunk[row]} * a.C + column, n);
                 });
             }
             fill_panel([&](int64_t i) { return a.x + int64_t{chunk[i]} * a.C; }, count, c, a.C, panel);
-            multiply({G, 1, a.K}, a.K, panel, count, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
+            multiply({G, 1, a.K}, a.K, {panel, PANEL}, count, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
                 const int n = lanes_of(column, a.C);
                 if (n > 0) store_first(x, g_weight + row * a.C + column, n);
             });

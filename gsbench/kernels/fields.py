@@ -1,0 +1,75 @@
+"""Compute what all Gaussians of a field share, its networks and planes, on the CPU: the same bits for any threads."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsbench.errors import InputError
+from gsbench.kernels.operation import Gradient, Input, Operation, Output
+
+# y = W x + b for every row x, or max(0, y) with `relu`. Rows of which the loss has no gradient cost nothing in the
+# backward pass.
+linear = Operation(
+    "linear",
+    inputs={
+        "x": Input("N C", Gradient.ON_REQUEST),
+        "weight": Input("K C", Gradient.SUMMED),
+        "bias": Input("K", Gradient.SUMMED),
+    },
+    outputs={"y": Output("N K")},
+    numbers={"relu": bool},
+    memory="layers of networks",
+)
+
+# A layer of H units with ReLU, then heads of one more such layer and one without ReLU each. Their outputs y lie side by
+# side: head h has those from ends[h - 1] to ends[h]. Hidden layers are not stored; rows are left out as in `linear`.
+heads = Operation(
+    "heads",
+    inputs={
+        "x": Input("N C"),
+        "first_weight": Input("H C", Gradient.SUMMED),
+        "first_bias": Input("H", Gradient.SUMMED),
+        "hidden_weight": Input("heads H H", Gradient.SUMMED),
+        "hidden_bias": Input("heads H", Gradient.SUMMED),
+        "last_weight": Input("K H", Gradient.SUMMED),
+        "last_bias": Input("K", Gradient.SUMMED),
+        "ends": Input("heads", Gradient.REFUSED, (torch.int32,)),
+    },
+    outputs={"y": Output("N K")},
+    memory="outputs of networks",
+)
+
+
+def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
+    """Return the numbers of nodes in all planes of all levels, and of features."""
+    channels, levels, x, y, z, t = (numbers[name] for name in ("C", "levels", "x", "y", "z", "t"))
+    if not (1 <= levels <= 8 and min(x, y, z, t) >= 2 and max(x, y, z, t) <= 4096):
+        raise InputError(f"sample_planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
+    return {
+        "in_space": sum(x * y + x * z + y * z << 2 * level for level in range(levels)),
+        "in_time": sum(t * (x + y + z) << level for level in range(levels)),
+        "F": levels * channels,
+    }
+
+
+# Each level has planes (x, y), (x, z), (y, z) and (x, t), (y, t), (z, t). Its C features are the product of the samples
+# of its planes, bilinear and constant beyond the border: at positions from `first` to `last`, and a time from -1 to 1.
+# `of_space` and `of_time` have the nodes of all levels, in each those of three planes, and in each the rows of nodes
+# along its first axis. x, y, z and t are the numbers of nodes in the first level; of x, y and z, each level has twice
+# as many as the level before.
+sample_planes = Operation(
+    "sample_planes",
+    inputs={
+        "positions": Input("N 3"),
+        "first": Input("3", Gradient.REFUSED),
+        "last": Input("3", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED),
+        "of_space": Input("in_space C", Gradient.SUMMED),
+        "of_time": Input("in_time C", Gradient.SUMMED),
+    },
+    outputs={"features": Output("N F")},
+    numbers={"C": int, "levels": int, "x": int, "y": int, "z": int, "t": int},
+    derive=_sizes,
+    memory="features of planes",
+)
