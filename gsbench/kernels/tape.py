@@ -25,19 +25,19 @@ def add_to(sums: dict[int, Tensor], gradients: dict[int, Tensor]) -> None:
     sums.update({key: gradient for key, gradient in gradients.items() if key not in sums})
 
 
-def collect_gradients(x: Tensor) -> Tensor:
-    """Return `x`, such as the output of a network, for which a tape adds up all gradients before autograd runs.
+def collect_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """Return tensors, such as outputs of networks, of which a tape adds up all gradients before autograd runs once.
 
-    Without this, autograd runs through the network once for each input of a kernel that is computed from `x`.
+    Without this, autograd runs through the network once for each input of a kernel that is computed from them.
     """
     tape: Tape | None = getattr(active, "tape", None)
-    return x if tape is None or x.grad_fn is None else tape.collect(x)
+    return tensors if tape is None else tape.collect(tensors)
 
 
 class _Call(NamedTuple):
     """A recorded call of an operation."""
 
-    operation: Operation | None  # None: `collect`, whose output is its input
+    operation: Operation | None  # None: `collect`, whose outputs are its inputs
     tensors: list[Tensor]
     wanted: list[bool]
     slots: Slots
@@ -73,11 +73,13 @@ class Tape:
             self._calls.append(_Call(operation, tensors, wanted, slots, outputs))
         return outputs
 
-    def collect(self, x: Tensor) -> Tensor:
-        """Return a tensor that shares the memory of `x` but not its `grad_fn`, see `collect_gradients`."""
-        leaf = x.detach().requires_grad_()
-        self._calls.append(_Call(None, [x], [True], {}, [leaf]))
-        return leaf
+    def collect(self, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Return tensors that share the memory of `tensors` but have no `grad_fn`, see `collect_gradients`."""
+        computed = [x for x in tensors if x.grad_fn is not None]
+        leaves = [x.detach().requires_grad_() for x in computed]
+        self._calls.append(_Call(None, computed, [True] * len(leaves), {}, leaves))
+        rest = iter(leaves)
+        return tuple([x if x.grad_fn is None else next(rest) for x in tensors])
 
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Compute the gradients of `loss` with respect to the tensors `sources`, and add them to `sums`.
@@ -88,7 +90,7 @@ class Tape:
         bitwise the same whether `sums` is empty or not. A tape may run backwards several times, with different seeds.
         """
         gradients = _Gradients(self._calls, sources, sums)
-        gradients.propagate(loss, seed)
+        gradients.propagate([loss], [seed])
         for call in reversed(self._calls):
             gradients.run_backward(call)
         add_to(sums, {key: gradients.by_id[key] for key in gradients.sources if key in gradients.by_id})
@@ -104,14 +106,16 @@ class _Gradients:
         self.by_id: dict[int, Tensor] = {}  # the gradient of each tensor
         self.uses = Counter([id(x) for call in calls for x in call.tensors])
 
-    def propagate(self, x: Tensor, gradient: Tensor) -> None:
-        """Add a gradient to that of the tensor `x`; if `x` has a `grad_fn`, backpropagate it through autograd."""
-        self._add(x, gradient)
-        if x.grad_fn is None:
+    def propagate(self, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
+        """Add gradients to those of tensors; if these have a `grad_fn`, backpropagate them through autograd."""
+        for x, gradient in zip(tensors, gradients, strict=True):
+            self._add(x, gradient)
+        if all(x.grad_fn is None for x in tensors):
             return
         outputs = [y for call in self.calls for y in call.outputs if y.requires_grad]
-        ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and y is not x]
-        by_ends = torch.autograd.grad(x, ends, gradient, allow_unused=True, retain_graph=True)
+        starts = {id(x) for x in tensors}
+        ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and id(y) not in starts]
+        by_ends = torch.autograd.grad(tensors, ends, gradients, allow_unused=True, retain_graph=True)
         for end, by_end in zip(ends, by_ends, strict=True):
             if by_end is not None:
                 # torch may return two gradients that share memory, or one of a transposed layout.
@@ -127,9 +131,8 @@ class _Gradients:
         if all(g is None for g in upstream):
             return
         if call.operation is None:
-            for x, gradient in zip(call.tensors, upstream, strict=True):
-                if gradient is not None:
-                    self.propagate(x, gradient)
+            there = [(x, g) for x, g in zip(call.tensors, upstream, strict=True) if g is not None]
+            self.propagate(*zip(*there, strict=True))
             return
         # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
         whole, sums = {}, {}
@@ -146,4 +149,4 @@ class _Gradients:
             if i in whole:
                 self.sums[whole[i]] = gradient
             else:
-                self.propagate(x, gradient)
+                self.propagate([x], [gradient])

@@ -116,4 +116,4 @@ class DeformationField(nn.Module):
         """Return shifts [N, 3], changes of scales [N, 3] (both world units) and of quaternions [N, 4], or `outputs`."""
         features = self.of_time(encode(time.reshape(-1, 1), self.time_octaves))
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
-        return collect_gradients(self.head(self.hidden(inputs))).split(self.outputs, -1)
+        return collect_gradients(self.head(self.hidden(inputs)))[0].split(self.outputs, -1)

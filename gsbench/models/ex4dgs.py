@@ -134,9 +134,8 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
     def slice_geometry(self, raw: Raw, query: CameraTime) -> Geometry:
         """Slice as other models do; gradients pass the path and the window once, not for each kernel that follows."""
         geometry = super().slice_geometry(raw, query)
-        return geometry._replace(
-            means=collect_gradients(geometry.means), opacities=collect_gradients(geometry.opacities)
-        )
+        means, opacities = collect_gradients(geometry.means, geometry.opacities)
+        return geometry._replace(means=means, opacities=opacities)
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
         """Return Gaussians that were turned in torch, except for those that gates made static."""

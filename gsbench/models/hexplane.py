@@ -89,9 +89,10 @@ class HexPlaneModel(Gaussians3DModel):
         if self.active.warms_up:
             return raw
         assert query.time is not None
-        changes = collect_gradients(self.network(self.planes(raw["means"], query.time)))
-        by_name = zip(self.outputs, changes.split(list(self.outputs.values()), -1), strict=True)
-        return raw | {name: raw[name] + change.view_as(raw[name]) for name, change in by_name}
+        changes = self.network(self.planes(raw["means"], query.time)).split(list(self.outputs.values()), -1)
+        by_name = zip(self.outputs, changes, strict=True)
+        changed = collect_gradients(*(raw[name] + change.view_as(raw[name]) for name, change in by_name))
+        return raw | dict(zip(self.outputs, changed, strict=True))
 
     def penalty(self) -> Tensor | None:
         return None if self.active.warms_up else self.planes.penalty(*self.weights)

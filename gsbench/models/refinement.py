@@ -172,5 +172,5 @@ class DeepRefinement(Changes):
         gamma = encode_time(time, self.octaves)
         inputs = torch.cat([encode(means, self.mean_octaves), gamma.expand(len(means), -1)], -1)
         return list(
-            (collect_gradients(self.head(self.hidden(inputs))) * self.units).split([x.shape[-1] for x in values], -1)
+            (collect_gradients(self.head(self.hidden(inputs)))[0] * self.units).split([x.shape[-1] for x in values], -1)
         )

@@ -205,8 +205,8 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
 
 
 def test_a_network_is_differentiated_once() -> None:
-    """Catches a pass through a network for each input of a kernel that it computes, a gradient that such a pass would
-    have and one pass lacks, and a tensor that is cut off from its network where no tape runs."""
+    """Catches a pass through a network for each input of a kernel or each of its outputs, a gradient that such a pass
+    would have and one pass lacks, and a tensor that is cut off from its network where no tape runs."""
     g = torch.Generator().manual_seed(6)
     raw = torch.randn(20, 7, generator=g).requires_grad_()
     sh0, shN = torch.randn(20, 1, 3, generator=g), torch.randn(20, 15, 3, generator=g)
@@ -215,7 +215,7 @@ def test_a_network_is_differentiated_once() -> None:
     def loss() -> Tensor:
         hidden = raw.sin()
         hidden.register_hook(passes.append)
-        scales, quats = (2 * collect_gradients(hidden)).split([3, 4], -1)
+        scales, quats, _ = collect_gradients(*(2 * hidden).split([3, 4], -1), sh0)
         factors, faded = slice_static(scales, quats, scales[:, 0].exp())
         colors = show_colors(sh0, shN, scales, faded, center=torch.zeros(3), degree=3)[0]
         return (factors.sum(-1) * colors).sum() + faded.sum()
