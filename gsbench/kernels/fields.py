@@ -45,7 +45,7 @@ def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return the numbers of nodes in all planes of all levels, and of features."""
     channels, levels, x, y, z, t = (numbers[name] for name in ("C", "levels", "x", "y", "z", "t"))
     if not (1 <= levels <= 8 and min(x, y, z, t) >= 2 and max(x, y, z, t) <= 4096):
-        raise InputError(f"sample_planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
+        raise InputError(f"planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
     return {
         "in_space": sum(x * y + x * z + y * z << 2 * level for level in range(levels)),
         "in_time": sum(t * (x + y + z) << level for level in range(levels)),
@@ -72,4 +72,17 @@ sample_planes = Operation(
     numbers={"C": int, "levels": int, "x": int, "y": int, "z": int, "t": int},
     derive=_sizes,
     memory="features of planes",
+)
+
+# The sum over planes of the mean square of second differences along the rows, and for those with t of the mean distance
+# from 1, with a weight for each.
+plane_penalty = Operation(
+    "plane_penalty",
+    inputs={"of_space": Input("in_space C"), "of_time": Input("in_time C")},
+    outputs={"penalty": Output("")},
+    numbers={
+        **{"C": int, "levels": int, "x": int, "y": int, "z": int, "t": int},
+        **{"space_smoothness": float, "time_smoothness": float, "time_sparsity": float},
+    },
+    derive=_sizes,
 )

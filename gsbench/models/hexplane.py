@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.backends import CPU
-from gsbench.kernels.fields import heads, sample_planes
+from gsbench.kernels.fields import heads, plane_penalty, sample_planes
 from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
@@ -124,7 +124,7 @@ class Planes(nn.Module):
         low, high = points.aminmax(dim=0)
         self.register_buffer("high", high)
         self.register_buffer("low", torch.minimum(low, high - THINNEST * (high - low).max()))
-        self.nodes = nodes
+        self.size = channels, levels, *nodes
         along = [
             dict(zip("xyzt", (*(n << level for n in nodes[:3]), nodes[3]), strict=True)) for level in range(levels)
         ]
@@ -158,8 +158,7 @@ class Planes(nn.Module):
         the second half of the nodes along t is read, as in the authors' code.
         """
         if CPU.serves(positions):
-            size = self.of_space.shape[1], len(self.shapes), *self.nodes
-            return sample_planes(positions, self.high, self.low, time, self.of_space, self.of_time, *size)[0]
+            return sample_planes(positions, self.high, self.low, time, self.of_space, self.of_time, *self.size)[0]
         # NaN would end the process in the gradient of grid_sample.
         coordinates = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num()
         at = dict(zip("xyzt", (*coordinates.unbind(-1), time.expand(len(coordinates))), strict=True))
@@ -177,6 +176,9 @@ class Planes(nn.Module):
         For all planes, it is the mean square of second differences along the rows (y, z or t), not along the columns,
         as in the authors' code. For those with t, it is also the mean distance from 1.
         """
+        if CPU.serves(self.of_space):
+            weights = space_smoothness, time_smoothness, time_sparsity
+            return plane_penalty(self.of_space, self.of_time, *self.size, *weights)[0]
         terms = []
         for level in self.levels():
             for axes, plane in level.items():

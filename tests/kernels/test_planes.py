@@ -68,3 +68,17 @@ def test_nodes_that_do_not_fit_are_refused() -> None:
     for levels, nodes in ((0, 5), (9, 5), (1, 1), (1, 1 << 20)):
         with pytest.raises(InputError, match="expected 1 to 8 levels of 2 to 4096 nodes"):
             sample_planes(*tensors, 2, levels, nodes, 4, 3, 6)
+
+
+@pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("channels", [32, 3])
+def test_the_penalty_and_its_gradients_are_torch_s(channels: int) -> None:
+    """Catches a plane, row or number that is left out or has another's weight, a difference at the border of a plane,
+    and a distance from 1 whose gradient has the wrong sign, or is not zero at 1, where nodes start."""
+    field, results = planes(channels, 2), []
+    field.of_time.data[::3] = 1
+    for of in (field, field.double()):
+        penalty = of.penalty(0.3, 0.5, 0.7)
+        results.append([penalty, *torch.autograd.grad(penalty, list(of.parameters()), penalty.new_tensor(100))])
+    for computed, expected in zip(*results, strict=True):
+        torch.testing.assert_close(computed.double(), expected, rtol=1e-5, atol=1e-5)

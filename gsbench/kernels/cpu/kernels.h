@@ -160,6 +160,31 @@ struct PlaneGrads {
 };
 GSB_FIELDS(PlaneGrads, GRADS, positions, of_space, of_time)
 
+// How rough these planes are along their rows, and how far from 1 those of time, with a weight for each.
+struct PenaltyArgs {
+    int C, levels, x, y, z, t;
+    const float *of_space, *of_time;  // as in PlaneArgs
+    float space_smoothness, time_smoothness, time_sparsity;
+    int threads;
+};
+GSB_FIELDS(PenaltyArgs, INPUTS, C, levels, x, y, z, t, of_space, of_time, space_smoothness, time_smoothness,
+           time_sparsity, threads)
+
+struct Penalty {
+    float* penalty;  // []
+};
+GSB_FIELDS(Penalty, OUTPUTS, penalty)
+
+struct PenaltyGrad {
+    const float* penalty;
+};
+GSB_FIELDS(PenaltyGrad, GIVEN, penalty)
+
+struct NodeGrads {
+    float *of_space, *of_time;
+};
+GSB_FIELDS(NodeGrads, GRADS, of_space, of_time)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -173,7 +198,9 @@ GSB_FIELDS(PlaneGrads, GRADS, positions, of_space, of_time)
     kernel(heads, HeadsArgs, Layer)                \
     kernel(heads_backward, HeadsArgs, LayerGrads, HeadsGrads) \
     kernel(sample_planes, PlaneArgs, Features)     \
-    kernel(sample_planes_backward, PlaneArgs, FeatureGrads, PlaneGrads)
+    kernel(sample_planes_backward, PlaneArgs, FeatureGrads, PlaneGrads) \
+    kernel(plane_penalty, PenaltyArgs, Penalty)    \
+    kernel(plane_penalty_backward, PenaltyArgs, PenaltyGrad, NodeGrads)
 
 namespace gsb {
 

@@ -42,7 +42,8 @@ struct Levels {
     Level level[MOST_LEVELS];
     int64_t nodes_of_lines = 0;
 
-    explicit Levels(const PlaneArgs& a) {
+    template <class Args>
+    explicit Levels(const Args& a) {
         int64_t space = 0;
         for (int l = 0; l < a.levels; ++l) {
             Level& of = level[l];
@@ -170,6 +171,49 @@ GSB_HD inline void add_cell(Vec g, float* p, int64_t next, int64_t row, const Pl
     add_pair(bottom, column.share, p + row, next, n);
 }
 
+// A plane and its weights in the penalty: its first number, its rows, the numbers in a row, and whether it is of time.
+struct Plane {
+    int64_t first, rows, size;
+    bool in_time;
+
+    float smoothness(const PenaltyArgs& a) const {  // of the sum of squares
+        const float weight = in_time ? a.time_smoothness : a.space_smoothness;
+        return rows > 2 ? weight / static_cast<float>((rows - 2) * size) : 0.0f;
+    }
+    float sparsity(const PenaltyArgs& a) const {  // of the sum of distances from 1
+        return in_time ? a.time_sparsity / static_cast<float>(rows * size) : 0.0f;
+    }
+};
+
+template <class F>
+void for_each_plane(const PenaltyArgs& a, F f) {
+    const Levels levels(a);
+    for (int l = 0; l < a.levels; ++l) {
+        const Level& level = levels.level[l];
+        for (int k = 0; k < PLANES; ++k) {
+            f(Plane{level.in_space[k] * a.C, level.nodes[ROW[k]], int64_t{level.nodes[COLUMN[k]]} * a.C, false});
+        }
+        for (int axis = 0; axis < AXES; ++axis) {
+            f(Plane{level.in_time[axis] * a.C, a.t, int64_t{level.nodes[axis]} * a.C, true});
+        }
+    }
+}
+
+// Returns the second difference along the rows at n numbers p of row r, or zero in the first and the last row.
+GSB_HD inline Vec bend(const Plane& plane, int64_t r, const float* p, int n) {
+    if (r < 1 || r > plane.rows - 2) return Vec(0.0f);
+    const Vec here = load_some(p, n);
+    return (load_some(p + plane.size, n) - here) - (here - load_some(p - plane.size, n));
+}
+
+// Returns 1 - p for n numbers, and zero in the other lanes.
+GSB_HD inline Vec below_one(const float* p, int n) {
+    alignas(64) constexpr float ones[LANES] = {1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1};
+    return load_some(ones, n) - load_some(p, n);
+}
+
+GSB_HD inline int lanes_at(int64_t c, int64_t size) { return static_cast<int>(size - c < LANES ? size - c : LANES); }
+
 }  // namespace
 
 void sample_planes(const PlaneArgs& a, const Features& out) {
@@ -262,6 +306,51 @@ void sample_planes_backward(const PlaneArgs& a, const FeatureGrads& grads, const
             out.positions[3 * i + axis] = sum * 2.0f / (a.last[axis] - a.first[axis]);
         }
     }
+}
+
+void plane_penalty(const PenaltyArgs& a, const Penalty& out) {
+    double total = 0.0;
+    for_each_plane(a, [&](const Plane& plane) {
+        const float* nodes = (plane.in_time ? a.of_time : a.of_space) + plane.first;
+        Buffer<float> of_rows(static_cast<size_t>(plane.rows));
+#pragma omp parallel for num_threads(a.threads) schedule(static)
+        for (int64_t r = 0; r < plane.rows; ++r) {
+            Vec squares(0.0f), distances(0.0f);
+            for (int64_t c = 0; c < plane.size; c += LANES) {
+                const int n = lanes_at(c, plane.size);
+                const float* p = nodes + r * plane.size + c;
+                const Vec x = bend(plane, r, p, n), below = below_one(p, n);
+                squares += x * x;
+                if (plane.in_time) distances += max(below, -below);
+            }
+            of_rows[static_cast<size_t>(r)] = plane.smoothness(a) * sum(squares) + plane.sparsity(a) * sum(distances);
+        }
+        for (int64_t r = 0; r < plane.rows; ++r) total += static_cast<double>(of_rows[static_cast<size_t>(r)]);
+    });
+    *out.penalty = static_cast<float>(total);
+}
+
+void plane_penalty_backward(const PenaltyArgs& a, const PenaltyGrad& grad, const NodeGrads& out) {
+    for_each_plane(a, [&](const Plane& plane) {
+        const float* nodes = (plane.in_time ? a.of_time : a.of_space) + plane.first;
+        float* g = (plane.in_time ? out.of_time : out.of_space) + plane.first;
+        const Vec by_bend(2.0f * plane.smoothness(a) * *grad.penalty), by_distance(plane.sparsity(a) * *grad.penalty);
+#pragma omp parallel for num_threads(a.threads) schedule(static)
+        for (int64_t r = 0; r < plane.rows; ++r) {
+            for (int64_t c = 0; c < plane.size; c += LANES) {
+                const int n = lanes_at(c, plane.size);
+                const float* p = nodes + r * plane.size + c;
+                const Vec here = bend(plane, r, p, n), below = below_one(p, n);
+                const Vec before = bend(plane, r - 1, p - plane.size, n), after = bend(plane, r + 1, p + plane.size, n);
+                Vec x = by_bend * ((before - here) + (after - here));
+                if (plane.in_time) {
+                    const Vec down = select(below > Vec(0.0f), by_distance, Vec(0.0f));
+                    x += select(below < Vec(0.0f), by_distance, Vec(0.0f)) - down;
+                }
+                store_first(x, g + r * plane.size + c, n);
+            }
+        }
+    });
 }
 
 }  // namespace GSB_ISA
