@@ -34,6 +34,7 @@ BOUNDS = (  # of columns whose name begins so; the first that fits counts
     ("ssim", -1.0, 1.0),
     ("lpips", 0.0, 10.0),
     ("dssim", 0.0, 1.0),
+    ("ms_ssim", 0.0, 1.0),
     ("flicker", 0.0, 255.0),
     ("static_drift", 0.0, 255.0),
     ("", 0.0, 1e12),

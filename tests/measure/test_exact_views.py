@@ -80,6 +80,7 @@ def test_exact_views_and_regions_are_named() -> None:
     """Catches a region at the cap that nobody is told of, a view named thrice, and a line of a thousand names."""
     assert ViewScore("a", psnr=30.0, psnr_object=100.0).exact == ["a (object)"]
     assert ViewScore("a", psnr=100.0, psnr_object=100.0, psnr_moving=100.0).exact == ["a"]
+    assert "PSNR of a, b, c is infinite" in sentence(["a", "b", "c"])
     assert "a, b, c and 97 more is infinite" in sentence(["a", "b", "c", *"d" * 97])
 
 

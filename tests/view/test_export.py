@@ -110,6 +110,8 @@ def test_each_file_of_a_clip_is_the_slice_of_its_time(
         assert exports(run, "--ply", "a.ply", "--time", time, *place)
         assert path.read_bytes() == (tmp_path / "a.ply").read_bytes()
     assert len({path.read_bytes() for path in written}) == 4
+    assert exports(run, "--plys", "two", *place, "--seconds", "2", "--fps", "1")  # the fewest
+    assert len(list((tmp_path / "two").iterdir())) == 2
     counts = [len(read_trained(path)) for path in written]
     (text,) = printed["notes"]
     assert f"frame0000.ply to frame0003.ply at times 0 to 1, {min(counts)} to {max(counts)} Gaussians" in text
