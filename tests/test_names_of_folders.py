@@ -41,5 +41,7 @@ def test_a_scene_of_any_name_is_trained(scene, tmp_path, capsys):
     assert record.read(path).scene == scene
     assert "name=" not in record.read(path).variant
     listed = [word for word in words[:-1] if not word.startswith(("scene=", "data.scenes"))]
+    assert main_here(*listed, f"data.scenes=[{scene},{scene}]") == 2
+    assert f"type \"data.scenes=['{scene}','{scene}']\"" in capsys.readouterr().err
     assert main_here(*listed, f"data.scenes=['{scene}']") == 0
     assert "finished before, kept" in capsys.readouterr().out

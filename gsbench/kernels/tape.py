@@ -112,7 +112,7 @@ class _Gradients:
             self._add(x, gradient)
         if all(x.grad_fn is None for x in tensors):
             return
-        outputs = [y for call in self.calls for y in call.outputs if y.requires_grad]
+        outputs = [y for call in self.calls for y in call.outputs]
         starts = {id(x) for x in tensors}
         ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and id(y) not in starts]
         by_ends = torch.autograd.grad(tensors, ends, gradients, allow_unused=True, retain_graph=True)

@@ -88,7 +88,7 @@ def contributors(folders: Sequence[Path]) -> dict[str, Path]:
     Raises:
         InputError: a folder is named twice or lies in another one, or has a name that no table can show.
     """
-    whole = [folder.resolve() for folder in folders]
+    whole = [folder.resolve().relative_to("/") for folder in folders]
     for folder, path in zip(folders, whole, strict=True):
         if sum(path.is_relative_to(other) for other in whole) > 1:
             raise InputError(f"--merge {folder}: expected folders apart from each other, got it in another or twice")

@@ -55,7 +55,9 @@ def test_prediction_against_brute_force(name: str) -> None:
     views = views_of(model, 1)
     predicted = probe(model, views, BLACK, antialias=True, draws=64)
     queries = [CameraTime.of(view.camera, view.time) for view in views]
-    for simplification in simplifications_of(model, queries, [model.slice(query) for query in queries]):
+    ways = simplifications_of(model, queries, [model.slice(query) for query in queries])
+    assert ("conditioned" in [way.name for way in ways]) == model.refines
+    for simplification in ways:
         true, guess = brute_force(model, views, simplification), predicted.errors[simplification.name]
         # The image is linear in opacities and colours, and not in what moves (gsbench/gates/sensitivity.py).
         linear = simplification.raw is None or simplification.order is not None

@@ -47,6 +47,17 @@ def test_picture_is_the_brute_force_one(name: str) -> None:
     assert info.pairs >= drawn
 
 
+def test_tiles_are_blended_together_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches tiles that are blended one at a time, and a tile above the limit that is never blended."""
+    arguments, pieces, blend = case("random"), [], reference._blend_tiles
+    monkeypatch.setattr(reference, "_blend_tiles", lambda *tiles: pieces.append(tiles) or blend(*tiles))
+    together = draw(arguments).image
+    assert len(pieces) == len(arguments["viewmats"])
+    monkeypatch.setattr(reference, "CHUNK", 1)
+    assert torch.equal(draw(arguments).image, together)
+    assert len(pieces) > 2 * len(arguments["viewmats"])
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_picture_in_single_precision(name: str) -> None:
     """Catches cancellation: float32 keeps 1e-4 wherever no rounding can flip a decision of the picture's rules; NaN by

@@ -162,6 +162,7 @@ def test_folders_name_their_contributors(tmp_path):
     assert [*merge.contributors(paths[:1])] == ["mini"]
     assert [*merge.contributors(paths[:2])] == ["alice/mini", "bob/mini"]
     assert [*merge.contributors([paths[0], paths[2]])] == ["mini", ".x"]
+    assert [*merge.contributors([Path("/mini"), Path("/alice/mini")])] == ["mini", "alice/mini"]
     for folders in ([tmp_path, paths[0]], [paths[0], paths[0]]):
         with pytest.raises(InputError, match="expected folders apart from each other"):
             merge.contributors(folders)
@@ -202,6 +203,7 @@ def test_the_command_writes_a_site(tmp_path, capsys):
         assert not [name for name, _ in page.attributes if name.startswith("on")]
         assert "<img src=x" not in text
         assert len(text) < 500_000  # the charts' library is a file of its own
+        assert 'class="scroll" tabindex="0" role="region" aria-label="Every view: table"' not in text  # but sortable
         for address in [*page.pages, *(of for of in page.values("src") if not of.startswith("data:"))]:
             target = (path.parent / unquote(address)).resolve()
             assert target.is_file(), f"{path}: {address}"

@@ -120,6 +120,9 @@ def test_an_exact_view_has_no_change(run: Path) -> None:
     views = [replace(exactness.views[0], psnr_change=change) for change in (-4e-5, 1e-5)]
     verdict = report.verdict(replace(exactness, views=views))
     assert "changes the mean PSNR by 1.5e-05 dB, that of one view by 4.0e-05 dB" in verdict
+    views = [replace(exactness.views[0], rms=rms) for rms in (1e-5, 2e-4)]
+    verdict = report.verdict(replace(exactness, views=views))  # of a step of 8 bits, whose rounding is 1 / sqrt(12)
+    assert "Rounding to 8 bits changes an image 1,443 times as much as float32" in verdict
 
 
 # ---- which Gaussians, and why
@@ -156,6 +159,8 @@ def test_why_a_gaussian_is_hard() -> None:
     assert float32_error.reasons(profiles, camera, rows)[4] == []
     moved = float32_error.reasons(far_away, float32_error.Camera(shift, camera.K, 32, 32), rows)
     assert all("far" in words for words in moved)
+    for width, height in ((320, 32), (32, 320)):
+        assert "huge" not in float32_error.reasons(wide, replace(camera, width=width, height=height), rows)[4]
 
 
 def test_the_first_gaussian_counts() -> None:
