@@ -34,6 +34,7 @@ def test_help_describes_what_there_is_without_torch():
     for word in ("late_harmonics", "row_scaled", "trex100"):
         assert word not in done.stdout
     assert max(map(len, done.stdout.splitlines())) <= 120
+    assert [f"{title}:" for title in DESCRIBED.values() if f"\n{title}:\n" not in done.stdout] == []
 
 
 @pytest.mark.parametrize("path", sorted(p for group in DESCRIBED for p in (CONF / group).glob("*.yaml")), ids=str)

@@ -240,6 +240,7 @@ def test_what_cannot_be_fetched_is_told(
     err = capsys.readouterr().err.splitlines()
     by_hand = f"download it in a browser (the Data link of gaozhongpai.github.io/7dgs) and unpack it into {tmp_path}"
     assert f"{by_hand}/data/pbr" in err[0]
+    assert "server that has pbr.zip" in err[0]
     assert "Did you mean 'dnerf'" in err[1]
     for mirror in (
         "ftp://x",

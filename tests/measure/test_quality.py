@@ -107,6 +107,8 @@ def test_quantise_is_an_8_bit_png():
     png = cv2.imdecode(cv2.imencode(".png", (x.numpy() * 255).round().astype(np.uint8))[1], cv2.IMREAD_UNCHANGED)
     assert torch.equal(quality.quantise(x), torch.from_numpy(png).float() / 255)
     assert torch.equal(quality.quantise(torch.tensor([-1.0, 2.0])), torch.tensor([0.0, 1.0]))
+    with pytest.raises(InputError, match="quantise: the image"):
+        quality.quantise(x.tolist())
 
 
 @needs_trunk

@@ -120,6 +120,8 @@ def test_an_exact_view_has_no_change(run: Path) -> None:
     views = [replace(exactness.views[0], psnr_change=change) for change in (-4e-5, 1e-5)]
     verdict = report.verdict(replace(exactness, views=views))
     assert "changes the mean PSNR by 1.5e-05 dB, that of one view by 4.0e-05 dB" in verdict
+    views = [replace(exactness.views[0], psnr_change=change) for change in (None, 3e-5)]  # one has no photograph
+    assert "the mean PSNR by 1.5e-05 dB" in report.verdict(replace(exactness, views=views))
     views = [replace(exactness.views[0], rms=rms) for rms in (1e-5, 2e-4)]
     verdict = report.verdict(replace(exactness, views=views))  # of a step of 8 bits, whose rounding is 1 / sqrt(12)
     assert "Rounding to 8 bits changes an image 1,443 times as much as float32" in verdict
