@@ -235,6 +235,7 @@ def test_paths_say_what_a_run_is_and_cannot_leave_the_root(tmp_path):
     assert folder == tmp_path / "mini" / "suzanne" / "7dgs" / "seed3"
     files.write(make(seed=3), folder / files.FILE_NAME)
     assert files.find(tmp_path) == [folder / "record.json"]
+    assert make(variant="iterations=9").path == Path("mini/suzanne/7dgs,iterations=9/seed0")
     for name in ("..", ".", "", "a/b", "a\\b", ".hidden", "a\n", "a b", "-x"):
         with pytest.raises(InputError, match="scene"):
             files.run_path(tmp_path, "mini", name, "7dgs", 0)
