@@ -1,12 +1,10 @@
 """Fit a static 3DGS in a few steps, and compute gradients of each view's error with respect to the Gaussians' means."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -19,6 +17,7 @@ from gsbench.models.render import rasterize_slice
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.points import frustum_points
+from gsbench.train.batches import reduced
 
 LONG_SIDE = 40  # least length in pixels of the longer side of a fitted image, if the image is not smaller
 POINTS = 2_000
@@ -79,17 +78,7 @@ def _gradients(model: Gaussians3DModel, parameters: list[nn.Parameter], backgrou
 
 def smaller(view: View) -> View:
     """Shrink a view by an integer factor to a longer side of LONG_SIDE pixels or a few more, so that a fit is fast."""
-    camera = view.camera
-    factor = max(1, max(camera.width, camera.height) // LONG_SIDE)
-    height, width = camera.height // factor, camera.width // factor
-    image = view.image[: height * factor, : width * factor].permute(2, 0, 1)[None]
-    K = camera.K.clone()
-    K[:2] /= factor
-    return replace(
-        view,
-        camera=replace(camera, K=K, width=width, height=height),
-        pixels=F.avg_pool2d(image, factor)[0].permute(1, 2, 0).contiguous(),
-    )
+    return reduced(view, max(1, max(view.camera.width, view.camera.height) // LONG_SIDE))
 
 
 def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -> Points:

@@ -41,9 +41,13 @@ heads = Operation(
 )
 
 
+# The numbers of channels, of levels and of nodes along each axis of the planes, see `sample_planes`.
+SIZE: dict[str, type] = dict.fromkeys(("C", "levels", "x", "y", "z", "t"), int)
+
+
 def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return the numbers of nodes in all planes of all levels, and of features."""
-    channels, levels, x, y, z, t = (numbers[name] for name in ("C", "levels", "x", "y", "z", "t"))
+    channels, levels, x, y, z, t = (numbers[name] for name in SIZE)
     if not (1 <= levels <= 8 and min(x, y, z, t) >= 2 and max(x, y, z, t) <= 4096):
         raise InputError(f"planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
     return {
@@ -69,7 +73,7 @@ sample_planes = Operation(
         "of_time": Input("in_time C", Gradient.SUMMED),
     },
     outputs={"features": Output("N F")},
-    numbers={"C": int, "levels": int, "x": int, "y": int, "z": int, "t": int},
+    numbers=SIZE,
     derive=_sizes,
     memory="features of planes",
 )
@@ -80,9 +84,6 @@ plane_penalty = Operation(
     "plane_penalty",
     inputs={"of_space": Input("in_space C"), "of_time": Input("in_time C")},
     outputs={"penalty": Output("")},
-    numbers={
-        **{"C": int, "levels": int, "x": int, "y": int, "z": int, "t": int},
-        **{"space_smoothness": float, "time_smoothness": float, "time_sparsity": float},
-    },
+    numbers=SIZE | {"space_smoothness": float, "time_smoothness": float, "time_sparsity": float},
     derive=_sizes,
 )

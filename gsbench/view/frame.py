@@ -170,8 +170,8 @@ class FrameRenderer:
             except Exception as error:  # a user's model may compute in float32 alone, and fail in any way
                 raise InputError(f"the model does not compute in float64: {one_line(error)}") from None
             antialias = run.config.raster.antialias
-            planes = replace(camera, near=run.near)
-            reference = float64_image(gaussians, single, planes, self._background(request), antialias)
+            camera = replace(camera, near=run.near)
+            reference = float64_image(gaussians, single, camera, self._background(request), antialias)
             bound, undecided = STEPS * reference.bound, float(reference.undecided.double().mean())
             return Float32Error(
                 rounding_image(bound.numpy()),

@@ -46,7 +46,7 @@ void product(const Left& A, int64_t rows, const Matrix& B, int first, int64_t in
 // ReLU had let `hidden` pass. Both are memory whose rows are `row` floats apart.
 auto write_to(float* out, int64_t row, int columns) {
     return [=](Vec x, int64_t i, int column) {
-        const int n = lanes_of(column, columns);
+        const int n = lanes_from(column, columns);
         if (n > 0) store_first(x, out + i * row + column, n);
     };
 }
@@ -57,7 +57,7 @@ auto write_relu(const Matrix& out, int columns) {
 }
 auto write_passed(const Matrix& hidden, const Matrix& out, int first, int columns) {
     return [=, write = write_to(out.start + first, out.row, columns)](Vec x, int64_t i, int column) {
-        const int n = lanes_of(column, columns);
+        const int n = lanes_from(column, columns);
         if (n <= 0) return;
         const Vec passed = load_some(hidden.start + i * hidden.row + first + column, n);
         write(select(passed > Vec(0.0f), x, Vec(0.0f)), i, column);
@@ -211,7 +211,7 @@ void heads_backward(const HeadsArgs& a, const LayerGrads& grads, const HeadsGrad
                 write_passed(layers.first, g.first, 0, a.H));
         product(g.first.transposed(), a.H, x, 0, count, a.C, at_zero, write_to(g_weights.first_weight, a.C, a.C));
         product(g.first.as_it_is(), count, w.first, 0, a.H, a.C, at_zero, [&](Vec by_x, int64_t i, int column) {
-            const int n = lanes_of(column, a.C);
+            const int n = lanes_from(column, a.C);
             if (n > 0) store_first(by_x, out.x + int64_t{rows[i]} * a.C + column, n);
         });
         sum_rows(g_y, count, a.K, g_weights.last_bias);

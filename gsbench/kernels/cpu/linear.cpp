@@ -18,7 +18,7 @@ template <class Row>
 void fill_panel(Row row, int64_t rows, int column, int columns, float* panel) {
     for (int64_t i = 0; i < rows; ++i) {
         GSB_UNROLL for (int v = 0; v < TILE_VECTORS; ++v) {
-            const int at = column + v * LANES, n = lanes_of(at, columns);
+            const int at = column + v * LANES, n = lanes_from(at, columns);
             (n > 0 ? load_some(row(i) + at, n) : Vec(0.0f)).store(panel + i * PANEL + v * LANES);
         }
     }
@@ -38,7 +38,7 @@ void before_relu(const LinearArgs& a, const float* y, const float* g, const int3
     for (int64_t i = 0; i < count; ++i) {
         const int64_t at = int64_t{rows[i]} * a.K;
         for (int k = 0; k < a.K; k += LANES) {
-            const int n = lanes_of(k, a.K);
+            const int n = lanes_from(k, a.K);
             Vec x = load_some(g + at + k, n);
             if (a.relu) x = select(load_some(y + at + k, n) > Vec(0.0f), x, Vec(0.0f));
             store_first(x, G + i * a.K + k, n);
@@ -58,7 +58,7 @@ void linear(const LinearArgs& a, const Layer& out) {
         const int64_t rows = a.N - first < CHUNK ? a.N - first : CHUNK;
         for (int k = 0; k < a.K; k += PANEL) {
             const auto finish = [&](Vec y, int64_t row, int column) {
-                const int n = lanes_of(column, a.K);
+                const int n = lanes_from(column, a.K);
                 if (a.relu) y = select(y < Vec(0.0f), Vec(0.0f), y);  // NaN stays
                 if (n > 0) store_first(y, out.y + (first + row) * a.K + column, n);
             };
@@ -85,13 +85,13 @@ void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGr
             if (out.x) {
                 fill_panel([&](int64_t k) { return a.weight + k * a.C; }, a.K, c, a.C, panel);
                 multiply({G, a.K, 1}, count, {panel, PANEL}, a.K, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
-                    const int n = lanes_of(column, a.C);
+                    const int n = lanes_from(column, a.C);
                     if (n > 0) store_first(x, out.x + int64_t{chunk[row]} * a.C + column, n);
                 });
             }
             fill_panel([&](int64_t i) { return a.x + int64_t{chunk[i]} * a.C; }, count, c, a.C, panel);
             multiply({G, 1, a.K}, a.K, {panel, PANEL}, count, c, a.C, at_zero, [&](Vec x, int64_t row, int column) {
-                const int n = lanes_of(column, a.C);
+                const int n = lanes_from(column, a.C);
                 if (n > 0) store_first(x, g_weight + row * a.C + column, n);
             });
         }

@@ -75,13 +75,10 @@ void multiply(const Left& A, int64_t rows, const Right& B, int64_t inner, int co
     }
 }
 
-// Returns how many of the sixteen columns from `column` on there are: zero or fewer if none.
-GSB_HD inline int lanes_of(int column, int columns) { return columns - column < LANES ? columns - column : LANES; }
-
 // Returns a `begin` of sums that start at a bias, and one of sums that start at zero.
 inline auto at_bias(const float* bias, int columns) {
     return [=](int column) {
-        const int n = lanes_of(column, columns);
+        const int n = lanes_from(column, columns);
         return n > 0 ? load_some(bias + column, n) : Vec(0.0f);
     };
 }

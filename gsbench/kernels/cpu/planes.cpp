@@ -73,7 +73,7 @@ void for_each_line(const PlaneArgs& a, const Levels& levels, const Place& time, 
             Float* before = planes + level.in_time[axis] * a.C + time.node * size;
             float* line = lines + level.in_lines[axis] * a.C;
             for (int64_t c = 0; c < size; c += LANES) {
-                f(static_cast<int>(size - c < LANES ? size - c : LANES), before + c, before + size + c, line + c);
+                f(lanes_from(c, size), before + c, before + size + c, line + c);
             }
         }
     }
@@ -212,8 +212,6 @@ GSB_HD inline Vec below_one(const float* p, int n) {
     return load_some(ones, n) - load_some(p, n);
 }
 
-GSB_HD inline int lanes_at(int64_t c, int64_t size) { return static_cast<int>(size - c < LANES ? size - c : LANES); }
-
 }  // namespace
 
 void sample_planes(const PlaneArgs& a, const Features& out) {
@@ -231,7 +229,7 @@ void sample_planes(const PlaneArgs& a, const Features& out) {
             }
             for (int64_t i = 0; i < count; ++i) {
                 for (int c = 0; c < a.C; c += LANES) {
-                    const int n = a.C - c < LANES ? a.C - c : LANES;
+                    const int n = lanes_from(c, a.C);
                     Sample in_space[PLANES], in_time[AXES];
                     sample_all(a, lines.data(), cells[i], c, n, in_space, in_time);
                     store_first(product_of(in_space) * product_of(in_time), out.features + (first + i) * F + l * a.C + c,
@@ -254,7 +252,7 @@ void sample_planes_backward(const PlaneArgs& a, const FeatureGrads& grads, const
     Buffer<float> moved(static_cast<size_t>(int64_t{tasks} * a.N * 4));  // of each task, gradients by x, y and z
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 1) if (a.N > CHUNK)
     for (int task = 0; task < tasks; ++task) {
-        const int l = task / parts, c = task % parts * LANES, n = a.C - c < LANES ? a.C - c : LANES;
+        const int l = task / parts, c = task % parts * LANES, n = lanes_from(c, a.C);
         const float* given = grads.features + l * a.C + c;
         float* by_axis = moved.data() + int64_t{task} * a.N * 4;
         for (int64_t first = 0; first < a.N; first += CHUNK) {
@@ -317,7 +315,7 @@ void plane_penalty(const PenaltyArgs& a, const Penalty& out) {
         for (int64_t r = 0; r < plane.rows; ++r) {
             Vec squares(0.0f), distances(0.0f);
             for (int64_t c = 0; c < plane.size; c += LANES) {
-                const int n = lanes_at(c, plane.size);
+                const int n = lanes_from(c, plane.size);
                 const float* p = nodes + r * plane.size + c;
                 const Vec x = bend(plane, r, p, n), below = below_one(p, n);
                 squares += x * x;
@@ -338,7 +336,7 @@ void plane_penalty_backward(const PenaltyArgs& a, const PenaltyGrad& grad, const
 #pragma omp parallel for num_threads(a.threads) schedule(static)
         for (int64_t r = 0; r < plane.rows; ++r) {
             for (int64_t c = 0; c < plane.size; c += LANES) {
-                const int n = lanes_at(c, plane.size);
+                const int n = lanes_from(c, plane.size);
                 const float* p = nodes + r * plane.size + c;
                 const Vec here = bend(plane, r, p, n), below = below_one(p, n);
                 const Vec before = bend(plane, r - 1, p - plane.size, n), after = bend(plane, r + 1, p + plane.size, n);

@@ -11,7 +11,7 @@ inline namespace GSB_ISA {
 
 alignas(64) constexpr float INDEX[LANES] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
-// Returns how many of the rows from i on, in an array of `size` rows, a SIMD vector holds.
+// Returns how many of the items from i on, of `size`, a SIMD vector holds: zero or fewer if there are none.
 GSB_HD inline int lanes_from(int64_t i, int64_t size) { return static_cast<int>(size - i < LANES ? size - i : LANES); }
 
 // Returns the address of sixteen rows of `width` floats from row i on. If the array has only n of them, they are copied
