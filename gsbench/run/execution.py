@@ -158,7 +158,7 @@ class Execution:
             cost=measured.cost,
             curve=trainer.curve.points,
             **fields,
-            parts=of_other_hooks,
+            parts=of_other_hooks | {"steps": trainer.gradients.replay.counts},
             exact=sorted(exact_views),
         )
 

@@ -21,8 +21,9 @@ DIGEST = 64  # hex digits
 MOST_STEPS = 10**9  # no training has more
 # Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
 REPRODUCED = frozenset({"step", "model", "optimizer", "density", "hooks", "exact"})
-# Keys of measured times, at any depth of the state. They differ between two trainings with one seed.
-TIMES = frozenset({"stages", "effort", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
+# Keys of measured times, and of what only saves time, at any depth of the state. They differ between two trainings with
+# one seed.
+TIMES = frozenset({"stages", "effort", "replay", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
 @dataclass(frozen=True)

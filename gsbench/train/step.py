@@ -126,7 +126,7 @@ class Step:
         self.stages = stages
         self.terms: Sequence[LossTerm] = ()
         self.maps: Sequence[ImageMap] = ()
-        self._replay: StepReplay[ViewResult] = StepReplay()
+        self.replay: StepReplay[ViewResult] = StepReplay()
 
     def __call__(
         self, views: Sequence[View], terms: Sequence[LossTerm] = (), maps: Sequence[ImageMap] = ()
@@ -147,7 +147,7 @@ class Step:
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
         seed = self.background.new_full((), 1 / len(views))
-        results = self._replay(
+        results = self.replay(
             self._signature(views, sources, workers),
             views,
             lambda i, observed, stages: self._of_view(i, observed, sources, sums[i], seed, stages),

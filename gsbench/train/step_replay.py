@@ -85,10 +85,15 @@ class _RecordedView(Generic[Result]):
 
 
 class StepReplay(Generic[Result]):
-    """Does the work of a step on each view of a batch: at first as written, later by repeating a recording."""
+    """Does the work of a step on each view of a batch: at first as written, later by repeating a recording.
+
+    `counts` has how many steps were `launched` call by call and how many were `replayed`, and how many of those that
+    were launched were recorded (`recordings`); on a GPU the calls of a recording are captured as CUDA graphs.
+    """
 
     def __init__(self) -> None:
         """Start without a recording."""
+        self.counts = {"launched": 0, "replayed": 0, "recordings": 0}
         self._signature: Hashable = None
         self._recorded: list[_RecordedView[Result]] = []  # one for each view of a batch
         self._is_repeatable = True
@@ -118,10 +123,13 @@ class StepReplay(Generic[Result]):
                 results = of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
                 for view in recorded:
                     view.check()
+                self.counts["replayed"] += 1
                 return results
+        self.counts["launched"] += 1
         if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: work(index, observed[index], stages))
         recorded = of_all(lambda index, stages: _RecordedView(partial(work, index), observed[index], stages))
         self._is_repeatable = all(view.is_repeatable for view in recorded)
         self._recorded = recorded if self._is_repeatable else []
+        self.counts["recordings"] += self._is_repeatable
         return [view.result for view in recorded]

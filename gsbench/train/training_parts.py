@@ -104,6 +104,7 @@ class TrainingParts:
             "hooks": {hook.name: hook.state_dict() for hook in self.hooks},
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
+            "replay": dict(self.gradients.replay.counts),
             "curve": self.curve.state_dict(),
             "exact": sorted(self.exact),
         }
@@ -134,6 +135,8 @@ class TrainingParts:
                 hook.load_state_dict(saved)
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state["effort"])
+            counts = self.gradients.replay.counts
+            counts |= {name: whole_number(f"replay: {name}", state["replay"][name], self.step) for name in counts}
             self.curve.load_state_dict(state["curve"])
             self.exact = set(parse(list[str], state["exact"], "checkpoint: exact"))
         except (InputError, MemoryError):

@@ -126,6 +126,10 @@ def test_repeated_steps_train_as_launched_ones(
         counts = repeats["done"]
         trainings.append(train(fitted, until=steps))
         assert (repeats["done"] - counts > 4 * 4 * steps // 4) == (fitted is trainings[0])
+    steps_of = [fitted.gradients.replay.counts for fitted in trainings]
+    assert steps_of[1] == {"launched": steps, "replayed": 0, "recordings": 0}
+    assert steps_of[0]["launched"] + steps_of[0]["replayed"] == steps
+    assert 0 < steps_of[0]["recordings"] < steps_of[0]["launched"]
     states = [without_times(fitted.state_dict()) for fitted in trainings]
     if cuda_device == "cpu":
         assert_same_bits(*states)

@@ -71,6 +71,9 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
     (path,) = record.find(broken)
     resumed = record.read(path)
     assert whole.metrics == resumed.metrics
+    for steps in (whole.parts["steps"], resumed.parts["steps"]):  # those before the last attempt count too
+        assert steps["launched"] + steps["replayed"] == whole.curve[-1].iteration
+        assert 0 < steps["recordings"] < steps["launched"]
     assert resumed.cost.train_cpu_s > spent > 0, "CPU-seconds of the last attempt alone"
     assert [point.psnr_val for point in whole.curve] == [point.psnr_val for point in resumed.curve]
     lines = [json.loads(line) for line in path.with_name("curve.jsonl").read_text().splitlines()]
