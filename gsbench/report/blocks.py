@@ -1,6 +1,7 @@
 """Make the tables of README.md and docs/results.md from the published studies: each block is one function."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -39,6 +40,7 @@ CHANGES = {
 EFFECTS = list(CHANGES)[:6]
 PRICES = {"train_cpu_s": Column("CPU s", 1, signed=True), "frame_ms": Column("ms a frame", 2, signed=True)}
 CHOICES = {
+    "hexplane": "4DGaussians, a field",
     "4dgs": "4DGS",
     "7dgs_noagr": "7DGS without AGR",
     "7dgs": "7DGS",
@@ -49,6 +51,7 @@ AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and
 POINTS = "initial_points=100000"  # trained with as many as in the paper, before D-NeRF had 10,000
 LAMBDA_T = "lambda_t=0.05"  # trained before lambda_t started at 0.5 on D-NeRF
 PARTS = (0.5, 0.7, 1.0)  # of the training after which the best model on val is chosen
+NEAR = 0.1  # dB below the best model
 ABLATIONS = {
     "none": "nothing",
     "paper_order": "Cholesky factor over (position, time, direction), as in the paper",
@@ -223,27 +226,41 @@ def minus(a: str, b: str, variant: str) -> stats.Weights:
     return {(a, variant): 1.0, (b, variant): -1.0}
 
 
-def suite_choices(published: Path) -> str:
-    """Return what choices of a model lose in PSNR to the best of six models, over dynamic scenes with val and test."""
-    runs = pd.concat([_val_on_the_way(study(published / "suite")[kind]) for kind in MOVING])
+def choices(published: Path) -> str:
+    """Return what choices of a model lose in PSNR to the best model, over scenes with val and test of two studies."""
+    runs = {
+        "suite": [_val_on_the_way(study(published / "suite")[kind]) for kind in MOVING],
+        DNERF: [_val_on_the_way(_of_dnerf(only(published, name))) for name in ("dnerf100", "compare100")],
+    }
+    lost = {title: _lost(pd.concat(of)) for title, of in runs.items()}
+    table = pd.DataFrame(index=lost[DNERF].columns.rename("choice"))
+    for title, gap in lost.items():
+        near = (gap >= -NEAR).sum()
+        texts = {name: f"{number(mean, 2, signed=True)}, {near[name]}/{len(gap)}" for name, mean in gap.mean().items()}
+        table[title] = pd.Series(texts).reindex(table.index).fillna(EMPTY)
+        table[f"{title}, worst"] = gap.min()
+    return block(table, **{f"{title}, worst": Column(f"{title}, worst", signed=True) for title in lost})
+
+
+def _of_dnerf(chapter: Results) -> Results:
+    """Return a study of D-NeRF with variants that leave out what all its runs have in common."""
+    variant = chapter.runs.variant.str.removeprefix(DNERF_VARIANT).str.removeprefix(",")
+    return replace(chapter, runs=chapter.runs.assign(variant=variant))
+
+
+def _lost(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return PSNR of choices (columns) minus that of the best model without choices, for each scene (rows)."""
     unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()
     runs = runs[~runs.scene.map(unusable)]
     psnr = runs.pivot(index=["scene", "seed"], columns="name", values="psnr_db")
-    fixed = [model for model in MODELS if model != "auto"]
+    fixed = [name for name in psnr if not name.startswith("auto")]
     best = psnr[fixed].max(axis=1)
-    lost = {title: psnr[name] - best for name, title in CHOICES.items()}
+    lost = {text: psnr[name] - best for name, text in CHOICES.items() if name in psnr}
     for part in PARTS:
         val = runs[runs.name.isin(fixed)].pivot(index=["scene", "seed"], columns="name", values=f"val {part}")
         chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
-        lost[f"the best model on val after {100 * part:.0f} % of the iterations"] = chosen - best
-    gap = pd.DataFrame(lost).groupby("scene").mean()
-    table = pd.DataFrame({"mean": gap.mean(), "worst": gap.min(), "near": (gap >= -0.1).sum()})
-    return block(
-        table.rename_axis("choice"),
-        mean=Column("mean, dB", 2, signed=True),
-        worst=Column("worst scene, dB", 2, signed=True),
-        near=Column(f"scenes at most 0.1 dB below, of {len(gap)}", 0),
-    )
+        lost[f"the best on val after {100 * part:.0f} %"] = chosen - best
+    return pd.DataFrame(lost).groupby("scene").mean()
 
 
 def _val_on_the_way(chapter: Results) -> pd.DataFrame:
@@ -399,7 +416,7 @@ _OF_RESULTS = (
     table1,
     effects,
     suite_kinds,
-    suite_choices,
+    choices,
     lengths,
     ablation,
     trex400,
