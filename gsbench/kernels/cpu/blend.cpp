@@ -36,7 +36,7 @@ GSB_HD inline void blend_block(const RecordOf<Profile>& s, const float* color, i
                                int64_t i, uint32_t b, Blocks blocks, float* stop) {
     const Vec zero(0.0f);
     float *T = blocks.transmittance(static_cast<int>(b)), *sums = blocks.color(static_cast<int>(b));
-    const Falloff<Vec, Profile> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s);
+    const Falloff<Vec, Profile> f(same_rows(grid.lane_x[b & 3] - s.x), grid.lane_y[b >> 2] - s.y, s);
     const Vec before = Vec::load(T), after = before - before * f.alpha;
     const Mask seen = f.alpha >= Vec(ALPHA_MIN), enough = after >= Vec(TRANSMITTANCE_MIN);
     const Mask blended = seen & enough;
@@ -45,7 +45,8 @@ GSB_HD inline void blend_block(const RecordOf<Profile>& s, const float* color, i
         (Vec::load(sums + k * LANES) + weight * color[k]).store(sums + k * LANES);
     }
     select(blended, after, negative_where(seen, before)).store(T);  // seen and not blended: the pixel ends here
-    store_where(seen & !enough & (before > zero), Vec(static_cast<float>(i)), stop + b * LANES);
+    const Mask ends = seen & !enough & (before > zero);
+    if (any(ends)) store_where(ends, Vec(static_cast<float>(i)), stop + b * LANES);
 }
 
 // Writes the tile's colours over the background to the image, and its state for the backward pass.

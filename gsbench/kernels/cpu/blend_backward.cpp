@@ -103,7 +103,7 @@ GSB_HD inline void backward_splat(const RecordOf<Profile>& s, const float* c, in
     for (; touched; touched &= touched - 1) {
         const int b = __builtin_ctz(touched);
         float *T = blocks.transmittance(b), *behind = blocks.behind(b);
-        const Falloff<Vec, Profile> f(grid.lane_x[b & 3] - s.x, grid.lane_y[b >> 2] - s.y, s);
+        const Falloff<Vec, Profile> f(same_rows(grid.lane_x[b & 3] - s.x), grid.lane_y[b >> 2] - s.y, s);
         const Mask blended = (f.alpha >= Vec(ALPHA_MIN)) & (position < Vec::load(blocks.stop(b)));
         const Vec alpha = select(blended, f.alpha, zero);
         const Vec before = Vec::load(T) / (Vec(1.0f) - alpha);

@@ -39,6 +39,8 @@ GSB_HD inline Mask operator!(Mask a) { return {static_cast<__mmask16>(~a.m)}; }
 GSB_HD inline bool any(Mask a) { return a.m != 0; }
 GSB_HD inline uint32_t bits(Mask a) { return a.m; }
 GSB_HD inline Vec select(Mask m, Vec yes, Vec no) { return _mm512_mask_mov_ps(no.v, m.m, yes.v); }
+// Returns x, whose lanes 8 to 15 equal its lanes 0 to 7; simd_halves.h says what for.
+GSB_HD inline Vec same_rows(Vec x) { return x; }
 // Returns -|x| in lanes of the mask m, and x in the others.
 GSB_HD inline Vec negative_where(Mask m, Vec x) {
     const __m512i bits = _mm512_castps_si512(x.v);

@@ -92,8 +92,13 @@ struct Register {
     GSB_HD friend Mask operator<=(Register a, Register b) { return {a.v <= b.v}; }
     GSB_HD friend Mask operator==(Register a, Register b) { return {a.v == b.v}; }
     GSB_HD friend Register select(Mask m, Register yes, Register no) { return m.m ? yes.v : no.v; }
+#if defined(__AVX2__)  // GCC makes a comparison and a blend of the operator ?:
+    GSB_HD friend Register min(Register a, Register b) { return Floats(_mm256_min_ps(a.v, b.v)); }
+    GSB_HD friend Register max(Register a, Register b) { return Floats(_mm256_max_ps(a.v, b.v)); }
+#else
     GSB_HD friend Register min(Register a, Register b) { return a.v < b.v ? a.v : b.v; }
     GSB_HD friend Register max(Register a, Register b) { return a.v > b.v ? a.v : b.v; }
+#endif
     GSB_HD friend Register sqrt(Register a) {
 #if defined(__AVX2__)
         return Floats(_mm256_sqrt_ps(a.v));
@@ -105,12 +110,17 @@ struct Register {
 #endif
     }
     GSB_HD friend Register exp2(Register x) {
-        const Floats bounded = x.v > EXP2_LEAST ? x.v : Floats{} + EXP2_LEAST;
+        const Floats bounded = max(x, Register(EXP2_LEAST)).v;
+#if defined(__AVX2__)
+        const Floats floor = _mm256_floor_ps(bounded), r = bounded - floor;
+        const Ints whole = __builtin_convertvector(floor, Ints);
+#else
         Ints whole = __builtin_convertvector(bounded, Ints);  // towards zero: one too many below it
         Floats r = bounded - __builtin_convertvector(whole, Floats);
         const Ints below = r < 0.0f;  // -1 where so
         whole += below;
         r -= __builtin_convertvector(below, Floats);
+#endif
         return exp2_fraction(Register(r)).v * reinterpret_cast<Floats>((whole + 127) << 23);
     }
     GSB_HD friend void split(Register x, Register& mantissa, Register& exponent) {
@@ -127,6 +137,9 @@ using Vec = Pair<Pair<Register>>;
 #endif
 using Mask = Vec::Mask;
 static_assert(Vec::size == LANES);
+
+// Returns x, whose lanes 8 to 15 equal its lanes 0 to 7; what is computed of it is then computed for one half only.
+GSB_HD inline Vec same_rows(Vec x) { return {x.lo, x.lo}; }
 
 // Returns -|x| in lanes of the mask m, and x in the others.
 GSB_HD inline Vec negative_where(Mask m, Vec x) { return select(m, min(x, Vec(0.0f) - x), x); }
