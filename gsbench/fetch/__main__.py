@@ -91,7 +91,6 @@ def fetch(source: Source) -> str:
         there = source.target.exists()
         path = download(source, source.folder)
         return f"{source.name}: {path} {'is there: nothing fetched' if there else 'fetched'}"
-    source.folder.parent.mkdir(parents=True, exist_ok=True)
     archive = download(source, source.folder.parent)
     digest = sha256_of(archive)
     try:

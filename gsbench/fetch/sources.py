@@ -121,5 +121,4 @@ def _trunk(backbone: str) -> Source:
         folder=Path(torch.hub.get_dir()) / "checkpoints",
         url=f"https://download.pytorch.org/models/{chosen.file}",
         sha256=chosen.trunk_sha256[0],
-        published="torchvision",
     )

@@ -134,8 +134,6 @@ def _folders(root: Path) -> Iterator[tuple[str, Path]]:
         top = root / fields[4].lstrip("/")
         group = PurePosixPath(groups[kind])
         inside = group.relative_to(fields[3]) if group.is_relative_to(fields[3]) else PurePosixPath()
-        if ".." in inside.parts:  # the group of this process is above what this container can see
-            inside = PurePosixPath()
         for folder in (inside, *inside.parents):
             yield kind, top / folder
 

@@ -31,7 +31,8 @@ def zipped(files: dict[str, bytes], mode: int = 0o100644, method: int = zipfile.
     return buffer.getvalue()
 
 
-GOOD = zipped({"data/trex/transforms_train.json": b"{}", "data/lego/transforms_train.json": b"{}", "data/a.txt": b"a"})
+SCENES = {"data/trex/transforms_train.json": b"{}", "data/lego/transforms_train.json": b"{}", "data/a.txt": b"a"}
+GOOD = zipped(SCENES)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -95,12 +96,16 @@ def raw(answer: str) -> str:
 
 
 @pytest.mark.parametrize("path", ["/file.bin", moved("/file.bin")])
-def test_a_file_arrives_whole_and_once(path: str, address: str, tmp_path: Path) -> None:
-    """Catches a redirect that is taken for the file, a file that is fetched twice, and another file taken for it."""
+def test_a_file_arrives_whole_and_once(
+    path: str, address: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches a redirect that is taken for the file, a file that is fetched twice, another file taken for it, and
+    messages of pooch."""
     weights = source(address + path, tmp_path, hashlib.sha256(PAYLOAD).hexdigest()[:8])
     assert fetch(weights) == f"file: {tmp_path}/file.bin fetched"
     assert fetch(weights) == f"file: {tmp_path}/file.bin is there: nothing fetched"
     assert Handler.asked.count(path) == 1
+    assert caplog.messages == []
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [PAYLOAD]
     (tmp_path / "file.bin").write_bytes(b"another")
     with pytest.raises(InputError, match="remove it and fetch again"):
@@ -147,15 +152,26 @@ def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str
     return main([*words, "--to", str(to / "data")])
 
 
+@pytest.mark.parametrize("mode", [0o100644, 0])
 def test_an_archive_is_unpacked_and_its_scenes_named(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mode: int, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again."""
-    for message in ("unpacked into", "nothing fetched"):
+    """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again.
+
+    Also files without a kind, as Windows zips them, that count as devices, and data that are there and are missed.
+    """
+    Handler.files["dnerf.zip"] = zipped(SCENES, mode)
+    for message, bar in (("unpacked into", "100%"), ("nothing fetched", "")):
         assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
-        out = capsys.readouterr().out
+        out, err = capsys.readouterr()
         assert message in out
         assert f"data.root={tmp_path}/data/dnerf/data has lego, trex" in out
+        assert bar in err
+    place = f"{tmp_path}/data/dnerf"
+    assert fetched(address, tmp_path, monkeypatch, "dnerf", "--dry-run") == 0
+    assert capsys.readouterr().out == f"dnerf: {place} is there: nothing would be fetched\n"
+    assert fetched(address, tmp_path, monkeypatch, "--list") == 0
+    assert capsys.readouterr().out.startswith(f"dnerf       D-NeRF, eight moving scenes; is in {place}\npbr ")
     assert (tmp_path / "data/dnerf/data/a.txt").read_bytes() == b"a"
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["dnerf"]
     assert Handler.asked == ["/dnerf.zip"]
@@ -218,7 +234,7 @@ def test_a_dry_run_fetches_nothing(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Catches a dry run that is none, and a plan that does not say from where, to where and what is checked."""
-    assert fetched(address, tmp_path, monkeypatch, "dnerf", "lpips-vgg", "--dry-run") == 0
+    assert fetched(f"{address}/", tmp_path, monkeypatch, "dnerf", "lpips-vgg", "--dry-run") == 0
     plans = capsys.readouterr().out.splitlines()
     assert plans[0] == f"dnerf: {address}/dnerf.zip -> {tmp_path}/data/dnerf; no SHA-256 of it is published"
     assert plans[1].endswith("must begin with 397923af")
@@ -230,6 +246,36 @@ def test_a_dry_run_fetches_nothing(
     listed = {row["name"]: (row["target"], row["there"]) for row in json.loads(capsys.readouterr().out)}
     assert len(listed) == 4
     assert listed["dnerf"] == (f"{tmp_path}/data/dnerf", False)
+
+
+def test_what_a_mirror_lacks_is_fetched_by_hand(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches advice that names no place where the file can be found, with an address that a program follows or not."""
+    Handler.files = {}
+    assert fetched(address, tmp_path, monkeypatch, "dnerf", "pbr") == 2
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench.fetch")]
+    assert errors == [
+        f"gsbench.fetch: {name}: 404 Client Error: Not Found for url: {address}/{name}.zip: take it from {place} by "
+        f"hand to {tmp_path}/data/{name}.zip and repeat this"
+        for name, place in (
+            ("dnerf", "https://www.dropbox.com/s/0bf6fl0ye2vz3vr/data.zip?dl=1"),
+            ("pbr", "the Data link of gaozhongpai.github.io/7dgs"),
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [([], "expected a NAME, or --list"), (["dnerf", "--json"], "--json: expected --list beside it")],
+)
+def test_a_command_without_sense_is_refused(words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a command that does nothing and ends as a success, and a usage that names no module."""
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    err = capsys.readouterr().err
+    assert err.endswith(f"python -m gsbench.fetch: error: {error}\n")
+    assert "[NAME ...]" in err
 
 
 def test_what_cannot_be_fetched_is_told(

@@ -46,8 +46,8 @@ def limited(limit: int, current: int, stat: str = "", folder: str = "") -> dict[
         ("0::/a/b\n", V2.format("/"), limited(1000, 1200, "inactive_file 50\n", "a") | limited(5000, 20, "", "a/b"), 0),
         # A container has its group at the top of its mount, under the path of the host.
         *[
-            (f"0::{path}\n", V2.format("/docker/abc"), limited(100, 40), 60)
-            for path in ("/docker/abc/job", "/docker/abc/../../job", "/elsewhere")
+            (f"0::{path}\n", V2.format(r"/docker/a\040c"), limited(100, 40) | limited(1, 9, "", "docker"), 60)
+            for path in ("/docker/a c/job", "/docker/a c/../../job", "/elsewhere")
         ],
         # Version 1 has other names of files, and each controller has its own mount.
         (
@@ -111,3 +111,4 @@ def test_what_cannot_be_read_is_no_limit(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 30)
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError()))
     assert memory.available() is None
+    memory.require(1 << 50, "frames", "lower --width")

@@ -6,6 +6,7 @@ Each program runs in a process of its own, and prints a number or what torch and
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -81,6 +82,37 @@ def test_the_environment_has_the_last_word():
     """Catches settings of malloc that a user has chosen and that an import overrules."""
     faults = printed("gsbench, torch", FAULTS.format(before=1, rounds=2), **dict.fromkeys(start.OPTIONS, "4"))
     assert float(faults) > 0.9 * ALL_ANEW
+
+
+def test_malloc_is_asked_for_what_the_user_has_not_set(monkeypatch):
+    """Catches an option under another number or variable, and a call of malloc's on Windows, which has no such list."""
+    asked = []
+    for variable in start.OPTIONS:
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(start.ctypes, "CDLL", lambda _: SimpleNamespace(mallopt=lambda *option: asked.append(option)))
+    monkeypatch.setattr(sys, "platform", "linux")
+    start.keep_freed_memory()
+    monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "4")
+    start.keep_freed_memory()
+    assert asked == [(-1, 1 << 30), (-3, 1 << 30), (-8, 1), (-1, 1 << 30), (-8, 1)]
+    monkeypatch.setattr(sys, "platform", "win32")
+    start.keep_freed_memory()
+    assert len(asked) == 5
+
+
+def test_an_openmp_that_is_not_loaded_reads_the_variable(monkeypatch):
+    """Catches a variable of another name or value, and libgomp loaded into a process that does without it."""
+
+    def load(name, mode):
+        assert (name, mode) == ("libgomp.so.1", os.RTLD_NOLOAD)
+        raise OSError
+
+    for variable in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.setenv(variable, "of before")  # so that the end of the test undoes what it sets
+        monkeypatch.delenv(variable)
+    monkeypatch.setattr(start.ctypes, "CDLL", load)
+    start.sleep_when_idle()
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
 
 
 @pytest.mark.skipif(not kernels.available(), reason="the native kernels are not built here")
