@@ -1,5 +1,6 @@
 """The command line as a user meets it: help, one run, sweeps, and everything that can be typed wrong."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -272,3 +273,13 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_
     statuses = {run.seed: (run.status, run.reason) for run in map(record.read, record.find(tmp_path))}
     reason = "out of memory: pictures need 9.0 MiB: lower the picture's size"
     assert statuses == {0: ("failed", reason), 1: ("ok", None)}
+
+
+@pytest.mark.parametrize(
+    "module", ["export", "score", *(f"{name}.__main__" for name in ("fetch", "gates", "launch", "stability", "view"))]
+)
+def test_the_usage_is_what_a_user_types(module, capsys):
+    """Catches a usage that begins with the name of a file."""
+    with pytest.raises(SystemExit, match="0"):
+        importlib.import_module(f"gsbench.{module}").main(["--help"])
+    assert capsys.readouterr().out.startswith(f"usage: python -m gsbench.{module.removesuffix('.__main__')} [-h]")

@@ -107,10 +107,10 @@ def test_a_gpu_is_named_with_its_kernels(built, capsys, monkeypatch):
 
 
 def test_what_is_absent_breaks_nothing(capsys, monkeypatch):
-    """Catches a machine without a GPU or a compiler that is called broken."""
+    """Catches a machine without a GPU or a compiler that is called broken, and advice on a GPU that is not there."""
     monkeypatch.setattr(shutil, "which", lambda _: None)
     listed = checks(capsys)
-    assert (listed["gpu"].state, listed["compiler"].state) == (ABSENT, ABSENT)
+    assert (listed["gpu"], listed["compiler"].state) == (Check("gpu", ABSENT, "none; the CPU trains", ""), ABSENT)
 
 
 def test_weights_that_are_here_need_no_advice(capsys, monkeypatch):

@@ -16,10 +16,10 @@ from worlds import brightening, filmed, moving, small_mover, still
 from gsbench.errors import InputError
 from gsbench.gates import __main__ as command
 from gsbench.gates import permutation_test, static_fit_residuals
-from gsbench.gates.messages import of_screen
+from gsbench.gates.messages import lines, of_screen
 from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import LEAST_FREE, screen_time
-from gsbench.measure.record import TimeScreen
+from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Camera, Scene, View
 
@@ -53,7 +53,8 @@ def timeless() -> Scene:
         (flickering, "off", "does not change over time"),
         (lambda: filmed(still, orbit=True), "undecided", "camera moves along"),
         (lambda: filmed(moving, orbit=True), "undecided", "camera moves along"),
-        (lambda: filmed(moving, views=8), "undecided", "too few"),
+        (lambda: filmed(moving, views=11), "undecided", "11 training views are too few; 12 are needed"),
+        (lambda: filmed(moving, views=12), "undecided", "camera moves along"),  # enough to be asked
         (lambda: filmed(moving, views=16, times=torch.full((16,), 0.5)), "undecided", "the same time"),
         (timeless, "off", "no times"),
     ],
@@ -84,6 +85,21 @@ def test_a_scene_without_views_is_refused() -> None:
 def test_the_answer_in_words(decision: str, kept: str) -> None:
     """Catches time that is said to be kept where it is not."""
     assert of_screen(TimeScreen(decision, "why", None, None, None, 0.0)) == f"time is {decision}{kept}: why"
+
+
+def test_a_gate_in_words() -> None:
+    """Catches removed Gaussians that count as left, and a loss in PSNR that reads as a gain."""
+    rows = {"refined": 1, "conditioned": 2, "static": 3, "removed": 4}
+    gate = Gate(0.1, 0.1, 0.01, rows, {}, 3_000_000, 1_000_000, 100, "val", 0.0, 0.02, 2.0, 1.0, 0.5)
+    direction = Direction(kept=0.25, loss_db=0.1, frame_ms=2.0, frame_ms_without=1.5)
+    assert lines(OnDemand(gates=[gate, Gate(0.1, 0.1, -0.01, {"static": 3}, {}, 1, 1)], direction=direction)) == [
+        "gate after step 100: 6 of 10 Gaussians are left (1 refined by AGR, 2 conditioned, 3 static); PSNR on val "
+        "-0.010 dB, on the evaluated views -0.020 dB, a frame 2.00 -> 1.00 ms, 3.00 -> 1.00 MB; in a frame, 50% of "
+        "AGR's Gaussians are invisible at its time and left out",
+        "gate after training: 3 of 3 Gaussians are left (3 static); PSNR on val +0.010 dB, 0.00 -> 0.00 MB",
+        "direction: 25% of the Gaussians depend on it; if none did, PSNR would change by -0.10 dB and a frame from "
+        "2.00 to 1.50 ms",
+    ]
 
 
 def test_directions_of_cameras_side_by_side() -> None:

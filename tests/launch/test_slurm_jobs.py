@@ -13,10 +13,12 @@ from tiny_run import ROOT, gsbench, overrides
 
 from gsbench.errors import InputError
 from gsbench.launch import plan, status
+from gsbench.launch.__main__ import main
 from gsbench.launch.command import compose_run, hydra_with
 from gsbench.launch.plan import Plan
 from gsbench.launch.slurm import SCRIPT, STOPPED, in_container
 from gsbench.launch.sweep import retry
+from gsbench.run import stop
 
 FAKES = {
     # The jobs of an array, one after the other; a job of which a run asks for it is put back and begins again.
@@ -101,6 +103,15 @@ def test_a_stopped_run_is_requeued_as_often_as_it_may(log: Path, tmp_path: Path)
         os.killpg(job.pid, signal.SIGUSR2)
         assert job.wait(30) == status_of_job
     assert (log / "scontrol").read_text() == "requeue 70\n" * 2
+
+
+def test_a_job_listens_before_it_reads_its_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a job that Slurm's signal kills without a word while it loads."""
+    heard: list[bool] = []
+    monkeypatch.setattr(stop, "listen", lambda: heard.append(True))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert main(["job", str(tmp_path), "0"]) == 2  # there is no plan
+    assert heard
 
 
 def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path, tmp_path: Path) -> None:

@@ -321,13 +321,17 @@ def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None
 def test_status_is_repeated_until_nothing_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a watch that ends with the first look, or never, and the exit status of a run that failed."""
+    """Catches a watch that ends with the first look, or never, the exit status of a run that failed, and a log that is
+    cleared as if it were a terminal."""
     folder = traced(tmp_path / "crowd", progress_of={})
     ends = iter([{}, DIVERGED])
-    for expected, words in ((0, "1 done"), (1, "1 failed")):
+    for expected, words, cleared in ((0, "1 done", 0), (1, "1 failed", 2)):
+        monkeypatch.setattr(sys.stdout, "isatty", lambda clears=cleared > 0: clears)
         monkeypatch.setattr(time, "sleep", lambda _: traced(tmp_path / "crowd", record_of=next(ends)))
         assert main(["status", str(tmp_path / "crowd"), "--watch"]) == expected
-        first, *_, last = [line for line in capsys.readouterr().out.splitlines() if ": 1 runs: " in line]
+        out = capsys.readouterr().out
+        assert out.count("\033[H\033[2J") == cleared
+        first, *_, last = [line for line in out.splitlines() if ": 1 runs: " in line]
         assert first.endswith("1 running")
         assert last.endswith(words)
         (folder / "record.json").unlink()

@@ -3,6 +3,7 @@
 import hashlib
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -190,6 +191,9 @@ def test_evaluate_means_over_views_and_quantises_on_request():
     assert eight.metrics["psnr"] != measured.metrics["psnr"]
     with pytest.raises(InputError, match="at least one image"):
         quality.evaluate([], background=(0.0, 0.0, 0.0))
+    for wrong in ("red", 5, (0.0, 0.0)):
+        with pytest.raises(InputError, match=re.escape(f"expected a background of three numbers, got {wrong!r}")):
+            quality.evaluate(zip("ab", render, truth, strict=True), background=wrong)
 
 
 @pytest.mark.usefixtures("no_weights")

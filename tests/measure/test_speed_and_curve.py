@@ -210,6 +210,15 @@ def test_peak_memory_sees_an_allocation_and_can_start_anew():
     assert speed.peak_memory() < high - 100 * 2**20
 
 
+def test_a_gpu_is_waited_for(monkeypatch):
+    """Would catch frames of a GPU that are timed while they are still queued, and another device that is waited for."""
+    waited = []
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+    for device in ("cpu", "cuda", "cuda:1"):
+        speed.synchroniser(device)()
+    assert waited == ["cuda", "cuda:1"]
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 def test_on_a_gpu_the_stage_that_caused_the_work_pays_for_it():
     """Would catch a missing synchronisation: queueing 200 large products takes far less time than doing them."""

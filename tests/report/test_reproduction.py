@@ -5,10 +5,12 @@ import json
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 from records import but, frontier, lost, on_demand, results, write_all
 
 from gsbench.measure.machine import Hardware
+from gsbench.report import reproduction
 from gsbench.report.__main__ import main
 from gsbench.report.reproduction import AGREES, DIFFERS, LIMITS, TITLES, UNDECIDED, compare, reasons, sections, summary
 
@@ -159,13 +161,16 @@ def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
 
 def test_seconds_are_compared_on_one_machine_alone():
     """Catches a stranger's seconds that differ from ours, those of a machine that had other work, and bits of another
-    machine that are not compared."""
+    machine that are not compared, and machines in an order that changes from call to call."""
     machine = {"hardware": Hardware("Invented CPU", 2, 24, "25", "1", "1", "v3")}
     of = reproduced(runs(*SEEDS, change=lambda r: but(r, provenance=machine)), runs(*SEEDS))
     assert (of.verdict, of.seeds.bit_equal.sum()) == (AGREES, 30)
     assert {verdict for name in ("train_s", "frame_ms") for verdict in of.of(name).verdict} == {UNDECIDED}
     named = "other machines: Invented CPU family 25 model 1 stepping 1, 2 cores, v3, 24 GiB, 2 threads instead of"
     assert named in reason(of, "train_s")
+    several = pd.DataFrame({"machine": [*"gdbaecf"]})
+    named = "other machines: x instead of a; b; c; d; e; f; g"
+    assert reproduction._other_machine(pd.DataFrame({"machine": ["x"]}), several) == named
     busy = reproduced(runs(*SEEDS, change=lambda r: but(r, cost={"load": r.cost.load + 1})), runs(*SEEDS))
     assert "the machine had other work: load 4.0 instead of 3.0" in reason(busy, "train_s")
     slow = reproduced(runs(*SEEDS, change=lambda r: but(r, cost={"train_s": 2 * r.cost.train_s})), runs(*SEEDS))

@@ -13,6 +13,7 @@ from tiny_run import main_here, overrides, write_moving_square
 from tiny_training import compose, moving_square
 
 from gsbench import kernels
+from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.factors import KINDS
@@ -21,8 +22,9 @@ from gsbench.run import setup
 from gsbench.run.load import load_run
 from gsbench.scenes import Points, View
 from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
+from gsbench.stability import __main__ as stability
 from gsbench.stability import float32_error, report
-from gsbench.stability.__main__ import main
+from gsbench.stability.__main__ import Subject, main
 from gsbench.stability.float32_error import float64_camera
 from gsbench.train.batches import generator
 
@@ -88,10 +90,31 @@ def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFix
     text = capsys.readouterr().out
     rows = [line for line in text.splitlines() if line.startswith("| orbit")]
     assert len(rows) == 10
-    assert text.startswith("Views: 10 on an orbit around the median of the means, ")
+    assert text.startswith("Views: 10 on an orbit around the median of the means, 2.98 world units away.\n\n")
     assert all(row.endswith("| - | - | - |") and "0.0e+00" not in row for row in rows)
     assert "Rounding to 8 bits changes an image" in text
     assert (tmp_path / "out/third party.exactness.png").exists()
+
+
+def centers(subject: Subject) -> torch.Tensor:
+    return torch.stack([shot.camera.center for shot in subject.shots])
+
+
+def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out."""
+    ply = stability.load(write_ply(run / "a.ply"), run)
+    assert {(shot.camera.width, shot.camera.height, shot.time) for shot in ply.shots} == {(400, 400, None)}
+    assert ply.model.active.sh_degree == 3
+    monkeypatch.setattr(stability, "scene_of", lambda *_: (_ for _ in ()).throw(InputError("gone")))
+    subject = stability.load(run, run)
+    assert subject.note == "No photographs, so 10 views of an orbit: gone"
+    assert subject.title == "/".join((run.parent.parent.name, run.parent.name, run.name))
+    assert [shot.time for shot in subject.shots] == [i / 9 for i in range(10)]
+    for orbit in (ply, subject):
+        steps = (centers(orbit) - centers(orbit).roll(1, 0)).norm(dim=-1)
+        assert torch.allclose(steps, steps.mean().expand(10), rtol=1e-3)
+    with pytest.raises(InputError, match="gone"):
+        stability.load(run, run, "elsewhere")
 
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -182,8 +182,10 @@ def test_the_error_against_the_nearest_training_view_is_shown(page: Visitor) -> 
 
 
 def test_everything_is_brought_back(page: Visitor) -> None:
-    """Catches a background without effect, and a reset that leaves something as it was."""
+    """Catches a background without effect, a reset that leaves something as it was, and a background of the training
+    that is rounded to 8 bits, or is the first run's in an image of the second."""
     page.set("reset", True)
+    assert page.controls.request("image").background is None
     start = page.pictures[-1]
     coloured = page.set("background", (0, 200, 0))
     assert (np.abs(coloured.astype(int) - (0, 200, 0)).max(-1) < 8).any()
