@@ -10,6 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote, unquote
 
+import pooch
 import pytest
 
 from gsbench.errors import InputError
@@ -97,15 +98,17 @@ def raw(answer: str) -> str:
 
 @pytest.mark.parametrize("path", ["/file.bin", moved("/file.bin")])
 def test_a_file_arrives_whole_and_once(
-    path: str, address: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    path: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a redirect that is taken for the file, a file that is fetched twice, another file taken for it, and
     messages of pooch."""
+    log = io.StringIO()
+    monkeypatch.setattr(pooch.get_logger().handlers[0], "stream", log)
     weights = source(address + path, tmp_path, hashlib.sha256(PAYLOAD).hexdigest()[:8])
     assert fetch(weights) == f"file: {tmp_path}/file.bin fetched"
     assert fetch(weights) == f"file: {tmp_path}/file.bin is there: nothing fetched"
     assert Handler.asked.count(path) == 1
-    assert caplog.messages == []
+    assert log.getvalue() == ""
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [PAYLOAD]
     (tmp_path / "file.bin").write_bytes(b"another")
     with pytest.raises(InputError, match="remove it and fetch again"):

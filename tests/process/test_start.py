@@ -101,7 +101,8 @@ def test_malloc_is_asked_for_what_the_user_has_not_set(monkeypatch):
 
 
 def test_an_openmp_that_is_not_loaded_reads_the_variable(monkeypatch):
-    """Catches a variable of another name or value, and libgomp loaded into a process that does without it."""
+    """Catches a variable of another name or value, one that is set over the user's, and libgomp loaded into a process
+    that does without it."""
 
     def load(name, mode):
         assert (name, mode) == ("libgomp.so.1", os.RTLD_NOLOAD)
@@ -113,6 +114,13 @@ def test_an_openmp_that_is_not_loaded_reads_the_variable(monkeypatch):
     monkeypatch.setattr(start.ctypes, "CDLL", load)
     start.sleep_when_idle()
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    start.sleep_when_idle()
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    monkeypatch.setenv("GOMP_SPINCOUNT", "1")
+    start.sleep_when_idle()
+    assert "OMP_WAIT_POLICY" not in os.environ
 
 
 @pytest.mark.skipif(not kernels.available(), reason="the native kernels are not built here")

@@ -25,11 +25,44 @@ from gsbench.scenes.gaussian_ply import TrainedGaussians, ply_of
 from gsbench.stability import __main__ as stability
 from gsbench.stability import float32_error, report
 from gsbench.stability.__main__ import Subject, main
-from gsbench.stability.float32_error import float64_camera
+from gsbench.stability.float32_error import Conditioning, Culprit, Exactness, ViewExactness, float64_camera
 from gsbench.train.batches import generator
 
 pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
 BLACK = (0.0, 0.0, 0.0)
+REPORT = """\
+a run: 20 Gaussians. Pixel values are in steps of 8 bits (1/255).
+
+| view | largest error | RMS | largest bound | median bound | undecided pixels | PSNR, dB | \
+changed by float32 | at most |
+| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
+| front | 5.0e-01 | 2.5e-04 | 1.0e+00 | 1.2e-01 | 25.00 % | 30.0000 | -1.0e-04 | 2.0e-04 |
+| back | 1.0e-01 | 5.0e-05 | 2.0e-01 | 1.0e-02 | 0.00 % | - | - | - |
+
+| Gaussian | view | pixels | sum of their bounds | why |
+| --- | ---: | ---: | ---: | ---: |
+| 7 | front | 12 | 3.5 | flat, far, huge, opaque, indefinite, skipped, stopped, order |
+| 3 | back | 1 | 0.5 | - |
+
+flat: its shortest axis is below 1/1000 of its longest.
+far: rounding of world coordinates moves its mean by more than 1/1000 pixel.
+huge: it covers more than the image.
+opaque: its opacity is above 0.99.
+indefinite: the papers' formula makes its covariance indefinite in float32.
+skipped: rounding may decide whether its alpha reaches 1/255, in the pixels with most of its share.
+stopped: rounding may decide whether a pixel ends before it.
+order: its depth equals another one's within rounding.
+
+| condition number of | 50 % | 90 % | 99 % | 99.9 % | 100 % |
+| --- | ---: | ---: | ---: | ---: | ---: |
+| joint factor | 1.0e+00 | 2.0e+00 | 3.0e+00 | 4.0e+00 | 5.0e+00 |
+
+| in float32 | indefinite | 99th percentile of the error |
+| --- | ---: | ---: |
+| schur | 50.00 % | 1.0e-01 |
+
+Float32 changes the mean PSNR by 5.0e-05 dB, that of one view by 1.0e-04 dB. Rounding to 8 bits changes an image \
+1,155 times as much as float32 (RMS of the worst view)."""
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +107,9 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
         assert view["psnr"] == pytest.approx(known["psnr"], abs=0.05)  # the record's images are rounded to 8 bits
         assert 0 < view["largest"] <= view["bound"] < 0.5
         assert abs(view["psnr_change"]) <= view["psnr_bound"] < 0.01
-    assert 0 < len(numbers["worst"]) <= float32_error.WORST
+    bounds = [worst["bound"] for worst in numbers["worst"]]
+    assert bounds == sorted(bounds, reverse=True)
+    assert 0 < len(bounds) <= float32_error.WORST
     assert list(numbers["conditioning"]["condition_numbers"]) == ["joint factor, 7 x 7", "sliced factor, 3 x 3"]
     assert numbers["verdict"].startswith("Float32 changes the mean PSNR by ")
     assert main([str(run)]) == 0
@@ -90,7 +125,8 @@ def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFix
     text = capsys.readouterr().out
     rows = [line for line in text.splitlines() if line.startswith("| orbit")]
     assert len(rows) == 10
-    assert text.startswith("Views: 10 on an orbit around the median of the means, 2.98 world units away.\n\n")
+    views = "Views: 10 on an orbit around the median of the means, 2.98 world units away."
+    assert text.startswith(f"{views}\n\nthird party.ply: 10 Gaussians. ")
     assert all(row.endswith("| - | - | - |") and "0.0e+00" not in row for row in rows)
     assert "Rounding to 8 bits changes an image" in text
     assert (tmp_path / "out/third party.exactness.png").exists()
@@ -148,6 +184,27 @@ def test_an_exact_view_has_no_change(run: Path) -> None:
     views = [replace(exactness.views[0], rms=rms) for rms in (1e-5, 2e-4)]
     verdict = report.verdict(replace(exactness, views=views))  # of a step of 8 bits, whose rounding is 1 / sqrt(12)
     assert "Rounding to 8 bits changes an image 1,443 times as much as float32" in verdict
+
+
+def test_the_report_word_for_word() -> None:
+    """Catches a number under another title, a share that is no percentage, and a reason that is not explained."""
+    of_front = ViewExactness("front", 0.5, 0.00025, 1.0, 0.125, 0.25, 30.0, -1e-4, 2e-4)
+    of_back = ViewExactness("back", 0.1, 0.00005, 0.2, 0.01, 0.0)
+    worst = [Culprit(7, "front", 12, 3.5, [*report.MEANINGS]), Culprit(3, "back", 1, 0.5, [])]
+    hard = Conditioning({"joint factor": [1.0, 2.0, 3.0, 4.0, 5.0]}, {"schur": 0.5}, {"schur": 0.1})
+    assert report.text(Exactness("a run", 20, [of_front, of_back], worst, hard, None)) == REPORT  # type: ignore[arg-type]
+    assert float32_error.BRANCHES.keys() < report.MEANINGS.keys()
+
+
+def test_an_indefinite_covariance_is_a_reason() -> None:
+    """Catches a Gaussian that is hard for the papers' formula and is not listed so."""
+    model = small_model()
+    model.splats["motion"].data.normal_(0, 3000.0, generator=generator(0))
+    worst = float32_error.measure(model, [*map(float32_error.Shot.of, VIEWS)], BLACK, "").worst
+    rows = torch.tensor([culprit.index for culprit in worst])
+    negative = list(float32_error.by_published_formula(model.double(), rows))
+    assert ["indefinite" in culprit.why for culprit in worst] == negative
+    assert 0 < sum(negative) < len(negative)
 
 
 # ---- which Gaussians, and why
