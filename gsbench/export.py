@@ -178,7 +178,7 @@ def export_clip(export: Export) -> list[str]:
     """Write a PLY file for each time of a clip, as one camera sees it; return names, numbers and colours in words."""
     folder = export.options.plys
     places = [slice_place(export, time) for time in video.times(frame_count(export.options))]
-    keep = places[0][1]
+    keep = places[0][1]  # whether the files keep SH colours, the same at all times
     plys = write_clip(export.run, [query for query, _ in places], folder, keep_harmonics=keep)
     counts = [ply.gaussians for ply in plys]
     text = (

@@ -146,12 +146,13 @@ def _run_of(options: argparse.Namespace) -> tuple[RunSpec, Path]:
         key = word.lstrip("+~").partition("=")[0].partition(".")[0]
         if key not in KEYS:
             raise InputError(f"{word!r:.200}: expected a key of {', '.join(KEYS)}, as nothing is trained: leave it out")
+    # Runs of gsbench have the name of a model, also with _agr or _noagr, or "auto".
     if is_registered(options.name.removesuffix("_noagr").removesuffix("_agr")) or options.name == AUTO:
         raise InputError(
             f"--name: expected a name that no model of gsbench has, got {options.name}: try {options.name}_official"
         )
     with hydra_with(options.config_dir):
-        runs, is_sweep = runs_of(Command(options.overrides, False, options.config_dir, False))
+        runs, is_sweep = runs_of(Command(options.overrides, multirun=False, config_dir=options.config_dir, asks=False))
         if is_sweep:
             raise InputError("scene: expected one, as there is one set of renders: add scene=NAME", docs=HOW_TO)
         spec = identify(compose_run(runs[0]).config)

@@ -170,7 +170,8 @@ def queue(jobs: Iterable[str]) -> Queue:
     answer = ask("squeue", "--noheader", "--array", "--jobs", ",".join(arrays), "--format=%F %K %T %r")
     if isinstance(answer, str):
         return Queue({}, answer)
-    if answer.returncode and "Invalid job id" not in answer.stderr:  # none of the jobs is known any more
+    # "Invalid job id": none of the jobs is known any more, so none is in the queue. Other errors are no answer.
+    if answer.returncode and "Invalid job id" not in answer.stderr:
         return Queue({}, (answer.stderr.splitlines() or ["squeue failed without a message"])[-1])
     states = {}
     for line in answer.stdout.splitlines():

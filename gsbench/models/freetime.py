@@ -49,7 +49,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
         self.duration = duration
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return spheres at rest with mean times uniform in [-0.1, 1.1]."""
+        """Return spheres at rest with the mean times of the points, else uniform in [-0.1, 1.1]."""
         N = len(distances)
         return super().initial_geometry(points, distances, generator) | {
             "times": initial_times(points, generator),

@@ -135,4 +135,4 @@ def _is_a(value: object, kind: Any) -> bool:
         return type(value) in (int, float)
     if kind in (bool, int, str):
         return type(value) is kind
-    return not isinstance(kind, type) or isinstance(value, kind)
+    return not isinstance(kind, type) or isinstance(value, kind)  # others, such as int | None, are not checked here

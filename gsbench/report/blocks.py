@@ -148,11 +148,15 @@ def cost(published: Path) -> str:
 
 
 def effects(published: Path) -> str:
-    """Return what time, direction and AGR gain and cost, alone and given both others; nested gains where there are."""
+    """Return what time, direction and AGR gain and cost, alone and given both others.
+
+    Where there is a nested gain, with 7DGS without direction in place of 4DGS, it is taken instead.
+    """
     chapter = only(published, "frontier")
     tests = tested(chapter)
     tests = tests[tests.section == "effects"].set_index("name")
     gains = tests[tests.quantity == "psnr_db"]
+    # Names are "time alone", "time, with direction" (left out here), "time, with direction and AGR".
     single = [name for name in gains.index if is_single(name) and (" alone" in name or " and " in name)]
     single = [name for name in single if not name.endswith("nested")]
     names = [f"{name}, nested" if f"{name}, nested" in gains.index else name for name in single]
@@ -290,7 +294,10 @@ LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "b
 
 
 def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str:
-    """Return PSNR on D-NeRF at the paper's protocol, by scene and on average."""
+    """Return PSNR on D-NeRF at the paper's protocol, by scene and on average; `quantities` are of LAST, BEST, OF_PAPER.
+
+    Each model has a column for each quantity. Scenes that lack one of them are left out.
+    """
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)].set_index("scene")
     by_column = {

@@ -111,6 +111,7 @@ def laid_out(records: Records, faults: Sequence[str]) -> Results:
     """Return the tables of records in their order."""
     runs = pd.DataFrame([row(record) | {"path": path, "record": record} for path, record in records], dtype=object)
     first = [*(column.name for column in RUNS), "path", "record"]
+    # Behind the declared columns stand those that depend on the records: protocol_* and stage_*.
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
     runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
     views = [view for i, (_, record) in enumerate(records) for view in _views(i, record)]

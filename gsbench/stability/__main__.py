@@ -100,15 +100,16 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
 
 
 def _of_ply(path: Path, out: Path) -> Subject:
+    """Load a PLY as a 3DGS model, with views of an orbit around the median of its means."""
     trained = read_trained(path)
     model = build("3dgs", sh_degree=MAX_DEGREE)
     model.start_from(trained, 1.0, generator(0))
-    model.set_active(ActiveComponents(MAX_DEGREE, False, False))
+    model.set_active(ActiveComponents(MAX_DEGREE, refine=False, tunes_lambda=False))
     model.requires_grad_(False)
     middle = trained.means.median(0).values
-    extent = DISTANCE * float((trained.means - middle).norm(dim=-1).median())
-    note = f"Views: {VIEWS} on an orbit around the median of the means, {extent:.3g} world units away."
-    shots = orbit_shots(model, max(extent, 1e-6), SIZE, SIZE, False)
+    distance = DISTANCE * float((trained.means - middle).norm(dim=-1).median())
+    note = f"Views: {VIEWS} on an orbit around the median of the means, {distance:.3g} world units away."
+    shots = orbit_shots(model, max(distance, 1e-6), SIZE, SIZE, False)
     return Subject(path.name, model, shots, (0.0, 0.0, 0.0), False, out / f"{path.stem}.exactness.png", note)
 
 
