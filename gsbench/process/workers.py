@@ -1,7 +1,7 @@
 """Run independent tasks in parallel Python threads that share the processors."""
 
 import functools
-import time
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -44,8 +44,9 @@ def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
         torch.set_num_threads(threads)
 
     pool = ThreadPoolExecutor(workers, "gsbench-worker", settle)
-    # All workers start now: the pool starts one only when a call finds none idle. Setting its own number of threads, a
-    # worker also sets that of threads to come, so the number is restored.
-    list(pool.map(lambda _: time.sleep(0.01), range(workers)))
+    # All workers start now: the pool starts one only when a call finds none idle, and none is idle until all wait.
+    # Setting its own number of threads, a worker also sets that of threads to come, so the number is restored.
+    started = threading.Barrier(workers)
+    list(pool.map(lambda _: started.wait(), range(workers)))
     torch.set_num_threads(before)
     return pool

@@ -318,6 +318,12 @@ def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None
         assert not any("of training left" in line for line in lines(status.Experiment(tmp_path), nothing_known))
 
 
+def test_a_folder_without_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a stack trace for the folder of an experiment that has no run yet."""
+    main(["status", str(tmp_path)])
+    assert capsys.readouterr().out == f"{tmp_path}: no run was asked for\n"
+
+
 def test_status_is_repeated_until_nothing_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
