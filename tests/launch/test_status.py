@@ -343,6 +343,24 @@ def test_status_is_repeated_until_nothing_goes_on(
         (folder / "record.json").unlink()
 
 
+def test_the_help_says_what_each_command_does(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches commands without a word, an example for what the program does, and no command that is a stack trace."""
+    monkeypatch.setenv("COLUMNS", "200")
+    for words, status_of_exit in (["--help"], 0), ([], 2):
+        with pytest.raises(SystemExit, match=str(status_of_exit)):
+            main(words)
+    out = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert {
+        "Show the state of an experiment's runs and the time that they still need, or launch again what did not "
+        "finish.",
+        "status show the state of each run: done, running, stopped, failed, ...",
+        "retry launch again the runs that were stopped, failed, are lost or not started",
+        "job do one run of a plan; a job of Slurm calls it",
+    } <= set(out)
+
+
 def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path) -> None:
     """Catches a status that composes configs, validates records, or imports what it does not need."""
     experiment = crowd.write(500, tmp_path)
