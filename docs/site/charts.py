@@ -40,9 +40,9 @@ def draw_frontier() -> None:
 
 
 def draw_networks() -> None:
-    """Draw PSNR and CPU seconds of Gaussians of each kind with each network, means over the scenes of D-NeRF."""
+    """Draw PSNR and CPU seconds of Gaussians of each kind with each network, means over the scenes of D-NeRF and seeds."""
     runs = pd.concat([only(PUBLISHED, name).runs for name in ("dnerf100", "networks")])
-    averages = runs[runs.seed == 0].groupby(["model", "variant"])[["psnr_db", "train_cpu_s"]].mean()
+    averages = runs.groupby(["model", "variant"])[["psnr_db", "train_cpu_s"]].mean()
     cells = [
         {"network": network, "Gaussians": dimensions, **averages.loc[(model + ending, variant)]}
         for network, (variant, endings) in NETWORKS.items()
