@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, one run, sweeps, and everything that can be typed wrong."""
 
 import importlib
+import itertools
 import json
 import subprocess
 import sys
@@ -278,8 +279,16 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_
 @pytest.mark.parametrize(
     "module", ["export", "score", *(f"{name}.__main__" for name in ("fetch", "gates", "launch", "stability", "view"))]
 )
-def test_the_usage_is_what_a_user_types(module, capsys):
-    """Catches a usage that begins with the name of a file."""
+def test_the_help_is_what_a_user_types_and_needs(module, capsys):
+    """Catches a usage that begins with the name of a file, a help that does not say what the command is for, and an
+    argument without a text."""
+    command = importlib.import_module(f"gsbench.{module}")
     with pytest.raises(SystemExit, match="0"):
-        importlib.import_module(f"gsbench.{module}").main(["--help"])
-    assert capsys.readouterr().out.startswith(f"usage: python -m gsbench.{module.removesuffix('.__main__')} [-h]")
+        command.main(["--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: python -m gsbench.{module.removesuffix('.__main__')} [-h]")
+    assert "".join(command.__doc__.partition(".")[0].split()) in "".join(text.split())
+    *_, listed = text.partition("\n\n")[2].partition(":\n")
+    for argument, after in itertools.pairwise([*listed.splitlines(), ""]):
+        if argument.startswith("  ") and argument[2] != " ":
+            assert "  " in argument[2:] or after.startswith("    "), argument

@@ -40,7 +40,7 @@ def draw_frontier() -> None:
 
 
 def draw_networks() -> None:
-    """Draw PSNR and CPU seconds of Gaussians of each kind with each network, means over the scenes of D-NeRF and seeds."""
+    """Draw PSNR and CPU seconds of Gaussians of each kind with each network, means over scenes and seeds of D-NeRF."""
     runs = pd.concat([only(PUBLISHED, name).runs for name in ("dnerf100", "networks")])
     averages = runs.groupby(["model", "variant"])[["psnr_db", "train_cpu_s"]].mean()
     cells = [

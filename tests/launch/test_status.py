@@ -322,6 +322,7 @@ def test_a_folder_without_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFix
     """Catches a stack trace for the folder of an experiment that has no run yet."""
     main(["status", str(tmp_path)])
     assert capsys.readouterr().out == f"{tmp_path}: no run was asked for\n"
+    assert main(["status", str(tmp_path / "nothing")]) == 2
 
 
 def test_status_is_repeated_until_nothing_goes_on(

@@ -65,6 +65,13 @@ def test_views_at_the_cap_are_named() -> None:
     assert "counts as" not in summary(make())
 
 
+def test_the_line_of_a_run_begins_with_its_psnr() -> None:
+    """Catches a run that seems to have no PSNR, and a stack trace for one that has none."""
+    psnr = make().metrics["psnr"]
+    assert summary(make()).startswith(f"PSNR {psnr:.2f} dB, ")
+    assert summary(replace(make(), metrics={"psnr": None})).startswith("PSNR - dB, ")
+
+
 def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> None:
     """Catches numbers of renders in 8 bits in place of floats, a film that leaves no picture, and a static model whose
     Gaussians move."""
