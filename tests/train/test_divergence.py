@@ -85,6 +85,7 @@ def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
             run.model.splats["log_diagonal"].grad[POISONED, -1] = math.nan
         return views
 
+    poisoned.replay = real.replay
     run.gradients = poisoned
     path = tmp_path / "checkpoint.pt"
     with pytest.raises(DivergedError, match=r"step 5.*'log_diagonal'"):
