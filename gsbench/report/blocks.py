@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from gsbench.report import paper, paper_tables, stats
-from gsbench.report.frame import Results, load, names_of
+from gsbench.report.frame import Results, load, names_of, without
 from gsbench.report.intervals import Values, estimate
 from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
@@ -248,7 +248,7 @@ def choices(published: Path) -> str:
 
 def _of_dnerf(chapter: Results) -> Results:
     """Return a study of D-NeRF with variants that leave out what all its runs have in common."""
-    variant = chapter.runs.variant.str.removeprefix(DNERF_VARIANT).str.removeprefix(",")
+    variant = chapter.runs.variant.map(lambda variant: without(variant, "downscale", "iterations"))
     return replace(chapter, runs=chapter.runs.assign(variant=variant))
 
 
