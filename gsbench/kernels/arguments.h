@@ -210,6 +210,7 @@ GSB_FIELDS(RefineGrads, GRADS, values, weight_in, bias_in, weight_out, bias_out,
 
 struct ProjectArgs {
     int64_t N, C;
+    bool gaussian_per_camera;                  // means, factors, opacities and shapes are [C, N, ..]
     const float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
     const float *viewmats, *Ks;                // [C, 4, 4] [C, 3, 3]
     const float* shapes;                       // [N] exponents of Beta profiles; null: Gaussians
@@ -218,8 +219,8 @@ struct ProjectArgs {
     bool antialias;
     int threads;
 };
-GSB_FIELDS(ProjectArgs, INPUTS, N, C, means, factors, opacities, viewmats, Ks, shapes, width, height, near, far, eps2d,
-           antialias, threads)
+GSB_FIELDS(ProjectArgs, INPUTS, N, C, gaussian_per_camera, means, factors, opacities, viewmats, Ks, shapes, width,
+           height, near, far, eps2d, antialias, threads)
 
 struct Splats {
     float* means2d;     // [C, N, 2]
@@ -235,23 +236,23 @@ struct SplatGrads {
 GSB_FIELDS(SplatGrads, GIVEN, means2d, roots, depths)
 
 struct ProjectGrads {
-    float *means, *factors, *opacities;
-    float* viewmats;  // [C, 4, 4], zero on entry; null: not wanted
+    float *means, *factors, *opacities;  // as the inputs
+    float* viewmats;                     // [C, 4, 4], zero on entry; null: not wanted
 };
 GSB_FIELDS(ProjectGrads, GRADS, means, factors, opacities, viewmats)
 
 struct BlendArgs {
     int64_t N, C;
     int D;
-    bool color_per_camera;  // colors are [C, N, D], else [1, N, D]
+    bool color_per_camera, shape_per_camera;  // colors are [C, N, D], else [N, D]; likewise shapes
     const float *means2d, *roots, *half_sizes, *colors, *background;
     const int32_t *offsets, *ids;  // [C * tiles + 1] [pairs]: each tile's list of splats, front to back
-    const float* shapes;           // [N] exponents of Beta profiles; null: Gaussians
+    const float* shapes;           // [N] or [C, N] exponents of Beta profiles; null: Gaussians
     int width, height;
     int threads;
 };
-GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, means2d, roots, half_sizes, colors, background, offsets, ids,
-           shapes, width, height, threads)
+GSB_FIELDS(BlendArgs, INPUTS, N, C, D, color_per_camera, shape_per_camera, means2d, roots, half_sizes, colors,
+           background, offsets, ids, shapes, width, height, threads)
 
 struct Picture {
     float *image, *alpha;         // [C, H, W, D] [C, H, W, 1]
@@ -272,14 +273,14 @@ GSB_FIELDS(PictureGrads, GIVEN, image, alpha)
 struct BlendGrads {
     float *means2d, *roots, *colors;  // [C, N, 2] [C, N, 4] as colors
     float* background;                // [D], zero on entry; null: not wanted
-    float* shapes;                    // [N]; null: Gaussians
+    float* shapes;                    // as shapes; null: Gaussians
     float* scratch;                   // [C, N, moments + D] zero on entry, on a GPU
 };
 GSB_FIELDS(BlendGrads, GRADS, means2d, roots, colors, background, shapes, scratch)
 
 // Bit k of `flags` is set if the k-th array has a value that is not finite or out of range.
 struct ValueArgs {
-    int64_t N, C, all_colors;  // all_colors: the size of `colors`
+    int64_t N, C, all_colors;  // N: the size of `opacities`; all_colors: the size of `colors`
     int D;
     const float *means, *factors, *opacities, *colors, *viewmats, *Ks, *background;
     const float* shapes;  // [N]; may be null
@@ -296,18 +297,18 @@ GSB_FIELDS(ValueFlags, OUTPUTS, flags)
 // ---- gsbench/kernels/loss.py
 
 struct SimilarityArgs {
-    int height, width;
-    const float *image, *target;  // [H, W, 3]
-    const uint8_t* target_bytes;  // [H, W, 3], 255 times the target; one of the two targets is null
+    int C, height, width;         // C images
+    const float *image, *target;  // [C, H, W, 3]
+    const uint8_t* target_bytes;  // [C, H, W, 3], 255 times the target; one of the two targets is null
     float ssim_weight;
     int threads;
 };
-GSB_FIELDS(SimilarityArgs, INPUTS, height, width, image, target, target_bytes, ssim_weight, threads)
+GSB_FIELDS(SimilarityArgs, INPUTS, C, height, width, image, target, target_bytes, ssim_weight, threads)
 
 struct SimilarityLoss {
-    float* loss;      // [parts] partial sums of the loss, as many as `similarity_parts` returns
-    float* gradient;  // [H, W, 3]; null: not wanted
-    float* scratch;   // [3, 3, H, W], on a GPU, for the gradient
+    float* loss;      // [C, parts] partial sums of each image's loss, as many as `similarity_parts` returns
+    float* gradient;  // [C, H, W, 3]; null: not wanted
+    float* scratch;   // [C, 3, 3, H, W], on a GPU, for the gradient
 };
 GSB_FIELDS(SimilarityLoss, OUTPUTS, loss, gradient, scratch)
 

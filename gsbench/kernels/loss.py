@@ -24,10 +24,10 @@ class _Similarity(Operation):
         super().__init__(
             "l1_ssim",
             inputs={
-                "image": Input("?one height width 3"),
-                "target": Input("?one height width 3", Gradient.REFUSED, _TARGET),
+                "image": Input("C height width 3"),
+                "target": Input("C height width 3", Gradient.REFUSED, _TARGET),
             },
-            outputs={"loss": Output(""), "gradient": Output("numbers", gradient=False)},
+            outputs={"loss": Output("C"), "gradient": Output("numbers", gradient=False)},
             numbers={"ssim_weight": float, "with_gradient": bool},
             derive=lambda tensors, numbers: {"numbers": tensors["image"].numel() if numbers["with_gradient"] else 0},
         )
@@ -35,13 +35,13 @@ class _Similarity(Operation):
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         slots = self.match(tensors, numbers).copy()
         image, target = in_rows(tensors)
-        height, width = slots["height"], slots["width"]
+        C, height, width = slots["C"], slots["height"], slots["width"]
         library = library_of(image.device.type)
-        parts = image.new_empty(library.similarity_parts(height, width))
+        parts = image.new_empty(C, library.similarity_parts(height, width))
         gradient = allocate("the gradient of the loss", image, (slots["numbers"],))
         scratch = None
         if library.needs_scratch and slots["with_gradient"]:
-            scratch = allocate("derivatives of SSIM", image, (3, 3, height, width))
+            scratch = allocate("derivatives of SSIM", image, (C, 3, 3, height, width))
         in_bytes = target.dtype == torch.uint8
         slots |= {
             "image": image.data_ptr(),
@@ -52,7 +52,7 @@ class _Similarity(Operation):
             "out.scratch": address(scratch),
         }
         library.call(self.name, slots, image)
-        return [parts.sum() if parts.shape[0] > 1 else parts[0], gradient], slots
+        return [parts.sum(1) if parts.shape[1] > 1 else parts[:, 0], gradient], slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
         return {}
@@ -66,19 +66,19 @@ class _Similarity(Operation):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        by_loss = upstream[0]
-        return [None if by_loss is None else (by_loss * outputs[1]).view_as(tensors[0]), None]
+        by_loss, image = upstream[0], tensors[0]
+        return [None if by_loss is None else by_loss.view(-1, 1, 1, 1) * outputs[1].view_as(image), None]
 
 
 _similarity = _Similarity()
 
 
 def l1_ssim(
-    image: Tensor,  # [H, W, 3] or [1, H, W, 3]
+    image: Tensor,  # [H, W, 3] or [C, H, W, 3]
     target: Tensor,  # as image, or the same in 8 bits
     ssim_weight: float,
-) -> Tensor:  # []
-    """Return the loss of 3DGS (eq. 7), (1 - w) L1 + w (1 - SSIM), differentiable with respect to `image`.
+) -> Tensor:  # [] or [C]
+    """Return the loss of 3DGS (eq. 7) of each image, (1 - w) L1 + w (1 - SSIM), differentiable with respect to `image`.
 
     The weight w is `ssim_weight`. SSIM has an 11 x 11 Gaussian window of sigma 1.5 and zero padding. The value is that
     of `gsbench.train.losses.photometric`. A target of uint8 is divided by 255 as it is read; the result has the same
@@ -93,7 +93,10 @@ def l1_ssim(
     check_number(ssim_weight, "l1_ssim: ssim_weight", 0, 1)
     if image.dim() not in (3, 4) or image.shape[-1] != 3 or target.shape != image.shape or not image.numel():
         raise InputError(
-            f"l1_ssim: expected image and target [H, W, 3] or [1, H, W, 3] of one size, got "
+            f"l1_ssim: expected image and target [H, W, 3] or [C, H, W, 3] of one size, got "
             f"{list(image.shape)} and {list(target.shape)}"
         )
-    return _similarity(image, target, ssim_weight, image.requires_grad and torch.is_grad_enabled())[0]
+    with_gradient = image.requires_grad and torch.is_grad_enabled()
+    if image.dim() == 3:
+        return _similarity(image[None], target[None], ssim_weight, with_gradient)[0][0]
+    return _similarity(image, target, ssim_weight, with_gradient)[0]

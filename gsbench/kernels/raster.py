@@ -37,7 +37,7 @@ class Viewport(NamedTuple):
 class RasterInputs(NamedTuple):
     """The tensors that `rasterize` takes, of one dtype on one device; `gsbench.raster.rasterize` explains them."""
 
-    means: Tensor  # [N, 3]
+    means: Tensor  # [N, 3] for all cameras, or [C, N, 3]; so are factors, opacities and exponents
     factors: Tensor  # [N, 3, 3] F of the covariances F F^T
     opacities: Tensor  # [N]
     colors: Tensor  # [N, D] for all cameras, or [C, N, D]
@@ -54,7 +54,7 @@ class Splats(NamedTuple):
     roots: Tensor  # [C, N, 4]: p, q, r of the inverse 2D covariance's triangular root (math/projection.h); the opacity
     depths: Tensor  # [C, N]
     half_sizes: Tensor  # [C, N, 2] pixels, beyond which alpha < 1/255; 0: not drawn; without a gradient
-    beta_exponents: Tensor | None = None  # [N] of Beta profiles; None: Gaussians
+    beta_exponents: Tensor | None = None  # [N] or [C, N] of Beta profiles; None: Gaussians
 
 
 class Bins(NamedTuple):
@@ -69,15 +69,24 @@ def count_tiles(width: int, height: int) -> int:
     return -(-width // TILE) * -(-height // TILE)
 
 
+def _sets_of_gaussians(tensors: dict[str, Tensor], _: dict[str, Any]) -> dict[str, int]:
+    """Return whether each camera sees Gaussians of its own."""
+    dimensions = {"means": 2, "factors": 3, "opacities": 1, "shapes": 1}  # of one set
+    sets = {tensors[key].dim() - dims for key, dims in dimensions.items() if key in tensors}
+    if len(sets) > 1:
+        raise InputError(f"project: expected {', '.join(dimensions)} of each camera, or all for all cameras")
+    return {"gaussian_per_camera": int(sets == {1})}
+
+
 _project = Operation(
     "project",
     inputs={
-        "means": Input("N 3"),
-        "factors": Input("N 3 3"),
-        "opacities": Input("N"),
+        "means": Input("?C N 3"),
+        "factors": Input("?C N 3 3"),
+        "opacities": Input("?C N"),
         "viewmats": Input("C 4 4", Gradient.ON_REQUEST),
         "Ks": Input("C 3 3", Gradient.REFUSED),
-        "shapes": Input("N", Gradient.NONE, left_out_with="shapes"),
+        "shapes": Input("?C N", Gradient.NONE, left_out_with="shapes"),
     },
     outputs={
         "means2d": Output("C N 2"),
@@ -86,6 +95,7 @@ _project = Operation(
         "half_sizes": Output("C N 2", gradient=False),
     },
     numbers={"width": int, "height": int, "near": float, "far": float, "eps2d": float, "antialias": bool},
+    derive=_sets_of_gaussians,
     memory="projected Gaussians",
 )
 
@@ -109,6 +119,7 @@ def _sizes_of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dic
     tiles = C * count_tiles(numbers["width"], numbers["height"])
     return {
         "color_per_camera": int(C > 1 and sets == C),
+        "shape_per_camera": int("shapes" in tensors and tensors["shapes"].dim() == 2),
         "lists": tiles + 1,
         "D": D,
         "sums": GEOMETRY + ("shapes" in tensors) + D,
@@ -126,7 +137,7 @@ _blend = Operation(
         "background": Input("D", Gradient.ON_REQUEST),
         "offsets": Input("lists", Gradient.NONE, (torch.int32,)),
         "ids": Input("pairs", Gradient.NONE, (torch.int32,), is_list=True),
-        "shapes": Input("N", left_out_with="shapes"),
+        "shapes": Input("?C N", left_out_with="shapes"),
     },
     outputs={
         "image": Output("C height width D"),
@@ -168,7 +179,8 @@ def flag_values(inputs: RasterInputs) -> Tensor:
     """Return a tensor [1] int64 that is not zero if any value is not finite or out of range."""
     means, colors = inputs.means, inputs.colors
     flags = torch.zeros(1, dtype=torch.int64, device=means.device)
-    sizes = {"N": len(means), "C": len(inputs.viewmats), "all_colors": colors.numel(), "D": colors.shape[-1]}
+    N, C, D = inputs.opacities.numel(), len(inputs.viewmats), colors.shape[-1]
+    sizes = {"N": N, "C": C, "all_colors": colors.numel(), "D": D}
     names = ("means", "factors", "opacities", "colors", "viewmats", "Ks", "background", "shapes")  # of the kernel
     present = {name: x for name, x in zip(names, inputs, strict=True) if x is not None}
     rows = in_rows(list(present.values()))

@@ -13,9 +13,9 @@ __all__ = ["EPS2D", "FAR", "NEAR", "RasterInfo", "RasterOutput", "rasterize"]
 
 
 def rasterize(
-    means: Tensor,  # [N, 3]
-    factors: Tensor,  # [N, 3, 3]
-    opacities: Tensor,  # [N]
+    means: Tensor,  # [N, 3] or [C, N, 3]
+    factors: Tensor,  # [N, 3, 3] or [C, N, 3, 3]
+    opacities: Tensor,  # [N] or [C, N]
     colors: Tensor,  # [N, D] or [C, N, D]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
@@ -28,7 +28,7 @@ def rasterize(
     eps2d: float = EPS2D,
     backend: str | Backend = "auto",
     antialias: bool = False,
-    beta_exponents: Tensor | None = None,  # [N]
+    beta_exponents: Tensor | None = None,  # [N] or [C, N]
 ) -> RasterOutput:
     """Render N Gaussians to C images by the rules of 3DGS (Kerbl et al. 2023, section 4 and appendix C).
 
@@ -41,7 +41,8 @@ def rasterize(
     are skipped. A pixel stops before the Gaussian that would reduce its transmittance below 1e-4.
 
     Args:
-        means: the means, [N, 3], world units.
+        means: the means, [N, 3] for all cameras or [C, N, 3] for each camera, world units. Factors, opacities and
+            exponents are then for each camera too.
         factors: the factors F of the covariances F F^T, [N, 3, 3], world units.
         opacities: the opacities in [0, 1], [N].
         colors: D colour channels, [N, D] for all cameras or [C, N, D] for each camera.

@@ -59,10 +59,11 @@ def check_arguments(inputs: RasterInputs, viewport: Viewport) -> None:
         check_tensor(tensor, name)
         if tensor.dim() == 0:
             raise InputError(f"{name}: expected a tensor of at least one dimension, got one of shape []")
-    means, colors = inputs.means, inputs.colors
-    N, C, D = len(means), len(inputs.viewmats), colors.shape[-1]
+    means, colors, C, D = inputs.means, inputs.colors, len(inputs.viewmats), inputs.colors.shape[-1]
+    N = means.shape[-2] if means.dim() == 3 else len(means)
+    rows = [C, N] if means.dim() == 3 else [N]
     shape_of_colors = [N, D] if colors.dim() == 2 else [C, N, D]
-    shapes = [[N, 3], [N, 3, 3], [N], shape_of_colors, [C, 4, 4], [C, 3, 3], [D], [N]]
+    shapes = [[*rows, 3], [*rows, 3, 3], rows, shape_of_colors, [C, 4, 4], [C, 3, 3], [D], rows]
     for (name, tensor), shape in zip(tensors.items(), shapes, strict=False):  # exponents may be left out
         if list(tensor.shape) != shape:
             raise InputError(f"{name}: expected shape {shape}, got {list(tensor.shape)}")
@@ -101,11 +102,11 @@ def check_values(inputs: RasterInputs) -> None:
         if tensor is not None and not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor).all():
             row = int((~torch.isfinite(tensor)).flatten().nonzero()[0])
             raise InputError(f"{name}: expected finite values, got {tensor.flatten()[row].item()} at flat index {row}")
-    low, high = inputs.opacities.detach().aminmax() if len(inputs.means) else (0, 0)
+    low, high = inputs.opacities.detach().aminmax() if inputs.opacities.numel() else (0, 0)
     if low < 0 or high > 1:
         raise InputError(f"opacities: expected values in [0, 1], got {low} to {high}")
     exponents, Ks = inputs.beta_exponents, inputs.Ks.detach()
-    if exponents is not None and len(exponents) and (least := exponents.detach().min()) <= 0:
+    if exponents is not None and exponents.numel() and (least := exponents.detach().min()) <= 0:
         raise InputError(
             f"beta_exponents: expected exponents above 0, got {least}: exponentiate raw parameters, or use softplus"
         )

@@ -35,7 +35,7 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
     device = inputs.means.device.type
     if inputs.Ks.requires_grad:
         raise InputError(f"raster backend '{device}' has no gradient by Ks: detach them, or use backend 'reference'")
-    C, N = len(inputs.viewmats), len(inputs.means)
+    C, N = len(inputs.viewmats), inputs.means.shape[-2]
     if device == "cpu":
         if N >= MAX_GAUSSIANS:
             raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")

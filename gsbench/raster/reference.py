@@ -37,15 +37,18 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
         InputError: a value is out of range, or the CPU memory does not suffice.
     """
     means, factors, opacities, colors, viewmats, Ks, background, beta_exponents = inputs
+    C = len(viewmats)
     if means.device.type == "cpu":
-        C, N = len(viewmats), len(means)
+        N = means.shape[-2]
         require(means.element_size() * C * N * NUMBERS, f"images of {C} cameras with {N} Gaussians", LOWER)
     check_values(inputs)
     if colors.dim() == 2:
-        colors = colors.expand(len(viewmats), *colors.shape)
+        colors = colors.expand(C, *colors.shape)
+    shared = means, factors, opacities, beta_exponents
+    sets = [shared] * C if means.dim() == 2 else zip(*([None] * C if x is None else x for x in shared), strict=True)
     splats = [
-        project(means, factors, opacities, viewmat, K, viewport, beta_exponents)
-        for viewmat, K in zip(viewmats, Ks, strict=True)
+        project(mean, factor, opacity, viewmat, K, viewport, exponent)
+        for (mean, factor, opacity, exponent), viewmat, K in zip(sets, viewmats, Ks, strict=True)
     ]
     means2d = torch.stack([s.means2d for s in splats])  # all images are computed from it, so it gets a gradient
     images, alphas, pairs = [], [], 0

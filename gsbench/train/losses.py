@@ -17,10 +17,12 @@ SIGMA = 1.5
 def photometric(image: Tensor, target: Tensor, ssim_weight: float, backend: Backend = AUTO) -> Tensor:
     """Compute the loss (1 - ssim_weight) L1 + ssim_weight (1 - SSIM) of an image and its target, [H, W, 3] each.
 
-    The target has floats in [0, 1], or 8 bits.
+    The target has floats in [0, 1], or 8 bits. Of images [C, H, W, 3] the losses are [C].
     """
     if backend.serves(image):
         return l1_ssim(image, target, ssim_weight)
+    if image.dim() == 4:
+        return torch.stack([photometric(*pair, ssim_weight, backend) for pair in zip(image, target, strict=True)])
     target = to_floats(target)
     loss = F.l1_loss(image, target)
     if ssim_weight == 0:
@@ -33,7 +35,7 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
 
     The SSIM in tables of results is `gsbench.measure.quality.ssim` (Wang et al. 2004), not this one.
     """
-    a, b = (x.reshape(x.shape[-3:]).permute(2, 0, 1) for x in (a, b))
+    a, b = (x.permute(2, 0, 1) for x in (a, b))
     moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
     mean_a, mean_b, aa, bb, ab = moments.split(len(a))
     variances, covariance = aa - mean_a**2 + bb - mean_b**2, ab - mean_a * mean_b

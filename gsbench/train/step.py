@@ -105,7 +105,7 @@ def _in_order(sums: Sequence[Sums]) -> Sums:
 class ViewResult(NamedTuple):
     """Hold the results of one view of a training step. The next step may overwrite the tensors."""
 
-    loss: Tensor  # [] the view's part of the batch's loss
+    loss: Tensor  # [1] the view's part of the batch's loss
     drawn: Tensor  # [1, N] bool: which Gaussians were not culled
     g_means2d: Tensor  # [1, N, 2] gradient of the batch's loss by the 2D means, per pixel
     sums: Sums  # gradients of the batch's loss by the parameters, of this view and of those that share the dictionary
@@ -146,7 +146,7 @@ class Step:
         workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(views) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(views), bounds)
-        seed = self.background.new_full((), 1 / len(views))
+        seed = self.background.new_full((1,), 1 / len(views))
         results = self.replay(
             self._signature(views, sources, workers),
             views,

@@ -115,7 +115,7 @@ def shape_in(sizes: dict[str, int], declared: str, unknown: int | None = None) -
 def values(key: str, shape: list[int], dtype: torch.dtype, count: int) -> Tensor:
     """The numbers of an input: its own, or any."""
     if key in VALUES:
-        known = VALUES[key]
+        known = VALUES[key].expand(*shape[: len(shape) - VALUES[key].dim()], *VALUES[key].shape)
         for dim, size in enumerate(shape):  # repeated where more are asked for
             known = known.index_select(dim, torch.arange(size) % known.shape[dim])
         return (

@@ -17,9 +17,9 @@ SIZES = [
 ]
 
 
-def pictures(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Two that differ, and are equal in a few rows, where |a - b| has no slope."""
-    g = torch.Generator().manual_seed(height)
+    g = torch.Generator().manual_seed(height + seed)
     a = torch.rand(height, width, 3, generator=g)
     b = (a + 0.2 * torch.randn(a.shape, generator=g)).clamp(0, 1)
     b[1:3] = a[1:3]
@@ -47,6 +47,22 @@ def test_value_and_gradient(height: int, width: int, ssim_weight: float, place: 
     atol = 2e-5 * exact.grad.abs().max().item()
     torch.testing.assert_close(gradient.cpu().double(), exact.grad, rtol=1e-3, atol=atol)
     assert l1_ssim(place.move(a), place.move(b), ssim_weight).item() == value.item()  # without a gradient: the same
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (12, 21), (17, 33)])
+def test_several_images_have_the_bits_of_each(height: int, width: int, place: Place) -> None:
+    """Catches an image that is compared with another's target, a gradient of another's loss, and sums over all."""
+    images, targets = (torch.stack(x) for x in zip(*(pictures(height, width, seed) for seed in range(4)), strict=True))
+    in_bytes = (255 * targets).round().to(torch.uint8)
+    weights = torch.arange(1.0, 5)
+    for each in (place.move(targets), in_bytes.to(place.device)):
+        results = []
+        for parts in (slice(None),), [slice(i, i + 1) for i in range(4)], range(4):
+            leaf = place.move(images).requires_grad_()
+            losses = torch.cat([l1_ssim(leaf[i], each[i], 0.2).view(-1) for i in parts])
+            (losses * weights.to(losses)).sum().backward()
+            results.append([losses.detach(), leaf.grad])
+        assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")

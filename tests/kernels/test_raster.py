@@ -130,6 +130,31 @@ def test_many_tiles_and_rounds(place: Place) -> None:
             assert_gradients_close(differentiate(single, place.device, error < 1e-4)[1], expected)
 
 
+@pytest.mark.parametrize("is_reversed", [False, True])
+@pytest.mark.parametrize("name", [name for name in CASES if "their_own" in name])
+def test_cameras_of_their_own_gaussians_have_the_bits_of_single_calls(
+    name: str, is_reversed: bool, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a camera that reads another's Gaussians or adds to their gradients, and a barrier that is missing."""
+    if is_reversed:
+        monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")  # the kernels of a CPU do not read it
+    arguments = with_background(name, device=place.device)
+    sliced = [key for key, x in arguments.items() if isinstance(x, Tensor) and key != "background"]
+
+    def drawn(at: slice) -> list[Tensor]:
+        inputs = {key: arguments[key][at].clone().requires_grad_(key != "Ks") for key in sliced}
+        output = rasterize(**arguments | inputs, backend=place.device)
+        gradients = torch.autograd.grad(
+            (output.image.square() + output.alpha).sum(), [inputs[key] for key in DIFFERENTIABLE if key in inputs]
+        )
+        return [output.image, output.alpha, output.info.half_sizes, output.info.depths, *gradients]
+
+    for kernel in backward_kernels(place):
+        with kernel:
+            single = zip(*(drawn(slice(c, c + 1)) for c in range(3)), strict=True)
+            assert all(map(torch.equal, drawn(slice(None)), map(torch.cat, single)))
+
+
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack", "beta_of_three_cameras"])
 def test_same_bits_for_any_number_of_threads(name: str) -> None:

@@ -14,7 +14,8 @@ from torch import Tensor
 PRODUCTS = 1 << 21  # (Gaussian, pixel) pairs in one chunk, to limit memory
 Arguments = dict[str, Any]  # of `gsbench.raster.rasterize`
 RIM = 1e-3  # a pixel with |1 - r^2| below this is at the rim of a Beta profile
-DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "beta_exponents")
+# What may be of one camera each, and its dimensions where it is of all.
+DIFFERENTIABLE = {"means": 2, "factors": 3, "opacities": 1, "colors": 2, "beta_exponents": 1}
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,23 @@ def render(
 
     `offsets2d` [C, N, 2] is added to the projected means, in pixels.
     """
-    C, N, D = len(viewmats), len(means), colors.shape[-1]
+    C, N, D = len(viewmats), means.shape[-2], colors.shape[-1]
+    gaussians = {"means": means, "factors": factors, "opacities": opacities, "colors": colors}
+    if (exponents := options.pop("beta_exponents", None)) is not None:
+        gaussians["beta_exponents"] = exponents
     background = torch.zeros(D).double() if background is None else background
     image, alpha = means.new_zeros(C, height * width, D), means.new_zeros(C, height * width, 1)
     touched, slack = torch.zeros(C, N, height * width, dtype=torch.bool), means.new_zeros(C, height * width)
     for c in range(C):
         moved = None if offsets2d is None else offsets2d[c]
         splats = _project(
-            means, factors, opacities, _colors_of(colors, c), viewmats[c], Ks[c], width, height, moved, **options
+            **_of_camera(gaussians, c),
+            viewmat=viewmats[c],
+            K=Ks[c],
+            width=width,
+            height=height,
+            offsets=moved,
+            **options,
         )
         for at, pixels in _pixels(width, height, N):
             image[c, at], alpha[c, at], some, slack[c, at] = _blend(splats, pixels, background)
@@ -84,19 +94,8 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
     background = rest.pop("background", None)
     background = weight.new_zeros(weight.shape[-1]) if background is None else background
     for c in range(len(viewmats)):
-        for at, pixels in _pixels(width, height, len(inputs["means"])):
-            splats = _project(
-                inputs["means"],
-                inputs["factors"],
-                inputs["opacities"],
-                _colors_of(inputs["colors"], c),
-                viewmats[c],
-                Ks[c],
-                width,
-                height,
-                beta_exponents=inputs.get("beta_exponents"),
-                **rest,
-            )
+        for at, pixels in _pixels(width, height, inputs["means"].shape[-2]):
+            splats = _project(**_of_camera(inputs, c), viewmat=viewmats[c], K=Ks[c], width=width, height=height, **rest)
             image, alpha, _, _ = _blend(splats, pixels, background)
             loss = (image * weight[c].flatten(0, 1)[at]).sum() + (alpha * weight_alpha[c].flatten(0, 1)[at]).sum()
             if loss.requires_grad:
@@ -104,8 +103,8 @@ def differentiate(arguments: Arguments, weight: Tensor, weight_alpha: Tensor) ->
     return {name: torch.zeros_like(x) if x.grad is None else x.grad for name, x in inputs.items()}
 
 
-def _colors_of(colors: Tensor, camera: int) -> Tensor:  # [N, D] or [C, N, D] -> [N, D]
-    return colors if colors.dim() == 2 else colors[camera]
+def _of_camera(gaussians: Arguments, camera: int) -> Arguments:
+    return {name: x if x.dim() == DIFFERENTIABLE[name] else x[camera] for name, x in gaussians.items()}
 
 
 def _pixels(width: int, height: int, N: int) -> Iterator[tuple[Tensor, Tensor]]:

@@ -108,6 +108,12 @@ def _three_cameras(g: torch.Generator) -> Arguments:
     }
 
 
+def _of_their_own(g: torch.Generator) -> Arguments:
+    """Three cameras each of which sees other Gaussians."""
+    sets = [gaussians(g, 30) for _ in range(3)]
+    return _three_cameras(g) | {key: torch.stack([x[key] for x in sets]) for key in sets[0]}
+
+
 def _five_channels(g: torch.Generator) -> Arguments:
     """Colours need not be in [0, 1]."""
     scene = gaussians(g, 20, D=5) | camera(16, 12)
@@ -166,6 +172,7 @@ CASES: dict[str, Callable[[torch.Generator], Arguments]] = {
     ),
     "three_cameras": _three_cameras,
     "three_cameras_of_shared_colors": lambda g: _three_cameras(g) | {"colors": _rand(g, 30, 3)},
+    "three_cameras_of_their_own_gaussians": _of_their_own,
     "oblong_pixels": lambda g: gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(25.0, 50.0, 12, 8)[None]},
     "principal_point_off_center": lambda g: (
         gaussians(g, 40) | camera(24, 16) | {"Ks": intrinsics(30.0, 30.0, 5.3, 12.8)[None]}
@@ -192,6 +199,9 @@ CASES: dict[str, Callable[[torch.Generator], Arguments]] = {
         g, _with_exponents(gaussians(g, 60, size=0.4) | camera(24, 16), 0.2 + 4 * _rand(g, 60))
     ),
     "beta_of_three_cameras": lambda g: _with_exponents(_three_cameras(g), 0.2 + 4 * _rand(g, 30)),
+    "beta_of_three_cameras_of_their_own_gaussians": lambda g: _with_exponents(
+        _of_their_own(g), 0.2 + 4 * _rand(g, 3, 30)
+    ),
     "beta_of_five_channels": lambda g: _with_exponents(_five_channels(g), 0.2 + 4 * _rand(g, 20)),
     # Opacity 1: alpha stops at 0.999 near the means, and there is no gradient there.
     "beta_saturated": lambda g: (

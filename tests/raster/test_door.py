@@ -65,7 +65,7 @@ def test_shapes_types_and_values_of_tensors(name: str) -> None:
     shape, value = TENSORS[name], scene()[name]
     # Colours may have any number of channels (background then does not fit), one set a camera.
     for wrong in ((), (0,), (7,), (*shape, 1), (1, *shape), (*shape[:-1], 2)):
-        if name != "colors" or wrong not in {(1, 40, 3), (40, 2)}:
+        if (name, wrong) not in {("colors", (1, 40, 3)), ("colors", (40, 2)), ("means", (1, 40, 3))}:
             refused({name: doubles(*wrong)}, name)
     refused({name: [[0.0]]}, f"{name}: expected a tensor, got list")
     refused({name: value.int()}, name if name != "means" else "expected float32 or float64")
@@ -131,6 +131,8 @@ def test_kinds_of_tensors(backend: str) -> None:
         ({"Ks": intrinsics([5, 0.1, 8], [0, 5, 6], [0, 0, 1])}, "skew is not drawn"),
         ({"Ks": intrinsics([5, 0, 8], [0, 5, 6], [0, 0, 2])}, "Ks: expected [fx 0 cx; 0 fy cy; 0 0 1]"),
         ({"opacities": doubles(39)}, "opacities: expected shape [40], got [39]"),
+        ({"means": doubles(1, 40, 3)}, "factors: expected shape [1, 40, 3, 3], got [40, 3, 3]"),
+        ({"means": doubles(2, 40, 3)}, "means: expected shape [1, 40, 3], got [2, 40, 3]"),
         ({"colors": doubles(2, 40, 3)}, "colors: expected shape [1, 40, 3], got [2, 40, 3]"),
         ({"colors": doubles(40, 2)}, "background: expected shape [2], got [3]"),
         ({"Ks": torch.eye(3).double().repeat(2, 1, 1)}, "Ks: expected shape [1, 3, 3], got [2, 3, 3]"),

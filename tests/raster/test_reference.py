@@ -33,7 +33,7 @@ def test_picture_is_the_brute_force_one(name: str) -> None:
     output, picture = draw(arguments), brute_force(arguments)
     np.testing.assert_allclose(output.image.numpy(), picture.image, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(output.alpha.numpy(), picture.alpha, rtol=1e-9, atol=1e-9)
-    info, C, N = output.info, len(arguments["viewmats"]), len(arguments["means"])
+    info, C, N = output.info, len(arguments["viewmats"]), arguments["means"].shape[-2]
     assert info.radii.shape == (C, N)
     assert info.radii.dtype == torch.int32
     assert info.means2d.shape == (C, N, 2)
@@ -74,7 +74,7 @@ def test_picture_in_single_precision(name: str) -> None:
     (output.image.square().sum() + output.alpha.sum()).backward()
     for tensor in (*(arguments[k] for k in DIFFERENTIABLE if k in arguments), output.info.means2d):
         assert tensor.grad.isfinite().all()
-    hidden = output.info.radii.amax(0) == 0
+    hidden = (output.info.radii if arguments["means"].dim() == 3 else output.info.radii.amax(0)) == 0
     assert not arguments["means"].grad[hidden].any()
 
 

@@ -77,7 +77,7 @@ def test_scores_are_the_sums_by_hand() -> None:
         c = sum(w for w, error in zip(weights, errors, strict=True) if (error - least) / (most - least) > 0.1)
         assert 0.1 * weights.sum() < c.sum() < 0.9 * weights.sum()
         counts += c / 3
-        weighed += photometric(image[None], view.image[None], 0.2) * c
+        weighed += photometric(image, view.image, 0.2) * c
     torch.testing.assert_close(importance, counts, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(badness, (weighed - weighed.min()) / (weighed.max() - weighed.min()), rtol=0, atol=1e-4)
     assert 0.05 < badness.sort().values[-2] < 0.95

@@ -185,7 +185,10 @@ void reduce_splat(const BlendArgs& a, const BlendGrads& out, int64_t camera, int
     for (int k = 0; k < 4; ++k) out.roots[at * 4 + k] = g[2 + k];
     float* g_color = out.colors + (a.color_per_camera ? at : i) * a.D;
     for (int k = 0; k < a.D; ++k) g_color[k] = color[k] + (a.color_per_camera || camera == 0 ? 0.0f : g_color[k]);
-    if constexpr (Profile::HAS_SHAPE) out.shapes[i] = g[6] + (camera == 0 ? 0.0f : out.shapes[i]);
+    if constexpr (Profile::HAS_SHAPE) {
+        float* shape = out.shapes + (a.shape_per_camera ? at : i);
+        *shape = g[6] + (a.shape_per_camera || camera == 0 ? 0.0f : *shape);
+    }
 }
 
 template <class Profile>

@@ -10,6 +10,9 @@ namespace {
 
 constexpr int64_t CHUNK = 512;  // Gaussians a task; camera gradients are summed by chunks, whatever the thread count
 
+// Returns the index of a camera's first Gaussian.
+int64_t first_of(const ProjectArgs& a, int64_t camera) { return a.gaussian_per_camera ? camera * a.N : 0; }
+
 Projection<Vec> load(const ProjectArgs& a, const Camera& camera, int64_t i, int n) {
     Vec mean[3], f[3][3];
     gather_row(a.means, i, n, mean);
@@ -66,15 +69,16 @@ template <class Profile>
 void project_as(const ProjectArgs& a, const Splats& out) {
     for (int64_t c = 0; c < a.C; ++c) {
         const Camera camera = camera_of<float>(a, c);
+        const int64_t first = first_of(a, c);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
         for (int64_t i = 0; i < a.N; i += LANES) {
             const int n = lanes_from(i, a.N);
-            if (!any(load_first(a.opacities + i, n) >= Vec(ALPHA_MIN))) {  // nothing that is drawn, whatever the rest
+            if (!any(load_first(a.opacities + first + i, n) >= Vec(ALPHA_MIN))) {  // nothing that is drawn, whatever the rest
                 store_nothing(out, c * a.N + i, n);
                 continue;
             }
-            Projection<Vec> projection = load(a, camera, i, n);
-            store_splat(splat_of<Profile>(projection, a, i, n), out, c * a.N + i, n);
+            Projection<Vec> projection = load(a, camera, first + i, n);
+            store_splat(splat_of<Profile>(projection, a, first + i, n), out, c * a.N + i, n);
         }
     }
 }
@@ -88,19 +92,21 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
         const int64_t begin = chunk * CHUNK, end = begin + CHUNK < a.N ? begin + CHUNK : a.N;
         for (int64_t c = 0; c < a.C; ++c) {
             const Camera camera = camera_of<float>(a, c);
+            const bool adds = c > 0 && !a.gaussian_per_camera;  // to the gradients by the cameras before
             Vec3<Vec> g_view[4] = {};
             for (auto& row : g_view) row = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
             for (int64_t i = begin; i < end; i += LANES) {
                 const int n = lanes_from(i, end);
+                const int64_t at = first_of(a, c) + i;
                 if (is_zero(grads, c * a.N + i, n)) {
-                    if (c > 0) continue;
-                    fill_zero(out.means, 3, i, i + n);
-                    fill_zero(out.factors, 9, i, i + n);
-                    fill_zero(out.opacities, 1, i, i + n);
+                    if (adds) continue;
+                    fill_zero(out.means, 3, at, at + n);
+                    fill_zero(out.factors, 9, at, at + n);
+                    fill_zero(out.opacities, 1, at, at + n);
                     continue;
                 }
-                Projection<Vec> projection = load(a, camera, i, n);
-                const Splat<Vec> splat = splat_of<Profile>(projection, a, i, n);
+                Projection<Vec> projection = load(a, camera, at, n);
+                const Splat<Vec> splat = splat_of<Profile>(projection, a, at, n);
                 const Mask drawn = splat.half_x > Vec(0.0f);
                 const Splat<Vec> g = load_splat(grads, c * a.N + i, n);
                 const GaussianGrad<Vec> grad = projection.vjp(splat, g);
@@ -113,14 +119,14 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
                     factor[k * 3 + 1] = row.y;
                     factor[k * 3 + 2] = row.z;
                 }
-                if (c > 0) {
-                    add_row(mean, out.means, i, n);
-                    add_row(factor, out.factors, i, n);
-                    add_first(opacity, out.opacities + i, n);
+                if (adds) {
+                    add_row(mean, out.means, at, n);
+                    add_row(factor, out.factors, at, n);
+                    add_first(opacity, out.opacities + at, n);
                 } else {
-                    scatter_row(mean, out.means, i, n);
-                    scatter_row(factor, out.factors, i, n);
-                    store_first(opacity, out.opacities + i, n);
+                    scatter_row(mean, out.means, at, n);
+                    scatter_row(factor, out.factors, at, n);
+                    store_first(opacity, out.opacities + at, n);
                 }
                 if (out.viewmats) {
                     for (int k = 0; k < 3; ++k) g_view[k] += masked(drawn, grad.rotation[k]);

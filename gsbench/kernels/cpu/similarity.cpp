@@ -1,4 +1,5 @@
-// The training loss (1 - w) L1 + w (1 - SSIM) and its gradient, in one pass over the rows of two images.
+// The training loss (1 - w) L1 + w (1 - SSIM) and its gradient, in one pass over the rows of two images. Several pairs
+// of images are compared one after the other.
 //
 // A row of pixels is filtered along x when it is read, and along y, four rows at a time, when the rows around them have
 // been read. The derivatives of SSIM pass through the same filter once more for the gradient. Only the last few rows
@@ -224,10 +225,8 @@ struct Strip {
     }
 };
 
-}  // namespace
-
-void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out) {
-    const Window window;
+// Compares one image with its target.
+void compare(const SimilarityArgs& a, const SimilarityLoss& out, const Window& window) {
     Buffer<float> row_sums(static_cast<size_t>(a.height) * 2);
     row_sums.zero();
     const int blocks = (a.width + COLUMNS - 1) / COLUMNS;
@@ -250,6 +249,18 @@ void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out) {
     const double pixels = static_cast<double>(a.height) * a.width * CHANNELS;
     const double weight = a.ssim_weight;
     *out.loss = static_cast<float>((1.0 - weight) * difference / pixels + weight * (1.0 - similarity / pixels));
+}
+
+}  // namespace
+
+void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out) {
+    const Window window;
+    for (int c = 0; c < a.C; ++c) {
+        SimilarityArgs image = a;
+        SimilarityLoss loss{out.loss + c, out.gradient, nullptr};
+        begin_at_image(c, image, loss);
+        compare(image, loss, window);
+    }
 }
 
 }  // namespace GSB_ISA

@@ -59,7 +59,7 @@ RecordOf<Profile> make_record(const BlendArgs& a, int64_t camera, int64_t i, con
         const float* color = a.colors + (a.color_per_camera ? at : i) * 3;
         for (int k = 0; k < 3; ++k) s.color[k] = color[k];
     }
-    if constexpr (Profile::HAS_SHAPE) s.shape = a.shapes[i];
+    if constexpr (Profile::HAS_SHAPE) s.shape = a.shapes[a.shape_per_camera ? at : i];
     return s;
 }
 

@@ -23,12 +23,15 @@ __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
             const float4 root = reinterpret_cast<const float4*>(a.roots)[s];
             StagedSplat splat{};
             splat.p = root.x, splat.q = root.y, splat.r = root.z, splat.opacity = root.w;
-            if constexpr (Profile::HAS_SHAPE) splat.shape = a.shapes[i];
+            if constexpr (Profile::HAS_SHAPE) splat.shape = a.shapes[a.shape_per_camera ? s : i];
             splat_gradient(m, splat, g);
         }
         reinterpret_cast<float2*>(out.means2d)[s] = {g[0], g[1]};
         reinterpret_cast<float4*>(out.roots)[s] = {g[2], g[3], g[4], g[5]};
-        if constexpr (Profile::HAS_SHAPE) out.shapes[i] = g[6] + (c == 0 ? 0.0f : out.shapes[i]);
+        if constexpr (Profile::HAS_SHAPE) {
+            float* shape = out.shapes + (a.shape_per_camera ? s : i);
+            *shape = g[6] + (a.shape_per_camera || c == 0 ? 0.0f : *shape);
+        }
         float* color = out.colors + (a.color_per_camera ? s : i) * a.D;
         for (int k = 0; k < a.D; ++k) {
             color[k] = sums[GEOMETRY + k] + (a.color_per_camera || c == 0 ? 0.0f : color[k]);

@@ -62,7 +62,7 @@ struct Patch {
         const float4 root = reinterpret_cast<const float4*>(args.roots)[s.id];
         s.x = mean.x, s.y = mean.y;
         s.p = root.x, s.q = root.y, s.r = root.z, s.opacity = root.w;
-        if constexpr (Profile::HAS_SHAPE) s.shape = args.shapes[s.id - camera * args.N];
+        if constexpr (Profile::HAS_SHAPE) s.shape = args.shapes[args.shape_per_camera ? s.id : s.id - camera * args.N];
         return s;
     }
 

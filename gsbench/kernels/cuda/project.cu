@@ -21,6 +21,9 @@ __device__ Vec3<float> vec3(const float* p) { return {p[0], p[1], p[2]}; }
 
 __device__ void store(const Vec3<float>& v, float* p) { p[0] = v.x, p[1] = v.y, p[2] = v.z; }
 
+// Returns the index of a camera's first Gaussian.
+__device__ int64_t first_of(const ProjectArgs& a, int64_t camera) { return a.gaussian_per_camera ? camera * a.N : 0; }
+
 __device__ Projection<float> projection_of(const ProjectArgs& a, const Camera& camera, int64_t i) {
     const float* F = a.factors + i * 9;
     const Vec3<float> factor[3] = {vec3(F), vec3(F + 3), vec3(F + 6)};
@@ -40,9 +43,9 @@ __global__ void project_kernel(ProjectArgs a, Splats out) {
     if (i >= a.N) return;
     for (int64_t c = blockIdx.y; c < a.C; c += gridDim.y) {
         const Camera camera = camera_of(a, c);
-        Projection<float> projection = projection_of(a, camera, i);
-        const Splat<float> s = splat_of<Profile>(projection, a, i);
-        const int64_t at = c * a.N + i;
+        const int64_t gaussian = first_of(a, c) + i, at = c * a.N + i;
+        Projection<float> projection = projection_of(a, camera, gaussian);
+        const Splat<float> s = splat_of<Profile>(projection, a, gaussian);
         reinterpret_cast<float2*>(out.means2d)[at] = {s.x, s.y};
         reinterpret_cast<float4*>(out.roots)[at] = {s.p, s.q, s.r, s.opacity};
         reinterpret_cast<float2*>(out.half_sizes)[at] = {s.half_x, s.half_y};
@@ -72,6 +75,13 @@ __device__ void add_camera_grad(const GaussianGrad<float>& grad, float* viewmat)
     }
 }
 
+// Writes the gradient of the i-th Gaussian.
+__device__ void store_grad(const GaussianGrad<float>& grad, const ProjectGrads& out, int64_t i) {
+    store(grad.mean, out.means + i * 3);
+    for (int row = 0; row < 3; ++row) store(grad.factor[row], out.factors + i * 9 + row * 3);
+    out.opacities[i] = grad.opacity;
+}
+
 template <class Profile>
 __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, ProjectGrads out) {
     const int64_t i = global_thread();
@@ -81,19 +91,18 @@ __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, Project
         GaussianGrad<float> grad{};
         if (exists) {
             const Camera camera = camera_of(a, c);
-            Projection<float> projection = projection_of(a, camera, i);
-            const Splat<float> splat = splat_of<Profile>(projection, a, i);
+            const int64_t gaussian = first_of(a, c) + i;
+            Projection<float> projection = projection_of(a, camera, gaussian);
+            const Splat<float> splat = splat_of<Profile>(projection, a, gaussian);
             if (splat.half_x > 0.0f) grad = projection.vjp(splat, splat_grad(grads, c * a.N + i));
+            if (a.gaussian_per_camera) store_grad(grad, out, gaussian);
         }
         sum.mean += grad.mean;
         for (int row = 0; row < 3; ++row) sum.factor[row] += grad.factor[row];
         sum.opacity += grad.opacity;
         if (out.viewmats) add_camera_grad(grad, out.viewmats + c * 16);
     }
-    if (!exists) return;
-    store(sum.mean, out.means + i * 3);
-    for (int row = 0; row < 3; ++row) store(sum.factor[row], out.factors + i * 9 + row * 3);
-    out.opacities[i] = sum.opacity;
+    if (exists && !a.gaussian_per_camera) store_grad(sum, out, i);
 }
 
 }  // namespace

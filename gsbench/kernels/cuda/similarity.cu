@@ -32,7 +32,7 @@ struct Place {
     __device__ Place()
         : left(static_cast<int>(blockIdx.x) * SIDE), top(static_cast<int>(blockIdx.y) * SIDE),
           x(left + static_cast<int>(threadIdx.x)), y(top + static_cast<int>(threadIdx.y)),
-          channel(static_cast<int>(blockIdx.z)), thread(static_cast<int>(threadIdx.y * SIDE + threadIdx.x)) {}
+          channel(static_cast<int>(blockIdx.z) % COLORS), thread(static_cast<int>(threadIdx.y * SIDE + threadIdx.x)) {}
 };
 
 __device__ float target_at(const SimilarityArgs& a, int64_t at) {
@@ -66,6 +66,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) compare_kernel(SimilarityArgs a, 
     __shared__ float image[BORDERED][BORDERED], target[BORDERED][BORDERED];
     __shared__ float along_x[MOMENTS][BORDERED][SIDE];
     const Place place;
+    begin_at_image(blockIdx.z / COLORS, a, out);
     each_bordered(a, place, [&](int row, int column, int x, int y, bool inside) {
         const int64_t at = (static_cast<int64_t>(y) * a.width + x) * COLORS + place.channel;
         image[row][column] = inside ? a.image[at] : 0.0f;
@@ -113,6 +114,7 @@ __global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a,
     constexpr int DERIVATIVES = 3;
     __shared__ float planes[DERIVATIVES][BORDERED][BORDERED], along_x[DERIVATIVES][BORDERED][SIDE];
     const Place place;
+    begin_at_image(blockIdx.z / COLORS, a, out);
     const int64_t pixels = static_cast<int64_t>(a.height) * a.width;
     each_bordered(a, place, [&](int row, int column, int x, int y, bool inside) {
         const int64_t at = place.channel * pixels + static_cast<int64_t>(y) * a.width + x;
@@ -142,21 +144,21 @@ __global__ void __launch_bounds__(SIDE * SIDE) gradient_kernel(SimilarityArgs a,
     out.gradient[at] = scale * ((1.0f - a.ssim_weight) * sign - a.ssim_weight * (g[0] + 2.0f * x * g[1] + y * g[2]));
 }
 
-dim3 tiles(int height, int width) {
+dim3 tiles(int images, int height, int width) {
     const auto along = [](int pixels) { return static_cast<unsigned>((pixels + SIDE - 1) / SIDE); };
-    return {along(width), along(height), COLORS};
+    return {along(width), along(height), static_cast<unsigned>(COLORS * images)};
 }
 
 }  // namespace
 
 int similarity_parts(int height, int width) {
-    const dim3 grid = tiles(height, width);
+    const dim3 grid = tiles(1, height, width);
     return static_cast<int>(grid.x * grid.y * grid.z);
 }
 
 void l1_ssim(const SimilarityArgs& a, const SimilarityLoss& out, Stream stream) {
     const Window window = gaussian_window();
-    const dim3 grid = tiles(a.height, a.width), block(SIDE, SIDE);
+    const dim3 grid = tiles(a.C, a.height, a.width), block(SIDE, SIDE);
     launch(compare_kernel, grid, block, stream, a, out, window);
     if (out.gradient) launch(gradient_kernel, grid, block, stream, a, out, window);
 }

@@ -1,8 +1,7 @@
 // SSIM of two images at one pixel (Wang et al. 2004, eq. 13) from filtered moments, and its derivatives.
 #pragma once
 
-#include <cstdint>
-
+#include "../arguments.h"
 #include "scalar.h"
 
 namespace gsb {
@@ -46,6 +45,16 @@ struct Similarity {
         g_mean = (mean_b * (structure - luminance) - value * mean_a * (B2 - B1)) * inverse * 2.0f;
     }
 };
+
+// Moves arguments for several images from the first image to the c-th one, except the sums of the loss.
+GSB_HD inline void begin_at_image(int64_t c, SimilarityArgs& a, SimilarityLoss& out) {
+    const int64_t first = c * a.height * a.width * 3;
+    a.image += first;
+    if (a.target) a.target += first;
+    if (a.target_bytes) a.target_bytes += first;
+    if (out.gradient) out.gradient += first;
+    if (out.scratch) out.scratch += 3 * first;
+}
 
 }  // namespace GSB_ISA
 }  // namespace gsb

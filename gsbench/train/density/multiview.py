@@ -98,7 +98,7 @@ class ErrorScore:
         rendered = WeighedImage(self.model, view, self.renderer.background, self.renderer.antialias)
         image, target = rendered.image, view.image
         weights = rendered.weights(flagged(image, target).to(image.dtype))
-        return weights, photometric(image[None], target[None], self.ssim_weight, self.model.backend)
+        return weights, photometric(image, target, self.ssim_weight, self.model.backend)
 
 
 def flagged(image: Tensor, target: Tensor) -> Tensor:
