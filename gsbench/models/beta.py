@@ -18,7 +18,7 @@ from gsbench.kernels.tensors import check_positive
 from gsbench.models.base import SHRINK, GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime, initial_times, unit
 from gsbench.models.gaussian_batch import Conditioned, reach
-from gsbench.models.portable_math import exp, log, log1p, sqrt
+from gsbench.models.portable_math import exp, expm1, log, log1p, sqrt
 from gsbench.models.registry import register
 from gsbench.models.slicing import Reduced, cholesky3, gain_of, reduce, triangularise, whiten
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -112,7 +112,7 @@ def opacity_factor(
     With x = y^2, ln(1 - tanh(x)) = -ln(1 + (e^2x - 1) / 2) loses no digits of a small x, which a large b multiplies.
     """
     doubled = (2 * white.square()).clamp(max=FADED)
-    logs = (-log1p(torch.expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
+    logs = (-log1p(expm1(doubled) / 2)).clamp(min=BETA_LOG_MIN)
     return exp((exponents(betas[:, 1:]) * logs).sum(-1))
 
 
@@ -123,7 +123,7 @@ def positive(x: Tensor) -> Tensor:
 
 def softplus_inverse(y: Tensor) -> Tensor:
     """Return x with softplus(x) = y, for y > 0."""
-    return y + log(-torch.expm1(-y))
+    return y + log(-expm1(-y))
 
 
 def skew_factor(scales: Tensor, skew: Tensor) -> Tensor:

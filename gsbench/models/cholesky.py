@@ -17,7 +17,7 @@ from gsbench.models.effect_sets import EffectSets
 from gsbench.models.factors import KINDS, OFF_DIAGONALS, CholeskyLayout, rotation, sizes
 from gsbench.models.gated import OPACITY_MARGIN, JointModel
 from gsbench.models.gaussian_batch import Conditioned
-from gsbench.models.portable_math import exp, log
+from gsbench.models.portable_math import exp, log, logit
 from gsbench.models.registry import register
 from gsbench.models.slicing import Reduced, check_scheme, gain_of, reduce, slice_gaussians, whiten
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -88,7 +88,7 @@ class CholeskyModel(JointModel):
             raw["directions"] = F.normalize(torch.randn(N, 3, generator=generator), dim=-1)
         if "time" in self.observes:
             times = initial_times(points, generator)
-            raw["times"] = times_inside(times).logit() if self.bounded_times else times
+            raw["times"] = logit(times_inside(times)) if self.bounded_times else times
         return raw
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
@@ -299,7 +299,7 @@ class CholeskyModel(JointModel):
             return raw["times"] + shift, shift
         times = self.mean_times(raw)
         inside = torch.where(shift == 0, times, times_inside(times + shift))
-        return torch.where(shift == 0, raw["times"], inside.logit()), inside - times
+        return torch.where(shift == 0, raw["times"], logit(inside)), inside - times
 
     def exponents(self, T_qq: Tensor, delta: Tensor, white: Tensor) -> dict[str, Tensor]:
         """Compute -ln of the factor by which each variable dims a Gaussian, and of both (`static`), [N] each.

@@ -20,7 +20,7 @@ from gsbench.models.camera_time import CameraTime
 from gsbench.models.factors import sizes
 from gsbench.models.gaussian_batch import Conditioned, Geometry
 from gsbench.models.moving import MovingGaussians3D
-from gsbench.models.portable_math import acos, exp, log, sin
+from gsbench.models.portable_math import acos, exp, log, sin, sqrt
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
@@ -178,7 +178,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
     def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
         fade = (sizes(self.splats["fades"].detach().amax(1)) + LEAST_FADE) / self.intervals
         inside = lifetimes - fade * 0.5**0.5
-        return torch.where(fading > 0, inside + fade * fading.sqrt(), 0.0)
+        return torch.where(fading > 0, inside + fade * sqrt(fading), 0.0)
 
 
 def is_dynamic(raw: Raw) -> Tensor:

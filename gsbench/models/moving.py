@@ -25,7 +25,7 @@ from gsbench.models.factors import sizes
 from gsbench.models.gated import OPACITY_MARGIN
 from gsbench.models.gaussian_batch import Conditioned, Geometry, reach
 from gsbench.models.gaussians3d import Gaussians3DModel
-from gsbench.models.portable_math import exp, log
+from gsbench.models.portable_math import exp, log, logit
 from gsbench.models.registry import register
 from gsbench.scenes.scene import Points
 
@@ -137,7 +137,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         times = times_inside(initial_times(points, generator))
         view, time = math.log(self.view_precision), math.log(TIME_PRECISION)
         return super().initial_geometry(points, distances, generator) | {
-            "times": times.logit(),
+            "times": logit(times),
             "directions": F.normalize(torch.randn(N, 3, generator=generator), dim=-1),
             "precision": torch.tensor([view, 0.0, view, 0.0, 0.0, view, time]).repeat(N, 1),
             "coupling": COUPLING_SPREAD * torch.randn(N, 12, generator=generator),
@@ -173,7 +173,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         super().shrink_rows(rows, factors)
         shares = torch.sigmoid(self.splats["shares"].data[rows])
         larger = (shares / factors[:, None].to(shares.dtype)).clamp(max=LARGEST_SHARE)
-        self.splats["shares"].data[rows] = larger.logit()
+        self.splats["shares"].data[rows] = logit(larger)
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         L_tt = sizes(self.splats["precision"].detach()[:, 6])

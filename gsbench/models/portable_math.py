@@ -1,4 +1,4 @@
-"""Compute exp, log, sqrt, sigmoid, sin, cos, acos and layers of networks with the same bits on every processor.
+"""Compute exp, log, sqrt, sigmoid and other functions, and layers of networks, with the same bits on every processor.
 
 On the CPU, torch leaves these functions to MKL, whose float32 results have another last bit on processors of another
 vendor. In float64 they differ too, but only behind the digits that float32 keeps. MKL's products of matrices also
@@ -24,8 +24,12 @@ def _in_float64(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tens
     return portable
 
 
-exp, log, log1p, sqrt, sigmoid, sin, cos, acos = map(
-    _in_float64, (torch.exp, torch.log, torch.log1p, torch.sqrt, torch.sigmoid, torch.sin, torch.cos, torch.acos)
+exp, expm1, log, log1p, sqrt, sigmoid, logit, sin, cos, acos = map(
+    _in_float64,
+    (
+        *(torch.exp, torch.expm1, torch.log, torch.log1p, torch.sqrt, torch.sigmoid, torch.logit),
+        *(torch.sin, torch.cos, torch.acos),
+    ),
 )
 
 

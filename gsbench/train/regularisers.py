@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.portable_math import sqrt
 from gsbench.scenes import View
 from gsbench.train.batches import generator
 from gsbench.train.checkpoint import MOST_STEPS, tensor, whole_number
@@ -122,7 +123,7 @@ class Strain(Penalty):
         velocities = (means_later - means) / (later.time - query.time)
         # A Gaussian that is culled has no conditional mean, so its pairs do not count.
         visible = torch.where(visible_later > 0, visible, 0.0)
-        weights = (visible[sample] * visible[pairs]).sqrt()
+        weights = sqrt(visible[sample] * visible[pairs])
         least = (LEAST_DISTANCE * self.model.extent) ** 2
         distances = _differences(means.detach(), sample, pairs).square().sum(0) + least
         strains = weights / distances * _differences(velocities, sample, pairs).square().sum(0)  # [k, B]
