@@ -145,10 +145,12 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
     share = share_of_points_seen(points, cameras)
     where = f"{data.initial_points} initial points in a cube of half width {data.initial_half_width:g}"
     if share < LEAST_SEEN:
+        away = sum(bool(camera.viewmat[2, 3] < 0) for camera in cameras)  # the depth of the origin
+        axes = "; {} of {} cameras look away from it: are their axes right (in transforms*.json x right, y up, z back)?"
         raise InputError(
             f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
             f"{share:.1%}: set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
-            f"at), or null for points that all cameras see"
+            f"at), or null for points that all cameras see{axes.format(away, len(cameras)) if away else ''}"
         )
     print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
     return points

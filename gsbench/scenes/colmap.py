@@ -6,7 +6,7 @@ What is missing, damaged or contradictory raises `InputError`, which names the f
 import math
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,7 +142,18 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
         listed_shots.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
     ordered = sorted(listed_shots, key=lambda shot: (shot.time or 0.0, shot.name))
-    return ordered, digests, timed.notes + finder.notes()
+    return ordered, digests, timed.notes + finder.notes() + _unregistered(root, ordered)
+
+
+def _unregistered(root: Path, listed: Sequence[Shot]) -> list[str]:
+    """Return a sentence on images in the folder that the model does not have, if there are any."""
+    known = {shot.path for shot in listed}
+    there = [Path(folder, name) for folder, _, names in os.walk(root / IMAGES) for name in names]
+    others = sorted(path for path in there if files.without_suffix(path.name) != path.name and path not in known)
+    if not others:
+        return []
+    first = others[0].relative_to(root).as_posix()
+    return [f"{len(others)} images are not in the COLMAP model and are left out, such as {first[:80]!a}"]
 
 
 def read_part(folder: Path, part: str) -> ModelFile:

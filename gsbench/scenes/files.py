@@ -4,6 +4,7 @@ import hashlib
 import math
 import os
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import fields
@@ -93,12 +94,12 @@ class ImageFinder:
             return path
         stem = without_suffix(path.name)
         suffix = path.name[len(stem) :]
-        names = self._images(path.parent).get(stem)
+        names = self._images(path.parent).get(unicodedata.normalize("NFC", stem))
         if not names:
             return path if suffix else path.with_name(f"{path.name}{_SUFFIXES[0]}")
         best = min(names, key=lambda other: (other.lower() != path.name.lower(), _order(other), other))
-        if suffix:
-            self._replaced[f"{best[len(stem) :]} for {suffix}"] += 1
+        if suffix and (read := os.path.splitext(best)[1]) != suffix:
+            self._replaced[f"{read} for {suffix}"] += 1
         return path.with_name(best)
 
     def notes(self) -> list[str]:
@@ -108,7 +109,10 @@ class ImageFinder:
         return [f"images of another suffix are read: {', '.join(f'{n} {of}' for of, n in self._replaced.items())}"]
 
     def _images(self, folder: Path) -> dict[str, list[str]]:
-        """Return the names of the images in a folder by their names without suffix; the folder is listed once."""
+        """Return the names of the images in a folder by their names without suffix; the folder is listed once.
+
+        macOS writes an umlaut as two characters (NFD), other systems as one (NFC), which is the key here.
+        """
         if folder not in self._listed:
             by_stem = self._listed.setdefault(folder, {})
             try:
@@ -117,7 +121,7 @@ class ImageFinder:
                 names = []
             for name in names:
                 if (stem := without_suffix(name)) != name:
-                    by_stem.setdefault(stem, []).append(name)
+                    by_stem.setdefault(unicodedata.normalize("NFC", stem), []).append(name)
         return self._listed[folder]
 
 

@@ -8,7 +8,7 @@ import os
 import struct
 import zlib
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -103,7 +103,9 @@ def read_image(path: Path, where: str) -> bytes:
 def photo_size(data: bytes, where: str) -> Size:
     """Return the width and height of a PNG, which is checked as by `png_size`, or of a JPEG, whose header is."""
     if not data.startswith((_JPEG, _SIGNATURE)):
-        raise DamagedError(f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it")
+        raise DamagedError(
+            f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it, or copy it again"
+        )
     if not data.startswith(_JPEG):
         return png_size(data, where)
     with _jpeg(data, where) as image:
@@ -113,11 +115,23 @@ def photo_size(data: bytes, where: str) -> Size:
 
 
 def is_turned(data: bytes) -> bool:  # of an image that was checked
-    """Return whether a JPEG has an EXIF orientation by which other programs turn or mirror it."""
-    if not data.startswith(_JPEG):
-        return False
-    with _jpeg(data, "EXIF") as image:
-        return image.getexif().get(_ORIENTATION, 1) != 1
+    """Return whether an image has an EXIF orientation by which other programs turn or mirror it."""
+    if data.startswith(_JPEG):
+        with _jpeg(data, "EXIF") as image:
+            return image.getexif().get(_ORIENTATION, 1) != 1
+    exif = Image.Exif()
+    with suppress(Exception):  # Pillow raises many types of exceptions for a damaged chunk, of which nothing is read
+        exif.load(next((body for name, body in _chunks(data) if name == b"eXIf"), b""))
+    return exif.get(_ORIENTATION, 1) != 1
+
+
+def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the name and the content of each chunk of a checked PNG."""
+    at = len(_SIGNATURE)
+    while at < len(data):
+        length, name = struct.unpack_from(">I4s", data, at)
+        yield name, data[at + 8 : at + 8 + length]
+        at += 12 + length
 
 
 def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
@@ -314,7 +328,7 @@ def _check_header(header: bytes, where: str, kind: Kind) -> Size:
     width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
     _check_size(width, height, where)
     if depth not in kind.depths.get(color, ()):
-        raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits")
+        raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits: convert it")
     if compression or filtering or interlacing > 1:
         raise DamagedError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
     return width, height

@@ -96,6 +96,7 @@ def load(
     needed = memory_needed(films[0].size, size, last - first + 1)
     require(needed, f"{root}: frames while they are decoded and measured", "use a larger scene.downscale")
     cameras = [_camera(film, rows[film], size, source) for film in films]
+    beside = colmap.points_beside(root)  # before frames are decoded, which takes minutes: its files may be damaged
     digests = {film.path.name: film.digest() for film in films} | {POSES: files.digest(data)}
     paths = _decoded_files(root, films, digests, (first, last), rendition, size)
     by_film = [
@@ -109,7 +110,6 @@ def load(
     )
     notes.append(f"{POSES}: depths are not read; no distortion is stated")
     notes += [f"cameras left out: {', '.join(leave_out)}"] if leave_out else []
-    beside = colmap.points_beside(root)
     if beside:
         digests[beside[1].relative_to(root).as_posix()] = files.digest(beside[1].read_bytes())
     notes.append(f"initial points: those of {beside[1].relative_to(root)}" if beside else "initial points: random")
@@ -231,9 +231,11 @@ def _read_rows(data: bytes, source: Path, films: Sequence[_Film]) -> NDArray[np.
         rows = np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float64)
     except (ValueError, EOFError, TypeError) as error:
         raise InputError(f"{source}: expected an array as numpy.save writes: {one_line(error)[:80]}") from None
-    if rows.shape != (len(films), _ROW) or not np.isfinite(rows).all():
+    if not np.isfinite(rows).all():
+        raise InputError(f"{source}: expected finite numbers, some are not: copy it again")
+    if rows.shape != (len(films), _ROW):
         raise InputError(
-            f"{source}: expected {_ROW} finite numbers for each of {len(films)} films, {films[0].name} to "
+            f"{source}: expected {_ROW} numbers for each of {len(films)} films, {films[0].name} to "
             f"{films[-1].name}, got {list(rows.shape)}: keep all films, and leave cameras out by scene.leave_out"
         )
     return rows

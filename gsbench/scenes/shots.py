@@ -153,7 +153,7 @@ def read(
     if in_8_bits is None:
         in_8_bits = rendition.resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
-    def read_one(shot: Shot) -> tuple[View, str, bool]:
+    def read_one(shot: Shot) -> tuple[View, str, bool, bool]:
         data = images.read_image(shot.path, shot.where)
         decoded = decode(shot, data)
         lens = _lens_of_image((decoded.shape[1], decoded.shape[0]), size, shot)
@@ -170,17 +170,22 @@ def read(
         alpha = None if is_kept else images.alpha_of(decoded, reduced)
         regions = None if shot.mask is None else _read_mask(shot, shot.mask, lens, reduced)
         view = View(shot.name, camera, shot.time, image, rendition.background, alpha, regions)
-        return view, files.digest(data), images.is_turned(data)
+        return view, files.digest(data), images.is_turned(data), decoded.shape[2] == 3
 
     pixel_bytes = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # with alpha and mask
     threads = images.count_readers(size, len(shots), downscale, first.where, pixel_bytes)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
-        views, digests, turned = zip(*pool.map(read_one, shots), strict=True)
+        views, digests, turned, opaque = zip(*pool.map(read_one, shots), strict=True)
     notes = _notes(shots, size, reduced, downscale)
     if any(turned):
         notes.append(
             f"{sum(turned)} of {len(shots)} images have an EXIF orientation, which is not applied: if the "
             f"program that wrote the poses applied it, turn the pixels and remove the tag"
+        )
+    if any(opaque) and not all(opaque):
+        notes.append(
+            f"{sum(opaque)} of {len(shots)} images have no alpha and keep their own background, the others get "
+            f"{rendition.background}"
         )
     return Shots(list(views), list(digests), notes)
 
@@ -224,6 +229,6 @@ def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> 
 
 def _read_mask(shot: Shot, path: Path, lens: Lens, size: Size) -> Tensor:  # [H, W] 8 bits
     """Read and undistort the mask of an image: a PNG with the number of the object in each pixel."""
-    where = f"{path} (the mask of {shot.name}{shot.path.suffix}; without a folder '{MASKS}' a scene has no regions)"
+    where = f"{path} (the mask of {shot.name}{shot.path.suffix}; without its folder a scene has no regions)"
     numbers = images.decode_regions(images.read_image(path, where), (lens.width, lens.height), where)
     return images.subsample(lens.undistort(numbers, where, cv2.INTER_NEAREST), size)

@@ -60,7 +60,7 @@ def load(
     root = root.resolve()
     source = root / CAMERAS
     text = read_file(source, str(source), _MAX_TEXT)
-    rows = _read_rows(text.decode("utf-8", "replace"), source)
+    rows = _read_rows(text.decode("utf-8-sig", "replace"), source)
     if len(rows) <= TEST_CAMERA:
         raise InputError(
             f"{source}: expected more than {TEST_CAMERA} cameras, number {TEST_CAMERA} is the test view, "
@@ -68,7 +68,7 @@ def load(
         )
     listed = _list_images(root, frames, len(rows))
     replaced = _replacements(repair, listed)
-    views, digests = _read_views(listed, replaced, rows, rendition)
+    views, digests, notes = _read_views(listed, replaced, rows, rendition)
     for image, before in replaced.items():
         print(f"{image.path}: damaged, replaced by {before.path.name} (data.repair)", file=sys.stderr)
     digests[CAMERAS] = files.digest(text)
@@ -85,6 +85,7 @@ def load(
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
         up=None,
+        notes=(*files.unread(CAMERAS, rows[0].keys() - {*COLUMNS, *DISTORTION}), *notes),
     )
 
 
@@ -187,8 +188,8 @@ def _read_views(
     replaced: dict[_Image, _Image],
     rows: list[dict[str, float]],
     rendition: Rendition,
-) -> tuple[list[View], dict[str, str]]:
-    """Return the views of all images, and the SHA-256 of each file by name.
+) -> tuple[list[View], dict[str, str], list[str]]:
+    """Return the views of all images, the SHA-256 of each file by name, and what was decided about sizes.
 
     The name of a damaged image that is replaced also says by which image, so that a fingerprint depends on it.
     """
@@ -221,7 +222,7 @@ def _read_views(
 
     loaded = shots.read(listed_shots, rendition, in_8_bits=rendition.downscale == 1, decode=decode)
     names = [f"{i.path.name} replaced by {replaced[i].path.name}" if i in replaced else i.path.name for i in listed]
-    return loaded.views, dict(zip(names, loaded.digests, strict=True))
+    return loaded.views, dict(zip(names, loaded.digests, strict=True)), loaded.notes
 
 
 def _decode(image: _Image, data: bytes) -> images.Pixels:

@@ -226,9 +226,15 @@ def _read_split(
     if not isinstance(frames, list):
         raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")
     if not frames:
-        what = name.removeprefix("transforms_").removesuffix(".json")
-        raise InputError(f"{source}: frames: expected at least one frame, the {what} split is empty")
+        raise InputError(f"{source}: frames: expected at least one frame, got an empty list")
     checked = [_read_frame(root, content, frame, source, index, finder) for index, frame in enumerate(frames)]
+    index_of: dict[Path, int] = {}
+    for index, frame in enumerate(checked):
+        if index_of.setdefault(frame.path, index) != index:
+            raise InputError(
+                f"{source}: frames[{index}].file_path: expected each image once, frames[{index_of[frame.path]}] has "
+                f"{frame.name[:80]!a} too: remove one of the two"
+            )
     unread = (content.keys() - _LENS_KEYS - {"frames", *keys}) | (
         {key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS
     )
@@ -356,13 +362,15 @@ def _split_views(
     by_path = {frame.path: view for frame, view in zip(split.frames, views, strict=True)}
     by_split: list[list[View]] = []
     for key, names in zip(_SPLITS, lists, strict=True):
-        where, of_split = f"{split.source}: {key}", []
+        where, of_split = f"{split.source}: {key}", dict[int, View]()
         for name in [] if names is None else names if isinstance(names, list) else [names]:
             view = by_path.get(finder.find(name, where)) if isinstance(name, str) else None
             if view is None:
                 raise InputError(f"{where}: expected file_path of frames, got {_brief(name)}: add its frame")
-            of_split.append(view)
-        by_split.append(of_split)
+            if id(view) in of_split:
+                raise InputError(f"{where}: expected each image once, got {_brief(name)} twice: remove one of the two")
+            of_split[id(view)] = view
+        by_split.append([*of_split.values()])
     train, val, test = by_split
     if not train or not test:
         raise InputError(

@@ -95,7 +95,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png is a folder": (lambda root: [(root / IMAGE).unlink(), (root / IMAGE).mkdir()], IMAGE, PATH),
     "png is a pipe": (pipe(IMAGE), IMAGE, PATH),
     "png truncated": (truncate(IMAGE), IMAGE, "truncated PNG"),
-    "png empty": (write(IMAGE, b""), IMAGE, "expected a PNG"),
+    "png empty": (write(IMAGE, b""), IMAGE, "copy it again"),
     "png is half a jpeg": (write(IMAGE, b"\xff\xd8\xff\xe0 JFIF"), IMAGE, "damaged JPEG"),
     "png is a gif": (write(IMAGE, b"GIF89a"), IMAGE, "expected a PNG or a JPEG"),
     "png without header": (write(IMAGE, SIGNATURE + chunk(b"IEND", b"")), IMAGE, "damaged PNG"),
@@ -105,7 +105,11 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png of 10 GB": (lambda root: os.truncate(root / IMAGE, 10**10), IMAGE, "at most"),
     "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "3 bits"),
     "png of interlacing 9": (write(IMAGE, png(8, 6, bytes(6 * 33), interlacing=9)), IMAGE, "interlacing is unknown"),
-    "png is grey": (write(IMAGE, png(8, 6, bytes(9 * 6), color=0)), IMAGE, "RGB or RGBA"),
+    "png is grey": (
+        write(IMAGE, png(8, 6, bytes(9 * 6), color=0)),
+        IMAGE,
+        "RGB or RGBA, got PNG's colour type 0 of 8 bits: convert it",
+    ),
     "png of another size": (paint(IMAGE, 6, 9, 4), IMAGE, "9x6"),
     "png of another size in test": (paint("test/r_0.png", 3, 8, 4), "test/r_0.png", "8x3"),
     # the JSON
@@ -121,8 +125,9 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "json is a list": (write(JSON, b"[]"), JSON, "'frames'"),
     "frames missing": (drop("frames"), JSON, "frames"),
     "frames is text": (change(frames="all"), JSON, "frames"),
-    "split empty": (change(frames=[]), JSON, "train split is empty"),
-    "val file there but empty": (write(VAL, b'{"camera_angle_x": 0.8, "frames": []}'), VAL, "val split is empty"),
+    "split empty": (change(frames=[]), JSON, "got an empty list"),
+    "val file there but empty": (write(VAL, b'{"camera_angle_x": 0.8, "frames": []}'), VAL, "got an empty list"),
+    "an image twice": (change_frame(file_path="train/r_0.png"), JSON, "frames[0] has 'train/r_0.png' too"),
     "test missing": (lambda root: (root / TEST).unlink(), TEST, "found none"),
     "frame is a number": (change(frames=[7]), JSON, "frames[0]"),
     # the intrinsics

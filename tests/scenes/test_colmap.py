@@ -185,14 +185,23 @@ def test_times_of_names(taken: Path, naming: str, capsys: pytest.CaptureFixture[
     assert f"{taken.name}: times: {note}" in capsys.readouterr().err
 
 
-def test_an_exif_orientation_is_told(taken: Path) -> None:
+def test_images_that_colmap_did_not_register_are_told(taken: Path) -> None:
+    """Catches a capture of which a part is left out in silence."""
+    assert len(scenes.load(taken).notes) == 1
+    (taken / "images" / NAMES[3]).with_name("more.JPG").write_bytes(b"")
+    note = "1 images are not in the COLMAP model and are left out, such as 'images/more.JPG'"
+    assert scenes.load(taken).notes[1:] == (note,)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_an_exif_orientation_is_told(taken: Path, kind: str) -> None:
     """Catches pixels that other programs turn, and gsbench does not, in silence."""
     exif = Image.Exif()
     exif[274] = 6
     for i, path in enumerate(sorted((taken / "images").rglob("*.png"))):
         with Image.open(path) as image:
             pixels = image.convert("RGB")
-        pixels.save(path, "JPEG", **({"exif": exif} if i < 3 else {}))
+        pixels.save(path, kind, **({"exif": exif} if i < 3 else {}))
     assert any(f"3 of {COUNT} images have an EXIF orientation" in note for note in scenes.load(taken).notes)
 
 

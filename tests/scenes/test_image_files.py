@@ -4,8 +4,9 @@ import shutil
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
-from tiny_scene import IMAGES, edit
+from tiny_scene import IMAGES, edit, write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -44,6 +45,21 @@ def test_the_image_that_is_named_comes_first(tiny: Path) -> None:
     }
     names = {path: [finder.find(name, "where").name for name in asked] for path, asked in expected.items()}
     assert names == {path: [path] * len(asked) for path, asked in expected.items()}
+
+
+def test_names_that_macos_spells_otherwise(tiny: Path) -> None:
+    """Catches an umlaut of two characters, as macOS writes it, that is not the one of the file of cameras."""
+    for split in SPLITS:
+        (tiny / split / "r_0.png").rename(tiny / split / "Ku\u0308che.png")
+        edit(tiny, lambda c, split=split: c["frames"][0].update(file_path=f"{split}/K\u00fcche.png"), split)
+    assert scenes.load(tiny).notes == ()
+
+
+def test_images_without_alpha_beside_others_are_told(tiny: Path) -> None:
+    """Catches test views on the background of the run, and training views on their own."""
+    write_image(tiny / "test/r_0.png", np.zeros((6, 8, 3), np.uint8))
+    note = "1 of 4 images have no alpha and keep their own background, the others get (1.0, 1.0, 1.0)"
+    assert scenes.load(tiny, background=(1.0, 1.0, 1.0)).notes == (note,)
 
 
 def test_links_of_the_user_are_followed(tiny: Path, tmp_path: Path) -> None:

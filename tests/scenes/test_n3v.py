@@ -222,9 +222,9 @@ def film(name: str, count: int, width: int = WIDTH) -> Callable[[Path], object]:
 
 
 FAULTS: list[tuple[Callable[[Path], object], str]] = [
-    (poses(lambda rows: rows[:-1]), r"17 finite numbers for each of 4 films, cam00 to cam04, got \[3, 17\].*leave_out"),
+    (poses(lambda rows: rows[:-1]), r"17 numbers for each of 4 films, cam00 to cam04, got \[3, 17\].*leave_out"),
     (poses(lambda rows: rows[:, :-1]), r"got \[4, 16\]"),
-    (poses(lambda rows: rows * np.nan), "finite"),
+    (poses(lambda rows: rows * np.nan), "expected finite numbers, some are not: copy it again"),
     (poses(lambda rows: rows.astype(object)), "poses_bounds.npy: expected an array as numpy.save writes"),
     (poses(stretched), "poses_bounds.npy: cam02: expected a rigid world-to-camera matrix"),
     (poses(mirrored), "cam02: expected a rigid"),
@@ -253,6 +253,14 @@ def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], mess
     with pytest.raises(InputError, match=message) as error:
         scenes.load(root)
     assert "\n" not in str(error.value)
+
+
+def test_damaged_points_are_told_before_frames_are_decoded(root: Path) -> None:
+    """Catches minutes of decoding, and gigabytes, before a message on another file."""
+    (root / "points3d.ply").write_bytes(b"")
+    with pytest.raises(InputError, match="expected a PLY"):
+        scenes.load(root)
+    assert not (root / n3v.DECODED).exists()
 
 
 def test_a_film_that_ends_early_leaves_no_file(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

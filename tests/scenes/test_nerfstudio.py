@@ -136,6 +136,10 @@ FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
     ({"ply_file_path": "none.ply"}, "none.ply"),
     ({"train_filenames": ["images/frame_00000.png"]}, "1 and 0: list them"),
     ({"train_filenames": ["images/x.png"]}, "train_filenames: expected file_path of frames, got .*add its frame"),
+    (
+        {"train_filenames": ["images/frame_00000.png"] * 2, "test_filenames": ["images/frame_00001.png"]},
+        "train_filenames: expected each image once",
+    ),
     ({"test_filenames": 3}, "test_filenames: expected file_path of frames, got 3"),
     ({"frames": []}, "at least one frame"),
     ({"w": math.inf}, "w: expected a finite number"),

@@ -198,6 +198,14 @@ def opposed(distance: float) -> list[Camera]:
     return [Camera(viewmat, K, 24, 40) for viewmat in (ahead, back)]
 
 
+def test_cameras_that_look_away_are_told() -> None:
+    """Catches poses of OpenCV in a file of OpenGL's, and a message that asks for another cube only."""
+    train = [View(f"train/{i}", camera, None, torch.zeros(40, 24, 3)) for i, camera in enumerate(opposed(-8.0))]
+    scene = Scene("away", train, [], [], (0.0, 0.0, 0.0), 1.0, None, "made here")
+    with pytest.raises(InputError, match="2 of 2 cameras look away from it: are their axes right"):
+        initial_points(DataConfig(initial_points=200, initial_half_width=1.3), scene, torch.Generator())
+
+
 def test_points_between_cameras_that_face_each_other() -> None:
     """Catches points behind a camera, whose projections are mirrored into its image, points of a scene at which only
     its first camera looks, and cameras back to back, which see nothing in common."""

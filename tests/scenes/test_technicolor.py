@@ -92,6 +92,15 @@ def test_columns_are_read_by_name(root: Path) -> None:
     assert torch.equal(first.K, other.K)
 
 
+def test_what_is_not_read_is_told(root: Path) -> None:
+    """Catches a column of distortion and a rounded size in silence, and Windows' mark at the start of a table."""
+    header, *rows = (root / CAMERAS).read_text().splitlines()
+    (root / CAMERAS).write_text("\n".join([f"\ufeff{header} d3", *(f"{row} 0.1" for row in rows)]))
+    unread, size, _ = scenes.load(root, downscale=4).notes
+    assert unread == f"{CAMERAS}: keys that are not read: 'd3'"
+    assert "reduced to 2x2" in size
+
+
 def table(change: Callable[[str], str]) -> Callable[[Path], object]:
     """Change the text of the cameras' parameters."""
     return lambda root: (root / CAMERAS).write_text(change((root / CAMERAS).read_text()))
