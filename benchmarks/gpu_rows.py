@@ -1,4 +1,4 @@
-"""What is compared on a GPU: repeated steps, the raster, its backward, frames, replays, steps of training, the loss."""
+"""What is compared on a GPU: steps of four views, the raster, its backward, frames, replays, steps, the loss."""
 
 import itertools
 from collections.abc import Iterator
@@ -28,24 +28,29 @@ TIME = 0.4  # at which models are seen
 
 def every(place: Place) -> Iterator[Row]:
     """All rows, those that matter most first."""
-    for rows in (repeated_rows, raster_rows, backward_rows, frame_rows, replay_rows, step_rows, loss_rows):
+    for rows in (four_view_rows, raster_rows, backward_rows, frame_rows, replay_rows, step_rows, loss_rows):
         yield from rows(place)
 
 
-def repeated_rows(place: Place) -> Iterator[Row]:
-    """A step of training on four views that is repeated, against the same step launched (`step.REPEATED_ON`)."""
+def four_view_rows(place: Place) -> Iterator[Row]:
+    """A step of training on four views together, against the same step that renders them one by one (`TOGETHER_ON`).
+
+    Then the same step repeated, against the one launched (`REPEATED_ON`).
+    """
     sizes = ((3_000, 160), (100_000, 400)) if place.on_gpu else ((500, 48),)
-    for name, (N, size) in itertools.product(("4dgs", "7dgs"), sizes):
-        case = f"{name}, {N} / {size}x{size}, four views, theirs is launched"
-        yield from attempted("repeated", case, lambda a=(place, case, name, N, size): [repeated_row(*a)])
+    sections = {"together": ("TOGETHER_ON", "one by one"), "repeated": ("REPEATED_ON", "launched")}
+    for (section, (option, way)), name, (N, size) in itertools.product(sections.items(), ("4dgs", "7dgs"), sizes):
+        case = f"{name}, {N} / {size}x{size}, four views, theirs is {way}"
+        arguments = place, section, option, case, name, N, size
+        yield from attempted(section, case, lambda a=arguments: [four_view_row(*a)])
 
 
-def repeated_row(place: Place, case: str, name: str, N: int, size: int) -> Row:
+def four_view_row(place: Place, section: str, option: str, case: str, name: str, N: int, size: int) -> Row:
     step = training_step(model(name, N, agr=True).to(place.device), size, size, 4)
-    with patch("gsbench.train.step.REPEATED_ON", ()):
-        launched = place.cost(step)
-    with patch("gsbench.train.step.REPEATED_ON", (torch.device(place.device).type,)):
-        return compared("repeated", case, "all", place.cost(step), launched)
+    with patch(f"gsbench.train.step.{option}", ()):
+        without = place.cost(step)
+    with patch(f"gsbench.train.step.{option}", (torch.device(place.device).type,)):
+        return compared(section, case, "all", place.cost(step), without)
 
 
 def raster_rows(place: Place) -> Iterator[Row]:

@@ -1,5 +1,6 @@
 """Every CUDA kernel, forward and backward, on small cases: what compute-sanitizer looks at."""
 
+import itertools
 from contextlib import nullcontext
 
 import torch
@@ -23,9 +24,10 @@ def main() -> None:
         means, factors, opacities, _ = (x.cuda().requires_grad_() for x in gaussians(1_000))
         colors = torch.rand(1_000, D, device="cuda").requires_grad_()
         arguments = means, factors * 4, opacities, colors, viewmats.requires_grad_(), Ks
-        for way in (backward_by_splat(), nullcontext()):
-            output = rasterize(*arguments, 70, 50, backend="cuda")
-            with way:
+        of_each = [torch.stack([x, x]) for x in arguments[:4]]  # the Gaussians of each camera
+        for drawn, way in itertools.product((arguments, (*of_each, *arguments[4:])), (backward_by_splat, nullcontext)):
+            output = rasterize(*drawn, 70, 50, backend="cuda")
+            with way():
                 (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
         for room in (100, 100_000):  # too few pairs, too many
             with torch.no_grad():
@@ -36,8 +38,8 @@ def main() -> None:
     for name, options in MODELS:
         batch = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))
         sum(x.square().sum() for x in tensors_of(batch)).backward()
-    image = torch.rand(37, 50, 3, device="cuda").requires_grad_()
-    l1_ssim(image, torch.rand(37, 50, 3, device="cuda"), 0.2).backward()
+    images = torch.rand(2, 37, 50, 3, device="cuda").requires_grad_()
+    l1_ssim(images, torch.rand(2, 37, 50, 3, device="cuda"), 0.2).sum().backward()
     arrays = [[x, y] for x, y in zip(*(torch.rand(4, 300, 7, device="cuda").unbind() for _ in range(2)), strict=True)]
     steps, skip = [torch.ones((), device="cuda")] * 2, torch.zeros((), device="cuda")
     flag_arrays([*arrays[1], skip / skip], torch.zeros(3, device="cuda").bool(), skip)

@@ -263,13 +263,13 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square, tmp_path):
 def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_path, monkeypatch):
     """Catches a run out of a GPU's memory, or refused by the CPU's, that ends the process, counts as diverged, or has
     a record that does not say what to lower."""
-    render = step.render_slice
+    render = step.render_slices
 
     def full(*_: object) -> None:
-        monkeypatch.setattr(step, "render_slice", render)  # the next run has memory again
+        monkeypatch.setattr(step, "render_slices", render)  # the next run has memory again
         raise error("pictures need 9.0 MiB: lower the picture's size")
 
-    monkeypatch.setattr(step, "render_slice", full)
+    monkeypatch.setattr(step, "render_slices", full)
     assert main_here("-m", *overrides(square, tmp_path), "model=3dgs", "seed=0,1") == 1
     statuses = {run.seed: (run.status, run.reason) for run in map(record.read, record.find(tmp_path))}
     reason = "out of memory: pictures need 9.0 MiB: lower the picture's size"

@@ -34,10 +34,17 @@ def collect_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tensors if tape is None else tape.collect(tensors)
 
 
+def stack(parts: Sequence[Sequence[Tensor]]) -> list[Tensor]:
+    """Stack tensors: return one of shape [V, ...] for each of several lists of V tensors."""
+    tape: Tape | None = getattr(active, "tape", None)
+    return [torch.stack(list(x)) for x in parts] if tape is None else tape.stack(parts)
+
+
 class _Call(NamedTuple):
     """A recorded call of an operation."""
 
-    operation: Operation | None  # None: `collect`, whose outputs are its inputs
+    # None: `collect`, whose outputs are its inputs, or `stack`, whose outputs are as many inputs each, in order
+    operation: Operation | None
     tensors: list[Tensor]
     wanted: list[bool]
     slots: Slots
@@ -81,6 +88,18 @@ class Tape:
         rest = iter(leaves)
         return tuple([x if x.grad_fn is None else next(rest) for x in tensors])
 
+    def stack(self, parts: Sequence[Sequence[Tensor]]) -> list[Tensor]:
+        """Return each list of tensors as one; the parts of its gradient are those of the tensors, without a copy."""
+        tensors = [x for part in parts for x in part]
+        with torch.no_grad():
+            stacked = [torch.stack(list(part)) for part in parts]
+        wanted = [x.requires_grad for x in tensors]
+        if torch.is_grad_enabled() and any(wanted):
+            for x, part in zip(stacked, parts, strict=True):
+                x.requires_grad_(any(y.requires_grad for y in part))
+            self._calls.append(_Call(None, tensors, wanted, {}, stacked))
+        return stacked
+
     def backward(self, loss: Tensor, seed: Tensor, sources: Sequence[Tensor], sums: dict[int, Tensor]) -> None:
         """Compute the gradients of `loss` with respect to the tensors `sources`, and add them to `sums`.
 
@@ -108,22 +127,26 @@ class _Gradients:
 
     def propagate(self, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
         """Add gradients to those of tensors; if these have a `grad_fn`, backpropagate them through autograd."""
-        for x, gradient in zip(tensors, gradients, strict=True):
-            self._add(x, gradient)
+        self._add(list(zip(tensors, gradients, strict=True)))
         if all(x.grad_fn is None for x in tensors):
             return
         outputs = [y for call in self.calls for y in call.outputs]
         starts = {id(x) for x in tensors}
         ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and id(y) not in starts]
         by_ends = torch.autograd.grad(tensors, ends, gradients, allow_unused=True, retain_graph=True)
-        for end, by_end in zip(ends, by_ends, strict=True):
-            if by_end is not None:
-                # torch may return two gradients that share memory, or one of a transposed layout.
-                self._add(end, by_end.clone(memory_format=torch.contiguous_format))
+        # torch may return two gradients that share memory, or one of a transposed layout.
+        reached = [(x, g) for x, g in zip(ends, by_ends, strict=True) if g is not None]
+        self._add([(x, g.clone(memory_format=torch.contiguous_format)) for x, g in reached])
 
-    def _add(self, x: Tensor, gradient: Tensor) -> None:
-        before = self.by_id.get(id(x))
-        self.by_id[id(x)] = gradient if before is None else before + gradient
+    def _add(self, gradients: Sequence[tuple[Tensor, Tensor]]) -> None:
+        """Add gradients to those of their tensors, in order; to those of different tensors together."""
+        added: dict[int, Tensor] = {}
+        for x, gradient in gradients:
+            if id(x) in added:
+                add_to(self.by_id, added)
+                added = {}
+            added[id(x)] = gradient
+        add_to(self.by_id, added)
 
     def run_backward(self, call: _Call) -> None:
         """Run the backward kernel of one recorded call, if one of its outputs has a gradient."""
@@ -131,22 +154,37 @@ class _Gradients:
         if all(g is None for g in upstream):
             return
         if call.operation is None:
-            there = [(x, g) for x, g in zip(call.tensors, upstream, strict=True) if g is not None]
+            size = len(call.tensors) // len(call.outputs)
+            parts: list[Tensor | None] = []
+            for g in upstream:
+                parts += [g] if size == 1 else [None] * size if g is None else g.unbind()
+            each = zip(call.tensors, parts, call.wanted, strict=True)
+            there = [(x, g) for x, g, wanted in each if g is not None and wanted]
             self.propagate(*zip(*there, strict=True))
             return
         # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
+        # If others behind it do, it is added to theirs.
         whole, sums = {}, {}
         for i in call.operation.adds:
             key = id(call.tensors[i])
-            if key in self.sources and self.uses[key] == 1 and key not in self.by_id:
+            if key in self.sources and key in self.by_id:
+                sums[i] = self.by_id[key]
+            elif key in self.sources and self.uses[key] == 1:
                 whole[i] = key
                 if key in self.sums:
                     sums[i] = self.sums[key]
         gradients = call.operation.backward(call.tensors, call.slots, call.outputs, upstream, call.wanted, sums)
+        waiting: list[tuple[Tensor, Tensor]] = []  # what torch need not differentiate is added up together
         for i, (x, gradient, wanted) in enumerate(zip(call.tensors, gradients, call.wanted, strict=True)):
             if gradient is None or not wanted:
                 continue
             if i in whole:
                 self.sums[whole[i]] = gradient
-            else:
-                self.propagate([x], [gradient])
+            elif i not in sums:
+                if x.grad_fn is not None:
+                    self._add(waiting)
+                    waiting = []
+                    self.propagate([x], [gradient])
+                else:
+                    waiting.append((x, gradient))
+        self._add(waiting)

@@ -1,12 +1,13 @@
 """Define the tuples of 3D Gaussians that a model gives for a camera and a time, and how they are joined."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsbench.errors import InputError
+from gsbench.kernels.tape import stack
 from gsbench.models.portable_math import sqrt
 
 
@@ -18,6 +19,15 @@ class Gaussians3D(NamedTuple):
     opacities: Tensor  # [N]
     colors: Tensor  # [N, 3]
     beta_exponents: Tensor | None = None  # [N] b of the alpha profile (1 - r^2)^b; None: the profile is a Gaussian
+
+
+def stacked(slices: Sequence[Gaussians3D]) -> Gaussians3D:
+    """Return the slices of several views as one, whose tensors are [V, N, ..]; a single one stays as it is."""
+    if len(slices) == 1:
+        return slices[0]
+    fields = [field for field, x in slices[0]._asdict().items() if x is not None]
+    parts = stack([[getattr(gaussians, field) for gaussians in slices] for field in fields])
+    return slices[0]._replace(**dict(zip(fields, parts, strict=True)))
 
 
 class Conditioned(NamedTuple):

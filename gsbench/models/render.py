@@ -1,6 +1,6 @@
 """Render an image of a model, once or as a CUDA graph that is replayed for other cameras and times."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
@@ -13,7 +13,7 @@ from gsbench.kernels.backends import Backend, resolve
 from gsbench.kernels.raster import RasterInputs, Viewport
 from gsbench.models.base import GaussianModel
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.gaussian_batch import Gaussians3D
+from gsbench.models.gaussian_batch import Gaussians3D, stacked
 from gsbench.raster import EPS2D, FAR, RasterOutput, rasterize
 from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
@@ -26,16 +26,35 @@ def rasterize_slice(
 
     The background [3] is that of the first three channels; behind further ones there is 0.
     """
-    view = camera.viewmat[None], camera.K[None], camera.width, camera.height
+    return rasterize_slices([gaussians], [camera], background, backend, antialias)
+
+
+def rasterize_slices(
+    slices: Sequence[Gaussians3D],  # one a camera
+    cameras: Sequence[Camera],  # of equal size and near plane
+    background: Tensor,
+    backend: Backend,
+    antialias: bool = False,
+) -> RasterOutput:
+    """Rasterize slices of a model in one call, each for its camera, otherwise as `rasterize_slice`."""
+    gaussians, camera = stacked(slices), cameras[0]
     return rasterize(
         *gaussians[:4],
-        *view,
+        _together([x.viewmat for x in cameras]),
+        _together([x.K for x in cameras]),
+        camera.width,
+        camera.height,
         background=_behind(gaussians, background),
         near=camera.near,
         backend=backend,
         antialias=antialias,
         beta_exponents=gaussians.beta_exponents,
     )
+
+
+def _together(tensors: list[Tensor]) -> Tensor:
+    """Stack tensors, without a copy if there is only one."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
 
 
 def _behind(gaussians: Gaussians3D, background: Tensor) -> Tensor:
@@ -48,8 +67,19 @@ def render_slice(
     model: GaussianModel, gaussians: Gaussians3D, camera: Camera, background: Tensor, antialias: bool = False
 ) -> RasterOutput:
     """Render a slice of a model for one camera: rasterize it, and let the model decode what was blended."""
-    output = rasterize_slice(gaussians, camera, background, model.backend, antialias)
-    return replace(output, image=model.decode(output.image, camera))
+    return render_slices(model, [gaussians], [camera], background, antialias)
+
+
+def render_slices(
+    model: GaussianModel,  # that does not decode, if there are several cameras
+    slices: Sequence[Gaussians3D],  # one a camera
+    cameras: Sequence[Camera],  # of equal size and near plane
+    background: Tensor,
+    antialias: bool = False,
+) -> RasterOutput:
+    """Render slices of a model in one call, each for its camera."""
+    output = rasterize_slices(slices, cameras, background, model.backend, antialias)
+    return replace(output, image=model.decode(output.image, cameras[0]))
 
 
 def render(

@@ -79,10 +79,10 @@ class Trainer(TrainingParts):
             raise DivergedError(f"step {step}: {error}") from None
         with stages("density"):
             self.density.accumulate(step, views, results)
-        self.finite_check.check(step, torch.stack([view.loss for view in results]).sum(), self.optimizer.groups)
+        self.finite_check.check(step, torch.cat([part.loss for part in results]).sum(), self.optimizer.groups)
         with torch.no_grad():
             with stages("optimizer"):
-                drawn = torch.cat([view.drawn for view in results]).any(0) if self.optimizer.is_sparse else None
+                drawn = torch.cat([part.drawn for part in results]).any(0) if self.optimizer.is_sparse else None
                 factors = {name: x for hook in self.hooks for name, x in hook.rate_factors(step).items()}
                 self.optimizer.step(step, drawn, factors)
                 for hook in self.hooks:

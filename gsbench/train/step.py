@@ -1,6 +1,8 @@
-"""Compute the gradients of one training step. On a CPU, threads render different views of the batch in parallel.
+"""Compute the gradients of one training step.
 
-The gradients of the views are added in a fixed order, so the result has the same bits for any number of threads.
+A part is the views of a batch that are rendered together. On a CPU each view is a part, and threads render different
+parts at the same time; their gradients are added in a fixed order, so the result has the same bits for any number of
+threads. On a GPU views of equal size are one part, so that each kernel is launched once for all of them.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -14,7 +16,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
 from gsbench.measure.speed import StageClock
 from gsbench.models import CameraTime, GaussianModel
-from gsbench.models.render import render_slice
+from gsbench.models.render import render_slices
 from gsbench.process.workers import side_by_side
 from gsbench.scenes import View
 from gsbench.train.divergence import DivergedError
@@ -33,6 +35,9 @@ PIXELS_OF_A_GAUSSIAN = 12
 # The types of devices on which a step is recorded to be repeated. Tests run the kernels of "cuda" on the CPU, where
 # repeated steps give the same bits; that they are faster on a GPU is to be shown by the first rows of `make gpu-check`.
 REPEATED_ON = ("cpu",)
+
+# The types of devices on which views of equal size are one part; the first rows of `make gpu-check` are to time it.
+TOGETHER_ON = ("cuda",)
 
 # A step with more work than this many Gaussians, in all views of its batch, is not recorded to be repeated. A recording
 # keeps about 900 bytes of memory for each, and Python code is a small share of such a step.
@@ -56,25 +61,25 @@ def fitting_threads(gaussians: int, pixels: int) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def deal(views: int, bounds: Sequence[int]) -> list[Sums]:
-    """Assign to each view of a batch the dictionary to which its gradients are added.
+def deal(parts: int, bounds: Sequence[int]) -> list[Sums]:
+    """Assign to each part of a batch the dictionary to which its gradients are added.
 
-    Views share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
-    inside a half, each of the thread's views in this half has its own dictionary. `add_up` adds all dictionaries in the
-    order of the views, so the total has the same bits for any number of threads. Thread i renders the views from
+    Parts share a dictionary if one thread renders them and they are in the same half of the batch. If a thread begins
+    inside a half, each of the thread's parts in this half has its own dictionary. `add_up` adds all dictionaries in the
+    order of the parts, so the total has the same bits for any number of threads. Thread i renders the parts from
     bounds[i] to bounds[i + 1].
     """
     sums: list[Sums] = []
-    begins = 0  # first view of the half, or of the thread, that view i belongs to
-    for i in range(views):
-        if i in _halves(views) or i in bounds:
+    begins = 0  # first part of the half, or of the thread, that part i belongs to
+    for i in range(parts):
+        if i in _halves(parts) or i in bounds:
             begins = i
-        sums.append(sums[-1] if i > begins and begins in _halves(views) else {})
+        sums.append(sums[-1] if i > begins and begins in _halves(parts) else {})
     return sums
 
 
 def add_up(sums: Sequence[Sums]) -> Sums:
-    """Return the sum of the gradients of all views; each half of the batch is summed first, then the two halves.
+    """Return the sum of the gradients of all parts; each half of the batch is summed first, then the two halves.
 
     This order does not depend on the threads, so the sum has the same bits for any number of them.
     """
@@ -82,16 +87,16 @@ def add_up(sums: Sequence[Sums]) -> Sums:
     return _in_order([_in_order(sums[i:end]) for i, end in zip(_halves(len(sums)), ends, strict=True)])
 
 
-def _halves(views: int) -> list[int]:
-    """Return the index of the first view of each half of a batch; a batch of at most three views is not halved."""
-    middle = (views + 1) // 2
-    return [0, middle] if views - middle > 1 else [0]
+def _halves(parts: int) -> list[int]:
+    """Return the index of the first part of each half of a batch; a batch of at most three parts is not halved."""
+    middle = (parts + 1) // 2
+    return [0, middle] if parts - middle > 1 else [0]
 
 
 def _in_order(sums: Sequence[Sums]) -> Sums:
     """Return the sum of dictionaries of gradients, added in order to the tensors of the first one.
 
-    A dictionary that views share is added only once.
+    A dictionary that parts share is added only once.
     """
     total = dict(sums[0])
     done = {id(sums[0])}
@@ -102,13 +107,14 @@ def _in_order(sums: Sequence[Sums]) -> Sums:
     return total
 
 
-class ViewResult(NamedTuple):
-    """Hold the results of one view of a training step. The next step may overwrite the tensors."""
+class PartResult(NamedTuple):
+    """Hold the results of V views of a training step, rendered together. The next step may overwrite the tensors."""
 
-    loss: Tensor  # [1] the view's part of the batch's loss
-    drawn: Tensor  # [1, N] bool: which Gaussians were not culled
-    g_means2d: Tensor  # [1, N, 2] gradient of the batch's loss by the 2D means, per pixel
-    sums: Sums  # gradients of the batch's loss by the parameters, of this view and of those that share the dictionary
+    views: list[int]  # [V] their indices in the batch
+    loss: Tensor  # [V] the views' parts of the batch's loss
+    drawn: Tensor  # [V, N] bool: which Gaussians were not culled
+    g_means2d: Tensor  # [V, N, 2] gradient of the batch's loss by the 2D means, per pixel
+    sums: Sums  # gradients of the batch's loss by the parameters, of this part and of those that share the dictionary
 
 
 class Step:
@@ -126,11 +132,11 @@ class Step:
         self.stages = stages
         self.terms: Sequence[LossTerm] = ()
         self.maps: Sequence[ImageMap] = ()
-        self.replay: StepReplay[ViewResult] = StepReplay()
+        self.replay: StepReplay[PartResult] = StepReplay()
 
     def __call__(
         self, views: Sequence[View], terms: Sequence[LossTerm] = (), maps: Sequence[ImageMap] = ()
-    ) -> list[ViewResult]:
+    ) -> list[PartResult]:
         """Render a batch of views and store the gradient of the loss in all parameters.
 
         The loss is the mean over views of the photometric loss of the mapped render plus weighted terms, plus the
@@ -143,14 +149,15 @@ class Step:
         """
         self.terms, self.maps = terms, maps
         sources = [parameter for parameter in self.parameters if parameter.requires_grad]
-        workers = min(len(views), self.model.backend.workers(self.model.splats["means"]))
-        bounds = [len(views) * worker // workers for worker in range(workers + 1)]
-        sums = deal(len(views), bounds)
-        seed = self.background.new_full((1,), 1 / len(views))
+        parts = self._parts(views)
+        workers = min(len(parts), self.model.backend.workers(self.model.splats["means"]))
+        bounds = [len(parts) * worker // workers for worker in range(workers + 1)]
+        sums = deal(len(parts), bounds)
+        seed = self.background.new_full((max(map(len, parts)),), 1 / len(views))
         results = self.replay(
-            self._signature(views, sources, workers),
-            views,
-            lambda i, observed, stages: self._of_view(i, observed, sources, sums[i], seed, stages),
+            self._signature(views, parts, sources, workers),
+            [[views[i] for i in part] for part in parts],
+            lambda i, observed, stages: self._of_part(parts[i], observed, sources, sums[i], seed, stages),
             lambda work: self._of_all(work, bounds),
         )
         with self.stages("backward"):
@@ -161,7 +168,22 @@ class Step:
                 penalty.backward()
         return results
 
-    def _signature(self, views: Sequence[View], sources: list[nn.Parameter], workers: int) -> Hashable:
+    def _parts(self, views: Sequence[View]) -> list[list[int]]:
+        """Return the indices of the views of each part; what is done to single views needs parts of one view."""
+        model, like = self.model, self.background
+        by_kernels = like.device.type in TOGETHER_ON and model.backend.serves(like)
+        if not by_kernels or self.terms or self.maps or model.decodes:
+            return [[i] for i in range(len(views))]
+        parts: dict[Hashable, list[int]] = {}
+        for i, view in enumerate(views):
+            camera, pixels = view.camera, view.pixels
+            key = camera.width, camera.height, camera.near, pixels.shape, pixels.dtype, view.time is None
+            parts.setdefault(key, []).append(i)
+        return list(parts.values())
+
+    def _signature(
+        self, views: Sequence[View], parts: list[list[int]], sources: list[nn.Parameter], workers: int
+    ) -> Hashable:
         """Return all that the calls of a step depend on, except values of tensors; None if they must not be repeated.
 
         A model may have attributes that this class does not know, so all its numbers and strings are included.
@@ -175,49 +197,50 @@ class Step:
         addresses = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
         counts = None if sets is None else (sets.refined, sets.conditioned)
         options = tuple([x for x in vars(model).values() if isinstance(x, int | float | str)])
-        return addresses, counts, options, model.active, tuple(map(id, sources)), workers, torch.get_num_threads()
+        threads = workers, torch.get_num_threads()
+        return addresses, counts, options, model.active, tuple(map(id, sources)), tuple(map(tuple, parts)), threads
 
-    def _of_all(self, work: Callable[[int, Stages], ViewResult], bounds: Sequence[int]) -> list[ViewResult]:
-        """Call `work` for all views of a batch; thread i does so for the views bounds[i] to bounds[i + 1]."""
+    def _of_all(self, work: Callable[[int, Stages], PartResult], bounds: Sequence[int]) -> list[PartResult]:
+        """Call `work` for all parts of a batch; thread i does so for the parts bounds[i] to bounds[i + 1]."""
         workers = len(bounds) - 1
         if workers == 1:
             return [work(i, self.stages) for i in range(bounds[1])]
         with self.stages.side_by_side(workers) as clocks:
 
-            def run(worker: int) -> list[ViewResult]:
+            def run(worker: int) -> list[PartResult]:
                 return [work(i, clocks[worker]) for i in range(bounds[worker], bounds[worker + 1])]
 
             return [result for part in side_by_side(run, range(workers), workers) for result in part]
 
-    def _of_view(
-        self, index: int, view: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages
-    ) -> ViewResult:
-        """Render view number `index` of a batch and add the gradients of its loss to `sums`.
+    def _of_part(
+        self, part: list[int], observed: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages
+    ) -> PartResult:
+        """Render the views `part` of a batch and add the gradients of their losses to `sums`.
 
-        `seed` is the gradient of the batch's loss by the loss of one view.
+        The numbers of `seed` are the gradient of the batch's loss by the loss of one view.
         """
         with Tape() as tape:
             with stages("slice"):
-                query = CameraTime.of(view.camera, view.time)
-                gaussians = self.model.slice(query)
+                queries = [CameraTime.of(*each) for each in zip(observed.cameras, observed.times, strict=True)]
+                slices = [self.model.slice(query) for query in queries]
             with stages("raster"):
                 try:
-                    output = render_slice(self.model, gaussians, view.camera, self.background, self.antialias)
+                    output = render_slices(self.model, slices, observed.cameras, self.background, self.antialias)
                 except InputError as error:  # the rasterizer checks its inputs, so it is the first to see NaN
-                    if all(tensor.isfinite().all() for tensor in gaussians if tensor is not None):
+                    if all(x.isfinite().all() for gaussians in slices for x in gaussians if x is not None):
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):
                 image = output.image
                 for image_map in self.maps:
-                    image = image_map(image, index)
-                loss = photometric(image, view.target[None], self.ssim_weight, self.model.backend)
+                    image = image_map(image, part[0])
+                loss = photometric(image, observed.targets(), self.ssim_weight, self.model.backend)
                 for weight, term in self.terms:
-                    loss = loss + weight * term(query, index)
+                    loss = loss + weight * term(queries[0], part[0])
         with stages("backward"):
-            means2d = output.info.means2d
+            means2d, seed = output.info.means2d, seed[: len(part)]
             tape.backward(loss, seed, [*sources, means2d], sums)
             g_means2d = sums.pop(id(means2d), None)
             if g_means2d is None:
                 g_means2d = torch.zeros_like(means2d)
-            return ViewResult(loss.detach() * seed, output.info.drawn, g_means2d, sums)
+            return PartResult(part, loss.detach() * seed, output.info.drawn, g_means2d, sums)

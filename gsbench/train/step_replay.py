@@ -1,4 +1,4 @@
-"""Record how a training step renders and differentiates its views, and replay this in the steps that follow.
+"""Record how a training step renders and differentiates its parts, and replay this in the steps that follow.
 
 Consecutive steps differ only in the values of tensors, such as the camera, until densification changes the number of
 Gaussians, or the schedule changes what is trained. `gsbench.kernels.recording` says why a replay is faster.
@@ -24,33 +24,52 @@ Result = TypeVar("Result")
 
 
 class Observed(NamedTuple):
-    """What a training step reads of a view."""
+    """What a training step reads of the V views of a part."""
 
-    camera: Camera
-    time: float | Tensor | None
-    target: Tensor  # [H, W, 3] floats in [0, 1] or 8 bits
+    cameras: list[Camera]
+    times: list[float | Tensor | None]
+    images: list[Tensor]  # [V] of [H, W, 3] floats in [0, 1] or 8 bits
+    together: Tensor | None = None  # [V, H, W, 3] the images, if they are in one memory
+
+    def targets(self) -> Tensor:
+        """Return the images that the loss takes, [V, H, W, 3]."""
+        if self.together is not None:
+            return self.together
+        return self.images[0][None] if len(self.images) == 1 else torch.stack(self.images)
 
     def copy(self) -> Observed:
         """Return a copy in memory of its own, which `overwrite` changes."""
-        camera = self.camera.clone()
-        time = None if self.time is None else camera.K.new_tensor(self.time)
-        return Observed(camera, time, self.target.clone())
+        cameras, together = [camera.clone() for camera in self.cameras], torch.stack(self.images)
+        like, times = cameras[0].K, list[float | Tensor | None]()
+        times += [None if time is None else like.new_tensor(time) for time in self.times]
+        return Observed(cameras, times, list(together.unbind()), together)
 
     def overwrite(self, other: Observed) -> None:
-        """Take the values of another view of the same signature."""
-        self.camera.overwrite(other.camera)
-        self.target.copy_(other.target)
-        if isinstance(self.time, Tensor) and other.time is not None:
-            self.time.fill_(other.time)
+        """Take the values of views of the same signature."""
+        torch._foreach_copy_(self.images, other.images)  # on a GPU in one launch
+        torch._foreach_copy_(_tensors_of(self.cameras), _tensors_of(other.cameras))
+        for kept, time in zip(self.times, other.times, strict=True):
+            if isinstance(kept, Tensor) and time is not None:
+                kept.fill_(time)
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> Observed:
+        """Take what is read of views; nothing is copied."""
+        return cls([view.camera for view in views], [view.time for view in views], [view.target for view in views])
 
     @property
     def signature(self) -> Hashable:
-        """Everything but values: views with equal signatures may overwrite each other."""
-        return self.camera.width, self.camera.height, self.time is None, self.target.shape, self.target.dtype
+        """Everything but values: parts with equal signatures may overwrite each other."""
+        camera, image = self.cameras[0], self.images[0]
+        return camera.width, camera.height, camera.near, self.times[0] is None, image.shape, image.dtype
 
 
-class _RecordedView(Generic[Result]):
-    """The recorded work on one view, stage by stage, what it reads, and the result that a repetition overwrites."""
+def _tensors_of(cameras: Sequence[Camera]) -> list[Tensor]:
+    return [x for camera in cameras for x in (camera.viewmat, camera.K, camera.center)]
+
+
+class _RecordedPart(Generic[Result]):
+    """The recorded work on one part, stage by stage, what it reads, and the result that a repetition overwrites."""
 
     def __init__(self, work: Callable[[Observed, Stages], Result], observed: Observed, stages: Stages) -> None:
         """Do the work on a copy of `observed`, and record it."""
@@ -65,7 +84,7 @@ class _RecordedView(Generic[Result]):
 
         self.result = work(self._observed, recorded)
         self.is_repeatable = all(recording.is_repeatable for _, recording in self._recordings)
-        if self.is_repeatable and observed.target.device.type in GRAPHED_ON:
+        if self.is_repeatable and observed.images[0].device.type in GRAPHED_ON:
             with suppress(RuntimeError):  # then single calls are repeated
                 for _, recording in self._recordings:
                     recording.capture()
@@ -85,7 +104,7 @@ class _RecordedView(Generic[Result]):
 
 
 class StepReplay(Generic[Result]):
-    """Does the work of a step on each view of a batch: at first as written, later by repeating a recording.
+    """Does the work of a step on each part of a batch: at first as written, later by repeating a recording.
 
     `counts` has how many steps were `launched` call by call and how many were `replayed`, and how many of those that
     were launched were recorded (`recordings`); on a GPU the calls of a recording are captured as CUDA graphs.
@@ -95,41 +114,41 @@ class StepReplay(Generic[Result]):
         """Start without a recording."""
         self.counts = {"launched": 0, "replayed": 0, "recordings": 0}
         self._signature: Hashable = None
-        self._recorded: list[_RecordedView[Result]] = []  # one for each view of a batch
+        self._recorded: list[_RecordedPart[Result]] = []  # one for each part of a batch
         self._is_repeatable = True
 
     def __call__(
         self,
         signature: Hashable,
-        views: Sequence[View],
+        parts: Sequence[Sequence[View]],
         work: Callable[[int, Observed, Stages], Result],
         of_all: Callable[[Callable[[int, Stages], Any]], list[Any]],
     ) -> list[Result]:
-        """Return the results of all views; a later call overwrites the tensors in them.
+        """Return the results of all parts; a later call overwrites the tensors in them.
 
         Args:
             signature: all that the work depends on, except values of tensors; None: it must not be recorded.
-            views: the views of the batch.
-            work: does the work on one view, whose index is its first argument. All calculations are inside of stages.
-            of_all: calls a function for each index of a view, and returns the results in this order.
+            parts: the views of the batch that are rendered together, of equal size.
+            work: does the work on one part, whose index is its first argument. All calculations are inside of stages.
+            of_all: calls a function for each index of a part, and returns the results in this order.
         """
-        observed = [Observed(view.camera, view.time, view.target) for view in views]
-        signature = None if signature is None else (signature, *[view.signature for view in observed])
+        observed = [Observed.of(views) for views in parts]
+        signature = None if signature is None else (signature, *[part.signature for part in observed])
         is_new = signature is None or signature != self._signature
         if is_new:
             self._signature, self._recorded, self._is_repeatable = signature, [], True
         if recorded := self._recorded:
             with suppress(OutdatedError):  # then the work is recorded anew
                 results = of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
-                for view in recorded:
-                    view.check()
+                for part in recorded:
+                    part.check()
                 self.counts["replayed"] += 1
                 return results
         self.counts["launched"] += 1
         if is_new or not self._is_repeatable:
             return of_all(lambda index, stages: work(index, observed[index], stages))
-        recorded = of_all(lambda index, stages: _RecordedView(partial(work, index), observed[index], stages))
-        self._is_repeatable = all(view.is_repeatable for view in recorded)
+        recorded = of_all(lambda index, stages: _RecordedPart(partial(work, index), observed[index], stages))
+        self._is_repeatable = all(part.is_repeatable for part in recorded)
         self._recorded = recorded if self._is_repeatable else []
         self.counts["recordings"] += self._is_repeatable
-        return [view.result for view in recorded]
+        return [part.result for part in recorded]

@@ -21,6 +21,7 @@ from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, View
 from gsbench.train.step import Step, fitting_threads
+from gsbench.train.step_replay import Observed
 
 BACKGROUND = torch.tensor([0.1, 0.5, 0.9])
 
@@ -32,8 +33,10 @@ def views(count: int, size: int = 40) -> list[View]:
     for i in range(count):
         viewmat = viewmats[0].clone()
         viewmat[2, 3] += 0.3 * i
+        K = Ks[0].clone()
+        K[:2, :2] *= 1 + 0.1 * i
         image = torch.rand(size - 3, size, 3, generator=g)
-        batch.append(View(str(i), Camera(viewmat, Ks[0], size, size - 3), 0.1 + 0.2 * i, image))
+        batch.append(View(str(i), Camera(viewmat, K, size, size - 3), 0.1 + 0.2 * i, image))
     return batch
 
 
@@ -123,10 +126,14 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) 
     ("name", "agr", "classed"),
     [("7dgs", True, False), ("4dgs", False, False), ("7dgs", True, True), ("4dgs", True, True)],
 )
-def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, classed: bool, place: Place) -> None:
+def test_a_training_step_s_gradients_are_the_reference_s(
+    name: str, agr: bool, classed: bool, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
     blending, projection, colours and slices to the parameters, or in the sum over views."""
     torch.set_num_threads(1)  # the shim runs in one
+    if place.name == "cuda":
+        monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", (place.device,))
 
     def step(backend: Backend, device: str) -> dict[str, Tensor]:
         fitting = fitted(name, agr=agr, classed=classed).to(device)
@@ -141,6 +148,64 @@ def test_a_training_step_s_gradients_are_the_reference_s(name: str, agr: bool, c
     for key, expected in want.items():
         assert expected.any(), key
         assert (got[key].cpu() - expected).norm() <= 1e-3 * expected.norm(), key
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(
+    ("name", "agr", "read_twice"),
+    [("3dgs", False, ["means"]), ("4dgs", False, ["times"]), ("7dgs", True, []), ("ubs", False, [])],
+)
+def test_views_together_have_the_bits_of_views_one_by_one(
+    name: str, agr: bool, read_twice: list[str], place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a view that reads another's slice, camera or target, and gradients that are lost or added twice.
+
+    Gradients are added from the last view to the first. What two operations of a view read has no sum for each view.
+    """
+    torch.set_num_threads(1)
+    monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", (place.device,))
+    fitting, batch = fitted(name, agr=agr).to(place.device), [view.to(place.device) for view in views(4)]
+    fitting.backend = AUTO
+    step = Step(fitting, BACKGROUND.to(place.device), 0.2, False, StageClock(place.device))
+    (together,) = step(batch)
+    of_together = gradients(fitting)
+    sums: dict[int, Tensor] = {}
+    single = []
+    for i in (3, 2, 1, 0):
+        seed = torch.full((1,), 0.25, device=place.device)
+        single.append(step._of_part([i], Observed.of(batch[i : i + 1]), step.parameters, sums, seed, step.stages))
+    assert together.views == [0, 1, 2, 3]
+    for key in ("loss", "drawn", "g_means2d"):
+        got, want = getattr(together, key), torch.cat([getattr(result, key) for result in reversed(single)])
+        assert torch.equal(got, want) or place.device == "cuda", key
+    for key, parameter in fitting.named_parameters():
+        got, want = of_together[key], sums[id(parameter)]
+        assert want.any()
+        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))
+        assert torch.equal(got, want) or place.device == "cuda" or key.removeprefix("splats.") in read_twice, key
+
+
+def test_views_that_cannot_be_rendered_together_are_parts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches images of two sizes in one launch, results in another order than their views', and a map or a term of the
+    loss that sees one view of several."""
+    monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", ("cpu",))
+    fitting, (a, b, c), (small,) = fitted("4dgs"), views(3), views(1, 30)
+    step = Step(fitting, BACKGROUND, 0.2, False, StageClock())
+    near = replace(b, camera=replace(b.camera, near=0.5))
+    in_bytes = replace(c, pixels=(255 * c.image).to(torch.uint8))
+    batch = [a, small, b, near, c, in_bytes]
+    results = step(batch)
+    assert [part.views for part in results] == [[0, 2, 4], [1], [3], [5]]
+    for part in results:
+        for i, drawn, loss in zip(part.views, part.drawn, part.loss, strict=True):
+            (alone,) = step(batch[i : i + 1])
+            assert torch.equal(drawn, alone.drawn[0])
+            torch.testing.assert_close(6 * loss, alone.loss[0])
+    single = [[i] for i in range(6)]
+    assert [part.views for part in step(batch, maps=[lambda image, _: image])] == single
+    assert [part.views for part in step(batch, terms=[(0.0, lambda *_: torch.zeros(()))])] == single
+    monkeypatch.setattr(type(fitting), "decodes", True)
+    assert [part.views for part in step(batch)] == single
 
 
 @pytest.mark.usefixtures("threads", "instruction_set")

@@ -15,7 +15,7 @@ from gsbench.train import checkpoint, divergence
 from gsbench.train.batches import generator
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.divergence import DivergedError, FiniteCheck
-from gsbench.train.step import ViewResult
+from gsbench.train.step import PartResult
 
 
 def parameter(gradient: list[float] | None) -> nn.Parameter:
@@ -79,7 +79,7 @@ def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
     run = trainer("7dgs", "train.curve_points=1", "train.checkpoint_minutes=0")
     real = run.gradients
 
-    def poisoned(batch: Sequence[View], *penalties: object) -> list[ViewResult]:
+    def poisoned(batch: Sequence[View], *penalties: object) -> list[PartResult]:
         views = real(batch, *penalties)
         if run.step == 5:
             run.model.splats["log_diagonal"].grad[POISONED, -1] = math.nan

@@ -11,7 +11,7 @@ from gsbench.scenes.scene import View
 from gsbench.train.batches import batch, generator
 from gsbench.train.hooks.penalties import PenaltiesConfig
 from gsbench.train.regularisers import PENALTIES
-from gsbench.train.step import Sums, ViewResult, add_up, deal
+from gsbench.train.step import PartResult, Sums, add_up, deal
 
 
 def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
@@ -84,7 +84,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     drawn = torch.zeros(3, 1, N, dtype=torch.bool)
     for view in range(3):
         drawn[view, 0, view] = True  # each view sees the Gaussian of its number
-    results = [ViewResult(torch.ones(()), of_view, torch.zeros(1, N, 2), {}) for of_view in drawn]
+    results = [PartResult([i], torch.ones(1), drawn[i], torch.zeros(1, N, 2), {}) for i in range(3)]
     fitted.gradients = lambda *_: results
     moved = []
     fitted.optimizer.step = lambda _, drawn, __: moved.append(drawn)

@@ -19,7 +19,7 @@ from gsbench.train.density.rule import DensificationRule
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
-from gsbench.train.step import ViewResult
+from gsbench.train.step import PartResult
 
 # The most Gaussians that a training may have, if `train.densify.max_gaussians` does not say it: one for so many pixels
 # of the training views, but at least so many times the initial number. With more, long trainings of small scenes take
@@ -54,15 +54,15 @@ class DensityControl:
         self.limit = gaussian_limit(train.densify.max_gaussians, scene.train, len(rows))
         self._is_full = False  # whether the limit was reached
 
-    def accumulate(self, step: int, views: Sequence[View], results: Sequence[ViewResult]) -> None:
+    def accumulate(self, step: int, views: Sequence[View], results: Sequence[PartResult]) -> None:
         """Accumulate the gradients of a step, while Gaussians are densified, and prepare the model for a round."""
         if step < self.schedule.densify_stop:
-            for view, result in zip(views, results, strict=True):
-                width, height = view.camera.width, view.camera.height
-                self.rule.accumulate(result.drawn, result.g_means2d, width, height, len(views))
+            for part in results:
+                camera = views[part.views[0]].camera
+                self.rule.accumulate(part.drawn, part.g_means2d, camera.width, camera.height, len(views))
         if self.schedule.densifies(step):
-            centers = torch.stack([view.camera.center for view in views])
-            self.rows.model.before_density(centers, torch.cat([result.drawn for result in results]))
+            centers = torch.stack([views[i].camera.center for part in results for i in part.views])
+            self.rows.model.before_density(centers, torch.cat([part.drawn for part in results]))
 
     def after_update(self, step: int, optimizer: Optimizer) -> None:
         """Add noise, densify, thin and sort the Gaussians as the schedule says."""

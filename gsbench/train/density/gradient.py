@@ -31,7 +31,7 @@ class GradientRule(DensificationRule):
 
     @torch.no_grad()
     def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
-        """Add the norms of the gradients of the 2D means in one view, in units of half the image, and count views."""
+        """Add the norms of the gradients of the 2D means in some views, in units of half the image, and count views."""
         scale = views * width / 2, views * height / 2
         if self.model.backend.serves(self.gradient) and library_of(self.gradient.device.type).has("add_density"):
             add_density(drawn, g_means2d, scale, self.gradient, self.times_visible, self.unseen)

@@ -68,7 +68,7 @@ class DensificationRule(ABC):
         height: int,
         views: int,  # in the batch
     ) -> None:
-        """Accumulate the gradients of the 2D means in one view of a batch; by default they are not used."""
+        """Accumulate the gradients of the 2D means in C views of a batch; by default they are not used."""
 
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move means by noise after a step, where `adds_noise`; `rate` is the learning rate of means, world units."""
