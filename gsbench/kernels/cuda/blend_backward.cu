@@ -11,7 +11,7 @@ __global__ void finish_kernel(BlendArgs a, BlendGrads out) {
     constexpr int GEOMETRY = Profile::MOMENTS;
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    for (int64_t c = 0; c < a.C; ++c) {
+    for (int64_t c = blockIdx.y; c < a.C; c += gridDim.y) {
         const int64_t s = c * a.N + i;
         const float* sums = out.scratch + s * (GEOMETRY + a.D);
         bool any = false;
@@ -65,7 +65,10 @@ void backward(SumUp sum_up, const BlendArgs& a, const BlendState& picture, const
                out.background, first);
     }
     if (a.N == 0) return;
-    launch(a.shapes ? finish_kernel<Beta> : finish_kernel<Gaussian>, blocks_for(a.N), THREADS, stream, a, out);
+    // The gradients of a colour or shape that all cameras see are added up in one thread.
+    const bool per_camera = a.color_per_camera && (!a.shapes || a.shape_per_camera);
+    const dim3 grid(blocks_for(a.N), per_camera ? rows_for(a.C) : 1);
+    launch(a.shapes ? finish_kernel<Beta> : finish_kernel<Gaussian>, grid, THREADS, stream, a, out);
 }
 
 }  // namespace

@@ -43,6 +43,12 @@ constexpr unsigned ALL_LANES = 0xffffffffu;
 
 inline unsigned blocks_for(int64_t threads) { return static_cast<unsigned>((threads + THREADS - 1) / THREADS); }
 
+// Returns the number of rows of blocks of a kernel that has one for each camera; further cameras are taken in turns.
+inline unsigned rows_for(int64_t cameras) {
+    constexpr int64_t MOST_ROWS = 65535;
+    return static_cast<unsigned>(cameras < MOST_ROWS ? cameras : MOST_ROWS);
+}
+
 // Returns the number of blocks of a kernel whose threads loop over `numbers` numbers: at least one, and at most as many
 // as a large GPU runs at once.
 inline unsigned looping_blocks(int64_t numbers) {

@@ -87,7 +87,7 @@ __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, Project
     const int64_t i = global_thread();
     const bool exists = i < a.N;
     GaussianGrad<float> sum{};
-    for (int64_t c = 0; c < a.C; ++c) {
+    for (int64_t c = blockIdx.y; c < a.C; c += gridDim.y) {
         GaussianGrad<float> grad{};
         if (exists) {
             const Camera camera = camera_of(a, c);
@@ -109,15 +109,16 @@ __global__ void project_backward_kernel(ProjectArgs a, SplatGrads grads, Project
 
 void project(const ProjectArgs& a, const Splats& out, Stream stream) {
     if (a.N == 0) return;
-    constexpr int64_t MOST_ROWS = 65535;  // of blocks; further cameras are taken in turns
-    const dim3 grid(blocks_for(a.N), static_cast<unsigned>(a.C < MOST_ROWS ? a.C : MOST_ROWS));
+    const dim3 grid(blocks_for(a.N), rows_for(a.C));
     launch(a.shapes ? project_kernel<Beta> : project_kernel<Gaussian>, grid, THREADS, stream, a, out);
 }
 
 void project_backward(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out, Stream stream) {
     if (a.N == 0) return;
-    launch(a.shapes ? project_backward_kernel<Beta> : project_backward_kernel<Gaussian>, blocks_for(a.N), THREADS,
-           stream, a, grads, out);
+    // The gradients of a Gaussian that all cameras see are added up in one thread.
+    const dim3 grid(blocks_for(a.N), a.gaussian_per_camera ? rows_for(a.C) : 1);
+    launch(a.shapes ? project_backward_kernel<Beta> : project_backward_kernel<Gaussian>, grid, THREADS, stream, a,
+           grads, out);
 }
 
 }  // namespace gsb::cuda

@@ -102,7 +102,10 @@ class Hook:
         """Raise InputError if the settings ask for what the scene cannot give."""
 
     def loss_terms(self, step: int, views: Sequence[View]) -> Sequence[LossTerm]:
-        """Return terms that are added to the loss of each view of a step; threads call them at the same time."""
+        """Return terms that are added to the loss of each view of a step; threads call them at the same time.
+
+        On a GPU, a step with terms or image maps renders its views one by one, which takes more launches.
+        """
         return ()
 
     def groups(self) -> dict[str, TrainedGroup]:
