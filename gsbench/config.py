@@ -34,10 +34,12 @@ class DataConfig:
     repair: list[str] | None = key(None, "damaged images, replaced by the frame before")
     background: str = key("black", "background of images", choices=("black", "white"))
     initial_lambda: float = key(0.5, "initial lambda_d of 7DGS")
-    initial_lambda_t: float = key(0.5, "its initial lambda_t", absent=0.5)
-    initial_points: int = key(100_000, "random points, if needed", low=4)
-    initial_half_width: float | None = key(1.3, "of their cube; null: what all cameras see", low=1e-6, high=1e6)
-    near: float | None = key(None, "least depth, user's units; null: 0.01 trained units", low=1e-6, high=1e6)
+    initial_lambda_t: float = key(0.5, "initial lambda_t of 7DGS", absent=0.5)
+    initial_points: int = key(100_000, "random points, if the scene has none", low=4)
+    initial_half_width: float | None = key(
+        1.3, "of the cube of random points; null: what all cameras see", low=1e-6, high=1e6
+    )
+    near: float | None = key(None, "least depth, in your units; null: 0.01 units of the training", low=1e-6, high=1e6)
 
 
 @dataclass
@@ -47,7 +49,9 @@ class SceneConfig:
     name: str = key(REQUIRED, "folder in data.root")
     released_as: str | None = key(None, "folder in the published data, if different", role="place")
     downscale: int = key(1, "divisor of the image size", low=1, high=10_000)
-    resize: str | None = key(None, "its filter; null: area; pillow: bicubic, 8 bits, as 3DGS", choices=("pillow",))
+    resize: str | None = key(
+        None, "filter of downscale; null: area; pillow: bicubic, 8 bits, as 3DGS", choices=("pillow",)
+    )
     eval_split: str = key("test", "evaluated views; val for D-NeRF lego", choices=("test", "val"))
     val_every: int | None = key(None, "every n-th training view becomes val", low=2)
     frames: list[int] | None = key(None, "first and last frame; null: all")
@@ -59,7 +63,7 @@ class InitConfig:
     """Start the training from the Gaussians of a PLY file: `+init.ply=FILE`."""
 
     ply: str | None = key(None, "trained Gaussians of 3DGS", role="place")
-    ply_sha256: str | None = key(None, "its hash; null: computed")
+    ply_sha256: str | None = key(None, "hash of the file; null: computed")
 
 
 @dataclass
@@ -86,7 +90,7 @@ class ModelConfig:
     min_opacity: float = key(0.005, "Gaussians of lower opacity are pruned", low=0, high=0.25)  # resets: to twice it
     gate: str = key("off", "default of effects.gate", role="place", choices=("off", "end", "both"))
     candidates: dict[str, Any] = key({}, "the models among which model=auto chooses")
-    compared: dict[str, Any] = key({}, "more of them, with effects.compare=true", needs="effects.compare")
+    compared: dict[str, Any] = key({}, "more candidates, with effects.compare=true", needs="effects.compare")
     lr: dict[str, LearningRate] = key({}, "of each parameter group")
     options: dict[str, Any] = key({}, "arguments of the class")
 
@@ -108,7 +112,7 @@ class DensifyConfig:
     reset_every: int | None = key(3_000, "steps between opacity resets; null: none", low=1)
     grad_threshold: float = key(2e-4, "least mean gradient of a 2D mean, per half image", low=0)
     clone_below: float = key(0.01, "clone if the largest scale is below this share of the extent, else split", low=0)
-    prune_above: float = key(0.1, "prune above this share, after an opacity reset", low=0)
+    prune_above: float = key(0.1, "prune above this share of the extent, after an opacity reset", low=0)
     thin_to: float | None = key(None, "share of Gaussians kept after `stop`, by blend weight", low=1e-3, high=1)
     max_gaussians: int | None = key(None, "most Gaussians; null: one for 64 training pixels", low=4)
     noise: float = key(5e5, "of mcmc: factor of noise on means", low=0, absent=5e5)
@@ -128,7 +132,7 @@ class TrainConfig:
     lambda_from: int = key(15_000, "step from which lambda_t and lambda_d learn", low=0)
     densify: DensifyConfig = group(DensifyConfig)
     cooldown_from: int | None = key(None, "step from which rates fall to a tenth", low=0)
-    coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until 3,000")
+    coarse: list[list[int]] | None = key(None, "[[4, 3000]]: a quarter of the width until step 3,000")
     curve_points: int = key(20, "measurements on val", low=1, high=10_000)  # a page can draw so many
     checkpoint_minutes: float = key(2.0, "time between two checkpoints", unit="minutes", low=0, role="place")
 
@@ -159,7 +163,7 @@ class EffectsConfig:
     """Remove time, direction and AGR from Gaussians that do not need them (docs/effects.md)."""
 
     gate: str = key(
-        "${model.gate}", "end: after training; both: also during it", choices=("off", "end", "both"), absent="off"
+        "${model.gate}", "end: after the training; both: during it too", choices=("off", "end", "both"), absent="off"
     )
     budget_db: float = key(
         0.05, "val PSNR that removal at the end may cost", unit="dB", low=0, high=10, needs="effects.gate"
@@ -168,9 +172,11 @@ class EffectsConfig:
         None, "lifetime above which Gaussians become static after densification, as in 3D-4DGS", unit="clips", low=0
     )
     compare: bool = key(False, "choose for model=auto by val PSNR, after 70 % of the steps", absent=False)
-    most_seconds: float | None = key(None, "most seconds until then", unit="s", low=0, needs="effects.compare")
+    most_seconds: float | None = key(
+        None, "most seconds of a model until this choice", unit="s", low=0, needs="effects.compare"
+    )
     most_frame_ms: float | None = key(
-        None, "most milliseconds of a frame then", unit="ms", low=0, needs="effects.compare"
+        None, "most milliseconds of a model's frame", unit="ms", low=0, needs="effects.compare"
     )
 
 
@@ -185,11 +191,11 @@ class LaunchConfig:
     cpus: int = key(4, "CPUs of a job", low=1)
     gpus: int | None = key(None, "GPUs of a job; use device=cuda", low=0)
     memory: str = key("8G", "of a job, as in sbatch")
-    setup: str = key(":", "shell line before it: `module load cuda`")
+    setup: str = key(":", "shell line before each job: `module load cuda`")
     requeues: int = key(20, "most jobs that continue a run", low=0)
-    signal_seconds: int = key(120, "before the limit, when a job saves", unit="seconds", low=1, high=65535)
+    signal_seconds: int = key(120, "a job saves so long before its limit", unit="seconds", low=1, high=65535)
     container: str | None = key(None, "Apptainer image of jobs")
-    container_command: str = key("apptainer exec", "runs a command in it")
+    container_command: str = key("apptainer exec", "runs a command in the image")
     sbatch: dict[str, Any] = key({}, "more options: +launch.sbatch.account=NAME")
 
 
@@ -201,7 +207,7 @@ class Config:
     experiment: str = key(REQUIRED, "the +exp= file", role="measuring")
     seed: int = key(0, "of every random number", low=0, high=2**63 - 1)
     device: str = key("cpu", "or cuda, cuda:1")
-    agr: bool = key("${model.agr}", "the neural refinement")
+    agr: bool = key("${model.agr}", "the neural refinement of 7DGS")
     optim: str = key("adam", "sparse_adam: only visible Gaussians", choices=("adam", "sparse_adam"))
     results: str = key("results", "folder of all results", role="launching")
     resume: bool = key(True, "false: start over", role="launching")

@@ -71,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("run", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     add("--ply", type=Path, metavar="OUT.ply", help="write the 3D Gaussians of one slice")
-    add("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame of a clip over time")
+    add("--plys", type=Path, metavar="FOLDER", help="write a slice for each frame, at times from 0 to 1")
     add("--video", type=Path, metavar="OUT.mp4", help=f"write a video along --path, {VIDEO_SIDE} pixels high or more")
     add("--images", type=Path, metavar="FOLDER", help="write the frames of that video as PNG")
     add("--time", type=float, help="of the slice, in [0, 1]; in a video time then stands still")

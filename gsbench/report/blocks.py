@@ -13,8 +13,6 @@ from gsbench.report.intervals import Values, estimate
 from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
 from gsbench.report.section import EMPTY, Column, Section, number
-from gsbench.report.sections import tested
-from gsbench.report.sections.effects import is_single
 from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
@@ -145,33 +143,6 @@ def cost(published: Path) -> str:
     of = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
     of = of.loc[list(lengths.values())].set_axis(pd.Index(lengths, name="iterations"))
     return reached(of.psnr_db[models], of.train_s[models])
-
-
-def effects(published: Path) -> str:
-    """Return what time, direction and AGR gain and cost, alone and given both others.
-
-    Where there is a nested gain, with 7DGS without direction in place of 4DGS, it is taken instead.
-    """
-    chapter = only(published, "frontier")
-    tests = tested(chapter)
-    tests = tests[tests.section == "effects"].set_index("name")
-    gains = tests[tests.quantity == "psnr_db"]
-    # Names are "time alone", "time, with direction" (left out here), "time, with direction and AGR".
-    single = [name for name in gains.index if is_single(name) and (" alone" in name or " and " in name)]
-    single = [name for name in single if not name.endswith("nested")]
-    names = [f"{name}, nested" if f"{name}, nested" in gains.index else name for name in single]
-    table = changes(gains.loc[names])
-    for quantity in ("train_s", "frame_ms", "model_mb"):
-        table[quantity] = tests[tests.quantity == quantity]["mean"].loc[names]
-    effect = [name.replace(" alone", "").replace(", with", " given") for name in single]
-    units = {
-        "mean": ("PSNR, dB", 2),
-        "train_s": ("training, s", 1),
-        "frame_ms": ("frame, ms", 2),
-        "model_mb": ("model, MB", 2),
-    }
-    columns = {name: Column(title, digits, signed=True) for name, (title, digits) in units.items()}
-    return block(table.set_axis(pd.Index(effect, name="effect")), **columns)
 
 
 def ablation(published: Path) -> str:
@@ -421,7 +392,6 @@ _OF_RESULTS = (
     dnerf100,
     dnerf100_rivals,
     table1,
-    effects,
     suite_kinds,
     choices,
     lengths,

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 class LengthsKey:
     """The key of this hook."""
 
-    lengths: int | None = key(None, "4: also train 1/2, 1/4, 1/8 of it; keep the best on val", low=2, high=8)
+    lengths: int | None = key(
+        None, "4: also train 1/2, 1/4, 1/8 of the iterations; keep the best on val", low=2, high=8
+    )
 
 
 @dataclass

@@ -29,7 +29,7 @@ class PenaltyConfig:
 
     weight: float = key(0.0, "factor of the term", low=0, absent=0)
     start: int = key(0, "first step", low=0, absent=0)
-    stop: int | None = key(None, "step after the last", low=0)
+    stop: int | None = key(None, "first step without it", low=0)
 
 
 @dataclass
