@@ -72,7 +72,7 @@ class LearningRate:
 
     start: float = key(REQUIRED, "at the first step", low=0, high=inf)
     end: float | None = key(None, "at the last step; null: constant", low=0, high=inf)
-    until: int | None = key(None, "step of the end; null: the last", low=1)
+    until: int | None = key(None, "step of `end`; null: the last", low=1)
     per_extent: bool = key(False, "the rate is multiplied by the scene's extent")
     per_run: bool = key(False, "the rate is multiplied by sqrt(recipe_iterations / iterations)")
 

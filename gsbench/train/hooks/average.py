@@ -27,7 +27,7 @@ EVERY = 10  # every tenth step is added: nearby steps hardly differ, and adding 
 class AverageKey:
     """The key of this hook."""
 
-    average_from: int | None = key(None, "first step of an average that replaces the end if better on val", low=0)
+    average_from: int | None = key(None, "step from which parameters are averaged; kept if better on val", low=0)
 
 
 class Average(Hook):
