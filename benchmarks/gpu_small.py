@@ -8,11 +8,10 @@ import torch
 from benchmarks.scene import camera, gaussians, model
 from gsbench.kernels.adam import adam_all, flag_arrays
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import RasterInputs, Viewport, add_density, backward_by_splat
+from gsbench.kernels.raster import RasterInputs, Viewport, add_density, backward_by_splat, enqueue
 from gsbench.models import CameraTime
 from gsbench.models.gaussian_batch import tensors_of
 from gsbench.raster import EPS2D, FAR, NEAR, rasterize
-from gsbench.raster.native import draw_within
 
 VIEWPORT = Viewport(70, 50, NEAR, FAR, EPS2D, antialias=False)
 MODELS = (("3dgs", {}), ("4dgs", {}), ("6dgs", {}), ("7dgs", {}), ("7dgs", {"factor_order": "paper"}))
@@ -31,9 +30,7 @@ def main() -> None:
                 (output.image.square().sum() + output.alpha.sum()).backward(retain_graph=True)
         for room in (100, 100_000):  # too few pairs, too many
             with torch.no_grad():
-                draw_within(
-                    RasterInputs(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D)), VIEWPORT, room
-                )
+                enqueue(RasterInputs(*arguments[:3], colors[None], *arguments[4:], colors.new_zeros(D)), VIEWPORT, room)
     center = torch.tensor([0.0, 0.0, -4.0], device="cuda")
     for name, options in MODELS:
         batch = model(name, 500, agr=True, **options).cuda().slice(CameraTime.at(center, 0.4))

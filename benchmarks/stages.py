@@ -10,7 +10,7 @@ from benchmarks.scene import trained
 from benchmarks.timing import Row
 from benchmarks.training import adam_of, one_view, training_step
 from gsbench.kernels.headers import ALPHA_MAX, ALPHA_MIN, HIDDEN, TRANSMITTANCE_MIN
-from gsbench.kernels.operation import Operation
+from gsbench.kernels.operation import Operation, Results
 from gsbench.kernels.raster import RasterInputs, Splats, Viewport, bin_tiles, flag_values
 from gsbench.kernels.tape import Tape
 from gsbench.models import CameraTime, GaussianModel
@@ -94,9 +94,11 @@ class Recording(Tape):
         super().__init__()
         self.calls: dict[str, Call] = {}
 
-    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
+    def record(
+        self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any], results: Results | None
+    ) -> list[Tensor]:
         call = self.calls[operation.name] = Call(operation, tensors, numbers)
-        return super().record(call, tensors, numbers)
+        return super().record(call, tensors, numbers, results)
 
 
 def recorded(fitted: GaussianModel, view: View) -> dict[str, Call]:
@@ -168,7 +170,7 @@ def binning(name: str, calls: dict[str, Call]) -> Iterator[Row]:
     project, blend = calls["project"], calls["blend"]
     means, factors, opacities, viewmats, Ks, _ = project.tensors
     values = means, factors, opacities, blend.tensors[3], viewmats, Ks, blend.tensors[4]
-    splats, viewport, flags = Splats(*project.outputs), Viewport(*project.numbers), torch.zeros(1, dtype=torch.int64)
+    splats, viewport = Splats(*project.outputs), Viewport(*project.numbers)
     yield Row(
         "stages", f"{name} check values", lambda: flag_values(RasterInputs(*values)), floor=("bytes", _bytes(values))
     )
@@ -176,7 +178,7 @@ def binning(name: str, calls: dict[str, Call]) -> Iterator[Row]:
     yield Row(
         "stages",
         f"{name} bin",
-        lambda: bin_tiles(splats, viewport, flags),
+        lambda: bin_tiles(splats, viewport),
         floor=("bytes", read + _bytes(blend.tensors[5:7])),
     )
 

@@ -383,5 +383,7 @@ GSB_FIELDS(ArrayFlags, OUTPUTS, flags, skip)
 #define GSB_CONST_2(A, B) const A&, const B&
 #define GSB_CONST_3(A, B, C) const A&, const B&, const C&
 #define GSB_CONST_4(A, B, C, D) const A&, const B&, const C&, const D&
-#define GSB_PICK(_1, _2, _3, _4, picked, ...) picked
-#define GSB_PARAMETERS(...) GSB_PICK(__VA_ARGS__, GSB_CONST_4, GSB_CONST_3, GSB_CONST_2, GSB_CONST_1)(__VA_ARGS__)
+#define GSB_CONST_5(A, B, C, D, E) const A&, const B&, const C&, const D&, const E&
+#define GSB_PICK(_1, _2, _3, _4, _5, picked, ...) picked
+#define GSB_PARAMETERS(...) \
+    GSB_PICK(__VA_ARGS__, GSB_CONST_5, GSB_CONST_4, GSB_CONST_3, GSB_CONST_2, GSB_CONST_1)(__VA_ARGS__)

@@ -23,6 +23,7 @@ from gsbench.kernels.tensors import check_tensor
 
 Tensors = list[Tensor]  # an input that is left out is an empty 1D tensor
 Sizes = dict[str, int]
+Results = tuple[Tensors, Slots]  # outputs of a call, and the kernel arguments that its backward pass needs
 Shape = tuple[int | str, ...]
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
@@ -152,13 +153,23 @@ class Operation:
         for (key, declared), x in zip(self.inputs.items(), tensors, strict=False):
             if declared.gradient is Gradient.REFUSED and x.requires_grad:
                 raise InputError(f"{self.name} has no gradient by {key}: detach it")
+        return self.record(tensors, numbers)
+
+    def record(self, tensors: Tensors, numbers: tuple[Any, ...], results: Results | None = None) -> Tensors:
+        """Return the outputs of a call, recorded for the backward pass.
+
+        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`; what looks at
+        each operator sees this one, which computes them again.
+        """
         if (recording := getattr(active, "tape", None)) is not None:
-            return recording.record(self, tensors, numbers)
+            return recording.record(self, tensors, numbers, results)
         differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
         if torch.compiler.is_compiling() or (differentiated and _get_current_dispatch_mode() is not None):
             traced: Tensors = self._traced(tensors, *numbers)
             return traced
-        return list(_Eager.apply(self, numbers, *tensors)) if differentiated else self.run(tensors, numbers)[0]
+        if differentiated:
+            return list(_Eager.apply(self, numbers, results, *tensors))
+        return (results or self.run(tensors, numbers))[0]
 
     def _in_order(self, arguments: tuple[Any, ...], by_name: dict[str, Any]) -> tuple[Any, ...]:
         """Return the arguments of a call in the order of the declaration; None has become the default."""
@@ -186,16 +197,18 @@ class Operation:
 
     # ---- forward and backward
 
-    def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
-        """Run the forward kernel; return the outputs, and the kernel arguments that the backward pass needs.
+    def run(self, tensors: Tensors, numbers: Sequence[Any]) -> Results:
+        """Run the forward kernel. The call is not recorded for the backward pass."""
+        outputs, slots = self.allocate_results(tensors, numbers)
+        library_of(tensors[0].device.type).call(self.name, slots, tensors[0])
+        return outputs, slots
 
-        The call is not recorded for the backward pass.
-        """
-        slots, like, outputs = self.prepare(tensors, numbers), tensors[0], []
+    def allocate_results(self, tensors: Tensors, numbers: Sequence[Any]) -> Results:
+        """Allocate the outputs of a call, and return them with the arguments of the forward kernel."""
+        slots, outputs = self.prepare(tensors, numbers), []
         for key, shape in self._out:
-            outputs.append(allocate(self._memory, like, _filled(shape, slots)))
+            outputs.append(allocate(self._memory, tensors[0], _filled(shape, slots)))
             slots[key] = outputs[-1].data_ptr()
-        library_of(like.device.type).call(self.name, slots, like)
         return outputs, slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
@@ -347,8 +360,10 @@ class _Eager(torch.autograd.Function):
     """A call of an operation that autograd records, in half the time that the registered operator takes."""
 
     @staticmethod
-    def forward(ctx: Any, operation: Operation, numbers: tuple[Any, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
-        outputs, _ = operation.run(list(tensors), numbers)
+    def forward(
+        ctx: Any, operation: Operation, numbers: tuple[Any, ...], results: Results | None, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        outputs, _ = results or operation.run(list(tensors), numbers)
         ctx.operation, ctx.numbers, ctx.inputs = operation, numbers, len(tensors)
         ctx.save_for_backward(*tensors, *outputs)
         carries = operation.carries_gradient(outputs)
@@ -360,13 +375,12 @@ class _Eager(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Any, ...]:
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
-        operation, wanted = ctx.operation, ctx.needs_input_grad[2:]
+        operation, wanted = ctx.operation, ctx.needs_input_grad[3:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
         gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
         # Unlike the registered operator, it makes no zeros that nobody asked for.
         return (
-            None,
-            None,
+            *[None] * 3,
             *[
                 (torch.zeros_like(x) if g is None else g) if asked else None
                 for x, g, asked in zip(tensors, gradients, wanted, strict=True)

@@ -1,6 +1,6 @@
 """Rasterize 3D Gaussians by kernels: project them, list the intersections of each tile, and blend them into images."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -10,13 +10,26 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels import recording
 from gsbench.kernels.headers import TILE
-from gsbench.kernels.library import Library, allocate, library_of
-from gsbench.kernels.operation import Gradient, Input, Operation, Output, address, in_rows
+from gsbench.kernels.library import Slots, allocate, library_of
+from gsbench.kernels.operation import (
+    MOST_KNOWN,
+    Gradient,
+    Input,
+    Operation,
+    Output,
+    Results,
+    Tensors,
+    address,
+    in_rows,
+)
 from gsbench.process.memory import require
 
+Numbers = tuple[Any, ...]  # the arguments of an operation that are not tensors
 TILE_PIXELS = TILE * TILE
+PAIRS = "lists of each tile's Gaussians"  # what needs memory, where it does not suffice
 MAX_PAIRS = (1 << 31) - 1  # splats and tile intersections (pairs of tile and splat) are numbered by int32
-ROOM = 2.0  # the memory for tile intersections of a recording, as a multiple of what its first image needs
+MARGIN = 1.25  # memory for tile intersections on a GPU, as a multiple of what an image needs
+ROOM = 2.0  # the same of a recording, as a multiple of what its first image needs
 GEOMETRY = 6  # numbers per splat: x, y, p, q, r, opacity; of a Beta profile its exponent too
 NEAR, FAR = 0.01, 1e10  # default range of depths; a Gaussian whose mean is outside is culled
 EPS2D = 0.3  # default number that is added to the diagonal of projected covariances, pixels^2
@@ -190,45 +203,117 @@ def flag_values(inputs: RasterInputs) -> Tensor:
 
 
 @torch.no_grad()
-def bin_tiles(splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Bins, int]:
-    """List the projected Gaussians that touch each tile, sorted by depth, and by index if depths are equal.
-
-    Also return the int64 tensor `flags` [1], which is not zero if an input is invalid, as an int. On a GPU the CPU
-    waits once for the number of tile intersections and for `flags`.
+def bin_tiles(splats: Splats, viewport: Viewport) -> Bins:
+    """List on a CPU the projected Gaussians that touch each tile, sorted by depth, and by index if depths are equal.
 
     Raises:
         InputError: there are more tile intersections than int32 can count or than fit into memory.
     """
-    library = library_of(splats.depths.device.type)
-    if not library.needs_scratch:
-        return _bin_on_cpu(library, splats, viewport), recording.read(flags, lambda values: values == [0])[0]
-    order, ends = _sort_on_gpu(library, splats, viewport, flags)
-    # The kernel leaves out intersections beyond its memory, so a repetition of four views waits for the GPU only once.
-    *total, flagged = recording.read(ends[-2:], lambda values: values[-1] == 0 and sum(values) <= room, is_late=True)
-    pairs = _checked_count(sum(total))
-    room = _recorded_room(pairs)
-    lists = _room(splats, room, is_filled=recording.current() is None)
-    bins = _list_on_gpu(library, splats, viewport, (order, ends), lists)
-    return Bins(bins.offsets, bins.ids[:pairs]), flagged
+    like, (C, N) = splats.depths, splats.depths.shape
+    library = library_of(like.device.type)
+    slots: Slots = {"N": N, "C": C, "width": viewport.width, "height": viewport.height}
+    slots |= {name: address(getattr(splats, name)) for name in ("means2d", "depths", "half_sizes")}
+    offsets = like.new_empty(C * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
+    total = like.new_empty(1, dtype=torch.int64)
+    library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
+    pairs = checked_count(recording.read(total, lambda values: values[0] <= room)[0])
+    room = pairs if recording.current() is None else int(ROOM * pairs)  # repetitions use the same memory
+    require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
+    ids = like.new_empty(room, dtype=torch.int32)
+    library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
+    return Bins(offsets, ids[:pairs])
 
 
-@torch.no_grad()
-def bin_within(splats: Splats, viewport: Viewport, flags: Tensor, room: int) -> tuple[Bins, Tensor]:
-    """List the projected Gaussians that touch each tile, as `bin_tiles` does, but without waiting for the GPU.
+class Drawing(NamedTuple):
+    """Images that a GPU draws by one call, which is not recorded for the backward pass yet."""
 
-    Memory is allocated for `room` tile intersections, and further ones are left out. Also return an int64 tensor [2]:
-    the number of intersections, and `flags`, which is not zero if an input is invalid. Without Gaussians the tensor has
-    only `flags`.
+    projection: tuple[Tensors, Numbers, Results]
+    blending: tuple[Tensors, Numbers, Results]
+    needed: Tensor  # [2] int64: the number of tile intersections; not zero if an input is invalid
+
+    @property
+    def image(self) -> Tensor:
+        """The images [C, H, W, D], without a gradient."""
+        return self.blending[2][0][0]
+
+    def record(self) -> tuple[Splats, Tensor, Tensor]:
+        """Record the call for the backward pass; return the splats, and image and alpha as `blend` does."""
+        splats = Splats(*_project.record(*self.projection))
+        (_, _, _, *further), numbers, results = self.blending
+        image, alpha, *_ = _blend.record([splats.means2d, splats.roots, splats.half_sizes, *further], numbers, results)
+        return splats, image, alpha
+
+
+def enqueue(inputs: RasterInputs, viewport: Viewport, room: int) -> Drawing:
+    """Draw images on a GPU by one call, without waiting for the GPU.
+
+    Memory is allocated for `room` tile intersections. If the images need more, further ones are left out of them.
     """
-    library = library_of(splats.depths.device.type)
-    order, ends = _sort_on_gpu(library, splats, viewport, flags)
-    lists = _room(splats, room, is_filled=False)
-    return _list_on_gpu(library, splats, viewport, (order, ends), lists), ends[-2:]
+    means, factors, opacities, colors, viewmats, Ks, background, beta_exponents = inputs
+    library, size = library_of(means.device.type), viewport[:2]
+    projection = _project.split((means, factors, opacities, viewmats, Ks, beta_exponents, *viewport))
+    splats, slots = projected = _project.allocate_results(*projection)
+    means2d, roots, depths, half_sizes = splats
+    offsets = allocate("lists of tiles", means, (len(depths) * count_tiles(*size) + 1,), torch.int32)
+    ids = allocate(PAIRS, means, (room,), torch.int32)
+    blending = _blend.split((means2d, roots, half_sizes, colors, background, offsets, ids, beta_exponents, *size))
+    blended = _blend.allocate_results(*blending)
+    needed = allocate("numbers of tiles", means, (2,), torch.int64)
+    scratch_bytes = library.extension.draw_scratch(depths.numel(), room)
+    scratch = allocate(PAIRS, means, (scratch_bytes,), torch.uint8)
+    out = {"offsets": offsets, "ids": ids, "needed": needed, "scratch": scratch}
+    slots = slots | blended[1] | {f"out.{key}": address(x) for key, x in out.items()}
+    library.call("draw", slots | {"out.room": room, "out.scratch_bytes": scratch_bytes}, means)
+    del out  # what torch.compile runs would free it before the call
+    return Drawing((*projection, projected), (*blending, blended), needed)
 
 
-def _recorded_room(pairs: int) -> int:
-    """Return for how many tile intersections to make memory: more than `pairs` if this is recorded to be repeated."""
-    return pairs if recording.current() is None else int(ROOM * pairs)
+_rooms: dict[Hashable, int] = {}  # for how many tile intersections the last call had memory, by its sizes
+
+
+def draw_on_gpu(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int, int]:
+    """Draw images on a GPU, with memory for all tile intersections. The CPU waits for the images.
+
+    Also return the number of tile intersections, and a number that is not zero if an input is invalid.
+
+    Raises:
+        InputError: there are more tile intersections than int32 can count.
+    """
+    if recording.current() is None:
+        return _draw_unrecorded(inputs, viewport)
+    with recording.paused():  # a repetition has one call, with memory for more than this image needs
+        _, pairs, _ = _draw_unrecorded(inputs, viewport)
+    room = int(ROOM * pairs)
+    drawing = enqueue(inputs, viewport, room)
+    # A repetition of four views waits for the GPU only once: the call leaves out intersections beyond its memory.
+    pairs, flagged = recording.read(drawing.needed, lambda x: x[1] == 0 and x[0] <= room, is_late=True)
+    return drawing, pairs, flagged
+
+
+def _draw_unrecorded(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int, int]:
+    """Draw as `draw_on_gpu`: with the memory of the last call, and again with more if this was too little."""
+    splats = len(inputs.viewmats) * len(inputs.means)
+    sizes = inputs.means.device, splats, viewport.width, viewport.height
+    while True:
+        room = _rooms.setdefault(sizes, splats)
+        drawing = enqueue(inputs, viewport, room)
+        pairs, flagged = drawing.needed.tolist()
+        if not pairs <= room <= 2 * pairs:
+            if len(_rooms) >= MOST_KNOWN:
+                _rooms.clear()
+            _rooms[sizes] = room_for(pairs)
+        if pairs <= room:
+            return drawing, pairs, flagged
+        del drawing  # so that the next one can have its memory
+
+
+def room_for(pairs: int) -> int:
+    """Return for how many tile intersections to allocate memory where `pairs` are expected, or a few more.
+
+    Raises:
+        InputError: there are more than int32 can count.
+    """
+    return min(int(MARGIN * checked_count(pairs)) + 1, MAX_PAIRS)
 
 
 @torch.no_grad()
@@ -256,7 +341,7 @@ def add_density(
     library_of(drawn.device.type).call("add_density", slots, drawn)
 
 
-def _checked_count(pairs: int) -> int:
+def checked_count(pairs: int) -> int:
     """Return the number of tile intersections; raise InputError if int32 cannot count them."""
     if pairs > MAX_PAIRS:
         raise InputError(
@@ -264,88 +349,3 @@ def _checked_count(pairs: int) -> int:
             "draw fewer cameras at once, a smaller image, or fewer large Gaussians"
         )
     return pairs
-
-
-def _splat_slots(splats: Splats, viewport: Viewport) -> dict[str, Any]:
-    """Return sizes and addresses of splats by the names of the arguments of `count_tiles` and `fill_tiles`."""
-    C, N = splats.depths.shape
-    addresses = dict(zip(("means2d", "roots", "depths", "half_sizes", "shapes"), map(address, splats), strict=True))
-    return {"N": N, "C": C, "width": viewport.width, "height": viewport.height} | addresses
-
-
-def _bin_on_cpu(library: Library, splats: Splats, viewport: Viewport) -> Bins:
-    like, slots = splats.depths, _splat_slots(splats, viewport)
-    offsets = like.new_empty(len(like) * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
-    total = like.new_empty(1, dtype=torch.int64)
-    library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = _checked_count(recording.read(total, lambda values: values[0] <= room)[0])
-    room = _recorded_room(pairs)  # repetitions use the same memory
-    require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
-    ids = like.new_empty(room, dtype=torch.int32)
-    library.call("fill_tiles", slots | {"out.offsets": address(offsets), "out.ids": address(ids)}, like)
-    return Bins(offsets, ids[:pairs])
-
-
-PAIRS = "lists of each tile's Gaussians"
-
-
-def _sort_on_gpu(library: Library, splats: Splats, viewport: Viewport, flags: Tensor) -> tuple[Tensor, Tensor]:
-    """Sort projected Gaussians by depth on a GPU.
-
-    Return their order [C * N] int32, and a tensor [C * N + 1] int64: the cumulative number of tile intersections in
-    this order, followed by `flags`.
-    """
-    like, count = splats.depths, splats.depths.numel()
-    keys, indices, sorted_keys, order = allocate("depths to sort", like, (4, count), torch.int32).unbind()
-    ends = allocate("numbers of tiles", like, (count + 1,), torch.int64)
-    scratch = _scratch(library, count, like)
-    out = {
-        "keys": keys,
-        "indices": indices,
-        "sorted_keys": sorted_keys,
-        "order": order,
-        "ends": ends,
-        "scratch": scratch,
-    }
-    slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
-    library.call("count_tiles", slots | {"out.scratch_bytes": len(scratch)}, like)
-    ends[-1:].copy_(flags)
-    return order, ends
-
-
-def _room(splats: Splats, pairs: int, is_filled: bool) -> tuple[Tensor, ...]:
-    """Allocate four int32 tensors [pairs] for the tile and the Gaussian of each intersection, unsorted and sorted.
-
-    The last one, the sorted Gaussians, is kept for the backward pass. Unless there will be `pairs` intersections
-    (`is_filled`), the first one is initialised to no tile, so that unused entries are sorted last.
-    """
-    rows = allocate(PAIRS, splats.depths, (3, pairs), torch.int32)
-    if not is_filled:
-        rows[0].fill_(-1)
-    return *rows.unbind(), allocate(PAIRS, splats.depths, (pairs,), torch.int32)
-
-
-def _list_on_gpu(
-    library: Library, splats: Splats, viewport: Viewport, by_depth: tuple[Tensor, Tensor], lists: tuple[Tensor, ...]
-) -> Bins:
-    """List as many tile intersections as fit into `lists`, on a GPU, and sort them by tile."""
-    like, ids = splats.depths, lists[-1]
-    tiles = len(like) * count_tiles(viewport.width, viewport.height)
-    offsets = allocate("lists of tiles", like, (tiles + 1,), torch.int32)
-    scratch = _scratch(library, len(ids), like)
-    out = dict(zip(("tiles", "splats", "sorted_tiles", "ids"), lists, strict=True))
-    out |= {"offsets": offsets, "scratch": scratch}
-    slots = _splat_slots(splats, viewport) | {f"out.{key}": address(x) for key, x in out.items()}
-    slots |= {
-        "order": address(by_depth[0]),
-        "ends": address(by_depth[1]),
-        "pairs": len(ids),
-        "out.scratch_bytes": len(scratch),
-    }
-    library.call("fill_tiles", slots, like)
-    return Bins(offsets, ids)
-
-
-def _scratch(library: Library, items: int, like: Tensor) -> Tensor:
-    """Allocate the scratch memory that the GPU needs to sort and to sum `items` numbers."""
-    return allocate("scratch space to sort", like, (library.extension.scratch_bytes(items),), torch.uint8)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from types import TracebackType
 from typing import Any, Self
@@ -38,6 +39,17 @@ class OutdatedError(Exception):
 def current() -> Recording | None:
     """Return the recording that is active in this thread, or None."""
     return getattr(_in_charge, "recording", None)
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """In a `with` block, record nothing; what the block calls is not repeated."""
+    recording, _in_charge.recording = current(), None
+    try:
+        with _disable_current_modes():
+            yield
+    finally:
+        _in_charge.recording = recording
 
 
 def read(numbers: Tensor, holds: Callable[[list[int]], bool], is_late: bool = False) -> list[int]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.library import Slots
-from gsbench.kernels.operation import Operation, active
+from gsbench.kernels.operation import Operation, Results, active
 
 
 def add_to(sums: dict[int, Tensor], gradients: dict[int, Tensor]) -> None:
@@ -66,9 +66,11 @@ class Tape:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         active.tape = self._outer
 
-    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run a kernel, and record the call if an input requires a gradient that the backward kernel computes."""
-        outputs, slots = operation.run(tensors, numbers)
+    def record(
+        self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any], results: Results | None
+    ) -> list[Tensor]:
+        """Run a kernel if there are no `results` yet; record the call if it has a gradient that an input requires."""
+        outputs, slots = results or operation.run(tensors, numbers)
         if not torch.is_grad_enabled():
             return outputs
         has_gradient = operation.differentiable(tensors)

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import Backend, resolve
-from gsbench.kernels.raster import RasterInputs, Viewport
+from gsbench.kernels.raster import RasterInputs, Viewport, enqueue, room_for
 from gsbench.models.base import GaussianModel
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.gaussian_batch import Gaussians3D, stacked
 from gsbench.raster import EPS2D, FAR, RasterOutput, rasterize
-from gsbench.raster.native import draw_within
 from gsbench.scenes.scene import Camera
 
 
@@ -90,7 +89,6 @@ def render(
     return render_slice(model, gaussians, camera, background, antialias).image[0]
 
 
-MARGIN = 1.25  # room for intersections, as a multiple of what the first image needs
 T = TypeVar("T")
 
 
@@ -108,9 +106,9 @@ class _Recording(NamedTuple):
 class GraphedFrames:
     """Render images of a model on a GPU by replaying a CUDA graph.
 
-    The first call for an image size records the graph. The graph has memory for MARGIN times as many tile
-    intersections as the first image has, so rendering needs no synchronisation before the end of an image. If an image
-    has more intersections, the graph is recorded again. The number of Gaussians must not change.
+    The first call for an image size records the graph. The graph has memory for more tile intersections than
+    the first image has (`room_for`), so rendering needs no synchronisation before the end of an image. If an image
+    has more than fit, the graph is recorded again. The number of Gaussians must not change.
     """
 
     def __init__(self, model: GaussianModel, background: Tensor, antialias: bool = False) -> None:
@@ -141,8 +139,8 @@ class GraphedFrames:
         if recording.time is not None and time is not None:
             recording.time.fill_(time)
         recording.play()
-        *pairs, flags = recording.needed.tolist()  # waits for the image
-        if flags or any(n > recording.room for n in pairs):
+        pairs, flags = recording.needed.tolist()  # waits for the image
+        if flags or pairs > recording.room:
             del self._recordings[size]
             return self(camera, time)
         return recording.image
@@ -150,7 +148,7 @@ class GraphedFrames:
     def _record(self, camera: Camera, time: float | None) -> _Recording:
         gaussians = self.model.slice(CameraTime.of(camera, time))
         drawn = rasterize_slice(gaussians, camera, self.background, self.model.backend, self.antialias)
-        room = 1 + int(MARGIN * drawn.info.pairs)
+        room = room_for(drawn.info.pairs)
         recorded = camera.clone()
         moment = None if time is None else recorded.K.new_full((), time)
         view = Viewport(camera.width, camera.height, camera.near, FAR, EPS2D, self.antialias)
@@ -160,8 +158,8 @@ class GraphedFrames:
             means, factors, opacities, colors, beta_exponents = gaussians
             camera_tensors = recorded.viewmat[None], recorded.K[None], _behind(gaussians, self.background)
             inputs = RasterInputs(means, factors, opacities, colors[None], *camera_tensors, beta_exponents)
-            blended, needed = draw_within(inputs, view, room)
-            return self.model.decode(blended, recorded), needed
+            drawing = enqueue(inputs, view, room)
+            return self.model.decode(drawing.image, recorded), drawing.needed
 
         with torch.cuda.device_of(recorded.K):
             play, (image, needed) = capture(frame)

@@ -82,7 +82,7 @@ def exact_image(
     if len(rounded.means) != N:
         raise InputError(f"expected as many Gaussians in float32 as in float64, got {len(rounded.means)} and {N}")
     records, boxes = _exact_splats(library, doubles, project(rounded, viewport), viewmat, K, viewport)
-    bins, _ = bin_tiles(boxes, viewport, torch.zeros(1, dtype=torch.int64))
+    bins = bin_tiles(boxes, viewport)
     out = ExactImage(
         torch.empty(height, width, D, dtype=torch.float64),
         torch.empty(height, width, dtype=torch.float64),

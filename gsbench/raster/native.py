@@ -1,8 +1,8 @@
 """Rasterize in float32 by the kernels for CPU and CUDA; the images equal those of the PyTorch code."""
 
-from torch import Tensor
-
 from gsbench.errors import InputError
+from gsbench.kernels import recording
+from gsbench.kernels.library import library_of
 from gsbench.kernels.raster import (
     LOWER,
     MAX_PAIRS,
@@ -10,9 +10,9 @@ from gsbench.kernels.raster import (
     RasterInputs,
     Viewport,
     bin_tiles,
-    bin_within,
     blend,
     count_tiles,
+    draw_on_gpu,
     flag_values,
     project,
 )
@@ -26,7 +26,7 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
     """Render images for all cameras by the CPU or CUDA kernels; see `gsbench.raster.rasterize`.
 
     On a CPU the results have the same bits for any number of threads. On a GPU gradients are added in random order, and
-    the call synchronises once, to read the number of tile intersections.
+    the call waits for the image, to read the number of tile intersections and whether a value was out of range.
 
     Raises:
         InputError: the intrinsics `Ks` require a gradient, a value is out of range, or the CPU memory does not suffice.
@@ -46,22 +46,17 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
         raise InputError(
             f"raster backend '{device}': expected at most {MAX_PAIRS} Gaussians times cameras, got {C * N}"
         )
-    flags = flag_values(inputs)
-    splats = project(inputs, viewport)
-    bins, flagged = bin_tiles(splats, viewport, flags)
-    if flagged:  # the kernel met a bad value: find out which one, for the error message
-        check_values(inputs)
-    image, alpha = blend(splats, inputs.colors, inputs.background, bins, viewport)
-    return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, len(bins.ids)))
-
-
-def draw_within(inputs: RasterInputs, viewport: Viewport, room: int) -> tuple[Tensor, Tensor]:
-    """Render images [C, H, W, D] without a GPU synchronisation, with memory for `room` tile intersections.
-
-    The second result, [2] int64, is the number of intersections, and a flag that is not zero if an input is out of
-    range. If the number is larger than `room`, the image is incomplete.
-    """
-    flags = flag_values(inputs)
-    splats = project(inputs, viewport)
-    bins, needed = bin_within(splats, viewport, flags, room)
-    return blend(splats, inputs.colors, inputs.background, bins, viewport)[0], needed
+    if library_of(device).has("draw"):
+        drawing, pairs, flagged = draw_on_gpu(inputs, viewport)
+        if flagged:  # the kernel met a bad value: find out which one, for the error message
+            check_values(inputs)
+        splats, image, alpha = drawing.record()
+    else:
+        flags = flag_values(inputs)
+        splats = project(inputs, viewport)
+        bins = bin_tiles(splats, viewport)
+        pairs = len(bins.ids)
+        if recording.read(flags, lambda values: values == [0])[0]:
+            check_values(inputs)
+        image, alpha = blend(splats, inputs.colors, inputs.background, bins, viewport)
+    return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, pairs))

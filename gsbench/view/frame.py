@@ -13,7 +13,7 @@ from torch import Tensor
 from gsbench.errors import InputError, one_line
 from gsbench.gates.gate import most_cost
 from gsbench.gates.picture import cost_colors, effect_set_colors
-from gsbench.kernels.operation import Operation
+from gsbench.kernels.operation import Operation, Results
 from gsbench.kernels.tape import Tape
 from gsbench.measure.images import STEPS, Pixels, inferno, rounding_image, to_bytes
 from gsbench.measure.speed import Laps
@@ -93,8 +93,15 @@ class StageWatch(Tape):
         super().__init__()
         self._laps = Laps(device)
 
-    def record(self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any]) -> list[Tensor]:
-        """Run a kernel; if a stage of the frame ends just before or just after this kernel, store the stage's time."""
+    def record(
+        self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any], results: Results | None
+    ) -> list[Tensor]:
+        """Run a kernel; if a stage of the frame ends just before or just after this kernel, store the stage's time.
+
+        A GPU's rasterizer is a single stage: one call has computed all `results`.
+        """
+        if results is not None:
+            return results[0]
         if operation.name in _FOLLOWS:
             self._laps.end(_FOLLOWS[operation.name])
         outputs, _ = operation.run(tensors, numbers)

@@ -203,15 +203,17 @@ void run(dim3 grid, dim3 size, const std::function<void()>& body) {
 
 }  // namespace shim
 
-size_t scratch_bytes(int64_t n) { return static_cast<size_t>(n); }
+size_t sort_scratch(int64_t n) { return static_cast<size_t>(n); }
 
 void need_scratch(size_t bytes, int64_t n) {  // as cub refuses
-    if (bytes < scratch_bytes(n)) throw std::runtime_error("too little scratch memory");
+    if (bytes < sort_scratch(n)) throw std::runtime_error("too little scratch memory");
 }
 
-void sort_pairs(void*, size_t bytes, const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values,
+template <class Key>
+void sort_pairs(void* scratch, size_t bytes, const Key* keys, Key* sorted_keys, const uint32_t* values,
                 uint32_t* sorted_values, int64_t n, int bits, Stream) {
     need_scratch(bytes, n);
+    std::memset(scratch, 0xff, bytes);  // cub writes there too
     const uint32_t mask = bits < 32 ? (1u << bits) - 1 : ~0u;
     std::vector<size_t> order(static_cast<size_t>(n));
     std::iota(order.begin(), order.end(), size_t{0});
@@ -223,8 +225,12 @@ void sort_pairs(void*, size_t bytes, const uint32_t* keys, uint32_t* sorted_keys
     }
 }
 
-void running_sum(void*, size_t bytes, int64_t* values, int64_t n, Stream) {
+template void sort_pairs(void*, size_t, const uint16_t*, uint16_t*, const uint32_t*, uint32_t*, int64_t, int, Stream);
+template void sort_pairs(void*, size_t, const uint32_t*, uint32_t*, const uint32_t*, uint32_t*, int64_t, int, Stream);
+
+void running_sum(void* scratch, size_t bytes, int64_t* values, int64_t n, Stream) {
     need_scratch(bytes, n);
+    std::memset(scratch, 0xff, bytes);
     std::partial_sum(values, values + n, values);
 }
 

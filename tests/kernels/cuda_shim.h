@@ -116,4 +116,6 @@ void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream, Argume
     shim::run(grid, block, [&] { kernel(static_cast<Parameters>(arguments)...); });
 }
 
+inline void fill_bytes(void* at, unsigned char value, size_t bytes, Stream) { std::memset(at, value, bytes); }
+
 }  // namespace gsb::cuda

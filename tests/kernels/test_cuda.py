@@ -8,12 +8,103 @@ import pytest
 import torch
 from raster.cases import case
 from test_raster import assert_gradients_close, differentiate
+from test_training_step import Calls
 from torch import Tensor
 
+from gsbench.kernels import raster
+from gsbench.kernels.library import CudaLibrary
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import add_density, backward_by_splat
+from gsbench.kernels.raster import add_density, backward_by_splat, room_for
+from gsbench.kernels.recording import Recording
+from gsbench.kernels.tape import Tape
+from gsbench.raster import rasterize
 
 EVERY_PIXEL = torch.ones(()).bool()
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the kernels that Python calls from here on, again in a repetition too."""
+    names, run = [], CudaLibrary._run
+
+    def noted(library: CudaLibrary, device: torch.device, name: str, *values: Any) -> None:
+        names.append(name)
+        run(library, device, name, *values)
+
+    monkeypatch.setattr(CudaLibrary, "_run", noted)
+    return names
+
+
+@pytest.mark.parametrize("name", ["three_cameras", "no_gaussian", "beta"])
+def test_a_forward_pass_is_one_call(name: str, cuda_device: str, called: list[str]) -> None:
+    """Catches kernels that Python calls one by one, each with memory of its own, or again for the backward pass."""
+    arguments = case(name, torch.float32, cuda_device)
+    differentiate(arguments, cuda_device, EVERY_PIXEL)  # which learns how many intersections there are
+    called.clear()
+    differentiate(arguments, cuda_device, EVERY_PIXEL)
+    assert called == ["draw", "blend_backward", "project_backward"]
+    arguments["means"].requires_grad_()
+    for way in (torch.no_grad, Tape):
+        called.clear()
+        with way():
+            image = rasterize(**arguments, backend=cuda_device).image
+        assert called == ["draw"]
+        assert image.requires_grad == (way is Tape)
+
+
+def test_too_little_memory_is_enlarged(cuda_device: str, called: list[str]) -> None:
+    """Catches intersections that are left out of an image, a call that is made twice each time, memory that stays as
+    large as an image needed long ago, and a repetition that makes calls with too little memory again."""
+    arguments = case("random", torch.float32, cuda_device)
+    expected, gradients = differentiate(arguments, cuda_device, EVERY_PIXEL)
+    (sizes,) = [key for key in raster._rooms if key[1:] == (60, arguments["width"], arguments["height"])]
+    for room, calls in ((1, 2), (10**6, 1), (expected.info.pairs, 1), (2 * expected.info.pairs, 1)):
+        raster._rooms[sizes] = room
+        called.clear()
+        output, actual = differentiate(arguments, cuda_device, EVERY_PIXEL)
+        assert called == ["draw"] * calls + ["blend_backward", "project_backward"]
+        assert output.info.pairs == expected.info.pairs
+        assert torch.equal(output.image, expected.image)
+        assert_gradients_close(actual, gradients)
+        fits = expected.info.pairs <= room <= 2 * expected.info.pairs
+        assert raster._rooms[sizes] == (room if fits else room_for(expected.info.pairs))
+    raster._rooms[sizes] = 1
+    with Recording() as recording, torch.no_grad():
+        image = rasterize(**arguments, backend=cuda_device).image
+    called.clear()
+    image.zero_()
+    recording.repeat()
+    recording.check()
+    assert called == ["draw"]
+    assert torch.equal(image, expected.image)
+
+
+def test_what_looks_at_operators_sees_them(cuda_device: str) -> None:
+    """Catches images that torch.compile and dispatch modes cannot differentiate, as another call has drawn them."""
+    arguments = case("three_cameras", torch.float32, cuda_device)
+    expected, gradients = differentiate(arguments, cuda_device, EVERY_PIXEL)
+    with Calls() as calls:
+        output, actual = differentiate(arguments, cuda_device, EVERY_PIXEL)
+    assert {f"gsbench.{name}.default" for name in ("project", "blend", "project_backward")} <= calls.counted.keys()
+    assert torch.equal(output.image, expected.image)
+    assert_gradients_close(actual, gradients)
+
+
+@pytest.mark.slow
+def test_more_tiles_than_16_bits_can_number(cuda_device: str) -> None:
+    """Catches tiles whose numbers are cut off, or taken for the number that stands for none."""
+    C = 2**16 + 1  # images of one tile
+    means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [0.0, 0.0, -1.0]])  # the last one is behind the camera
+    factors, opacities, colors = 0.1 * torch.eye(3).repeat(3, 1, 1), torch.tensor([0.9, 0.5, 0.5]), torch.eye(3)
+    views = torch.eye(4), torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    arguments = [x.to(cuda_device) for x in (means, factors, opacities, colors)]
+    one, many = (
+        rasterize(*arguments, *[x.to(cuda_device).repeat(count, 1, 1) for x in views], 1, 1, backend=cuda_device)
+        for count in (1, C)
+    )
+    assert one.image.any()
+    assert (many.image == one.image).all()
+    assert many.info.pairs == C * one.info.pairs
 
 
 @pytest.mark.parametrize("kernel", [nullcontext, backward_by_splat])

@@ -24,5 +24,5 @@ def test_compiles_without_a_warning(source: Path, tmp_path: Path) -> None:
     printed = done.stdout + done.stderr
     assert done.returncode == 0, printed[-4000:]
     kept = [int(number) for number in re.findall(r"(\d+) bytes (?:stack frame|spill)", printed)]
-    assert kept
-    assert max(kept) <= LOCAL_MEMORY.get(source.name, 0), printed
+    assert kept or "__global__" not in source.read_text()
+    assert max(kept, default=0) <= LOCAL_MEMORY.get(source.name, 0), printed

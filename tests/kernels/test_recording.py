@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-from gsbench.kernels.recording import OutdatedError, Recording, current, read
+from gsbench.kernels.recording import OutdatedError, Recording, current, paused, read
 from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import Tape
 
@@ -124,6 +124,27 @@ def test_what_is_captured_is_repeated_and_read_late(monkeypatch: pytest.MonkeyPa
         assert total.item() == before + 2 * (first + 2)
         with nullcontext() if is_good else pytest.raises(OutdatedError):
             recording.check()
+
+
+def test_what_a_pause_calls_is_not_repeated() -> None:
+    """Catches operations or reads of a pause in a repetition, and a recording that does not go on after its error."""
+    x, total = torch.ones(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
+
+    def fail() -> None:
+        with paused():
+            assert current() is None
+            total.add_(x)
+            assert read(total, lambda _: False) == [total.item()]
+            raise KeyError
+
+    with Recording() as recording:
+        with pytest.raises(KeyError):
+            fail()
+        assert current() is recording
+        total += 10
+    assert recording.is_repeatable
+    repeated(recording)
+    assert total.item() == 21
 
 
 @pytest.mark.parametrize("work", [Tensor.item, Tensor.nonzero, torch.rand_like, lambda x: x[x > 0]])

@@ -73,10 +73,10 @@ def launched(fitted: Training) -> Training:
 @pytest.mark.parametrize(
     ("model", "options", "kernels", "operations"),
     [
-        ("4dgs", (), 27, 56),
-        ("4dgs", ("optim=sparse_adam",), 27, 58),
-        ("7dgs_noagr", (), 27, 42),
-        ("7dgs", (), 35, 117),
+        ("4dgs", (), 23, 54),
+        ("4dgs", ("optim=sparse_adam",), 23, 56),
+        ("7dgs_noagr", (), 23, 40),
+        ("7dgs", (), 31, 115),
     ],
 )
 def test_calls_of_a_launched_step(

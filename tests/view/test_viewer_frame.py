@@ -17,6 +17,7 @@ from gsbench.config import Config
 from gsbench.errors import InputError
 from gsbench.gates import picture
 from gsbench.gates.gate import most_cost
+from gsbench.kernels import raster
 from gsbench.kernels.backends import AUTO, REFERENCE, Backend
 from gsbench.kernels.library import Library
 from gsbench.measure.images import Pixels, rounding_image, to_bytes
@@ -39,6 +40,7 @@ from gsbench.view.frame import (
     FrameCost,
     FrameRenderer,
     FrameRequest,
+    StageWatch,
     beside,
     wiped,
 )
@@ -164,6 +166,14 @@ def test_a_kernels_time_is_its_stages(
     assert tuple(cost.ms) == (*STAGES[SLICE], *STAGES[RASTER])
     assert max(cost.ms, key=lambda name: cost.ms[name]) == stage
     assert cost.ms[stage] >= 1000 * slow
+
+
+def test_what_one_call_computes_is_not_divided() -> None:
+    """Catches a GPU's rasterizer whose time counts for the stage that is noted first, or that runs again."""
+    watch, image = StageWatch("cpu"), torch.zeros(3)
+    assert watch.record(raster._project, [], (), ([image], {})) == [image]
+    watch.end(RASTER)
+    assert [*watch.ms] == [RASTER]
 
 
 def test_what_torch_computes_alone_is_not_divided(agr: FrameRenderer) -> None:

@@ -2,7 +2,6 @@
 #include "../bindings.h"
 
 #include "kernels.h"
-#include "sort.h"
 
 NB_MODULE(GSB_MODULE, m) {
     m.attr("SIGNATURES") = nanobind::dict();
@@ -11,6 +10,6 @@ NB_MODULE(GSB_MODULE, m) {
     bindings::define<__VA_ARGS__>(m, #name, [](const auto&... arguments) { cuda::name(arguments...); }, \
                                   cuda::Stream{});
     GSB_CUDA_KERNELS(GSB_DEFINE)
-    m.def("scratch_bytes", &cuda::scratch_bytes, "Bytes that sorting and summing n items need.");
+    m.def("draw_scratch", &cuda::draw_scratch, "Bytes of scratch memory for so many splats and tile intersections.");
     m.def("similarity_parts", &cuda::similarity_parts, "Parts that l1_ssim leaves of its loss.");
 }

@@ -15,43 +15,16 @@ struct CUstream_st;
 
 namespace gsb {
 
-// The inputs of the kernels that list the splats of each tile.
-struct BinArgs {
-    int64_t N, C;
-    const float *means2d, *roots, *depths, *half_sizes;
-    const float* shapes;  // null: Gaussians
-    int width, height;
-};
-GSB_FIELDS(BinArgs, INPUTS, N, C, means2d, roots, depths, half_sizes, shapes, width, height)
-
-// The arrays are [C * N].
-struct TileCounts {
-    uint32_t *keys, *indices, *sorted_keys;
-    uint32_t* order;  // splats by depth
-    int64_t* ends;    // the running sum of the tiles that they touch, in this order
-    void* scratch;
-    size_t scratch_bytes;
-};
-GSB_FIELDS(TileCounts, OUTPUTS, keys, indices, sorted_keys, order, ends, scratch, scratch_bytes)
-
-// `pairs` is the number of tile intersections for which there is memory. If it is not the last entry of `ends`, `tiles`
-// must be 0xffffffff on entry, and further intersections are left out.
-struct TileOrder {
-    const uint32_t* order;
-    const int64_t* ends;
-    int64_t pairs;
-};
-GSB_FIELDS(TileOrder, INPUTS, order, ends, pairs)
-
-// The arrays are [pairs], except `offsets`.
+// What `draw` computes between projecting and blending: each tile's list of splats.
 struct TileLists {
-    uint32_t *tiles, *splats, *sorted_tiles;
-    uint32_t* ids;     // splats of all cameras, each tile's front to back
-    int32_t* offsets;  // [C * tiles + 1] where each tile's list begins
+    int64_t room;      // the number of tile intersections for which there is memory; further ones are left out
+    int32_t* offsets;  // [C * tiles + 1]: tile t's list is [offsets[t], offsets[t + 1]) of `ids`
+    int32_t* ids;      // [room] splats of all cameras, each tile's front to back
+    int64_t* needed;   // [2]: the number of tile intersections that there are; the flags of ValueFlags
     void* scratch;
-    size_t scratch_bytes;
+    size_t scratch_bytes;  // as many as `draw_scratch` returns
 };
-GSB_FIELDS(TileLists, OUTPUTS, tiles, splats, sorted_tiles, ids, offsets, scratch, scratch_bytes)
+GSB_FIELDS(TileLists, OUTPUTS, room, offsets, ids, needed, scratch, scratch_bytes)
 
 // What density control adds up of C cameras.
 struct DensityArgs {
@@ -71,12 +44,12 @@ GSB_FIELDS(DensityState, OUTPUTS, gradient, times_visible, unseen)
 
 }  // namespace gsb
 
-// `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
+// `draw` checks values, projects, lists the splats of each tile and blends; the inputs of blending are outputs of the
+// earlier kernels. `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
 // same.
 #define GSB_CUDA_KERNELS(kernel)                                                                   \
     GSB_KERNELS(kernel)                                                                            \
-    kernel(count_tiles, BinArgs, TileCounts)                                                       \
-    kernel(fill_tiles, BinArgs, TileOrder, TileLists)                                              \
+    kernel(draw, ProjectArgs, Splats, BlendArgs, Picture, TileLists)                               \
     kernel(add_density, DensityArgs, DensityState)                                                 \
     kernel(blend_backward_by_splat, BlendArgs, BlendState, PictureGrads, BlendGrads)
 
@@ -87,6 +60,9 @@ using Stream = CUstream_st*;
 #define GSB_DECLARATION(name, ...) void name(GSB_PARAMETERS(__VA_ARGS__), Stream);
 GSB_CUDA_KERNELS(GSB_DECLARATION)
 #undef GSB_DECLARATION
+
+// Returns the bytes of scratch memory that `draw` needs for so many splats and tile intersections.
+size_t draw_scratch(int64_t splats, int64_t room);
 
 // The limits of `refine` (AGR): how many numbers the MLPs read, and how many one MLP changes.
 constexpr int MAX_FEATURES = 7, MAX_WIDTH = 28;

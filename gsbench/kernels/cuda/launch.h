@@ -30,6 +30,10 @@ void launch(void (*kernel)(Parameters...), dim3 grid, dim3 block, Stream stream,
     check(cudaGetLastError());
 }
 
+inline void fill_bytes(void* at, unsigned char value, size_t bytes, Stream stream) {
+    check(cudaMemsetAsync(at, value, bytes, stream));
+}
+
 }  // namespace gsb::cuda
 #endif
 

@@ -6,11 +6,12 @@
 
 namespace gsb::cuda {
 
-// Returns the bytes of scratch memory that either function needs for n items.
-size_t scratch_bytes(int64_t n);
+// Returns the bytes of scratch memory that each of these functions needs for n items.
+size_t sort_scratch(int64_t n);
 
-// Stable sort by the lowest `bits` bits of the keys.
-void sort_pairs(void* scratch, size_t bytes, const uint32_t* keys, uint32_t* sorted_keys, const uint32_t* values,
+// Stable sort by the lowest `bits` bits of the keys, which have 16 or 32.
+template <class Key>
+void sort_pairs(void* scratch, size_t bytes, const Key* keys, Key* sorted_keys, const uint32_t* values,
                 uint32_t* sorted_values, int64_t n, int bits, Stream);
 
 // Replaces the values by their cumulative sums.
