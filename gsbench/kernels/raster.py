@@ -292,7 +292,7 @@ def draw_on_gpu(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int,
 
 def _draw_unrecorded(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int, int]:
     """Draw as `draw_on_gpu`: with the memory of the last call, and again with more if this was too little."""
-    splats = len(inputs.viewmats) * len(inputs.means)
+    splats = len(inputs.viewmats) * inputs.means.shape[-2]
     sizes = inputs.means.device, splats, viewport.width, viewport.height
     while True:
         room = _rooms.setdefault(sizes, splats)

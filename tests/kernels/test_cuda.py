@@ -98,13 +98,13 @@ def test_more_tiles_than_16_bits_can_number(cuda_device: str) -> None:
     factors, opacities, colors = 0.1 * torch.eye(3).repeat(3, 1, 1), torch.tensor([0.9, 0.5, 0.5]), torch.eye(3)
     views = torch.eye(4), torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     arguments = [x.to(cuda_device) for x in (means, factors, opacities, colors)]
-    one, many = (
+    single, many = (
         rasterize(*arguments, *[x.to(cuda_device).repeat(count, 1, 1) for x in views], 1, 1, backend=cuda_device)
         for count in (1, C)
     )
-    assert one.image.any()
-    assert (many.image == one.image).all()
-    assert many.info.pairs == C * one.info.pairs
+    assert single.image.any()
+    assert (many.image == single.image).all()
+    assert many.info.pairs == C * single.info.pairs
 
 
 @pytest.mark.parametrize("kernel", [nullcontext, backward_by_splat])
