@@ -19,6 +19,7 @@ from pathlib import Path
 from gsbench.errors import how_to_install, one_line, printable
 from gsbench.measure.machine import hardware
 from gsbench.measure.provenance import git_commit
+from gsbench.process.ending import end_with
 from gsbench.reading import as_json
 from gsbench.version import __version__
 
@@ -261,3 +262,6 @@ def _data() -> Iterator[Check]:
 
 
 CHECKS = (_gsbench, _packages, _machine, _disk, _compiler, _kernels, _gpu, _weights, _data)
+
+if __name__ == "__main__":  # as `python -m gsbench.doctor` too, like the other commands
+    end_with("gsbench.doctor", main)

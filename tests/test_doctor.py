@@ -1,6 +1,7 @@
 """The doctor: every line says what is there, and what to do where something is not."""
 
 import json
+import runpy
 import shutil
 from importlib import metadata
 from types import SimpleNamespace
@@ -37,6 +38,14 @@ def test_one_screen_names_every_part(capsys, monkeypatch):
     assert torch.__version__ in listed["packages"].detail
     assert listed["memory"].detail.startswith("3.0 of")
     assert all(check.todo for check in listed.values() if check.state == ABSENT and check.name != "gpu")
+
+
+def test_it_is_a_module_as_the_other_commands_are(capsys, monkeypatch):
+    """Catches `python -m gsbench.doctor`, which looks like them, ending well without a word."""
+    monkeypatch.setattr("sys.argv", ["doctor", "--json"])
+    with pytest.raises(SystemExit):
+        runpy.run_path(doctor.__file__, run_name="__main__")
+    assert json.loads(capsys.readouterr().out)["checks"]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import argparse
 import copy
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, PATHS, register_schema
+from gsbench.config_roles import facts
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
@@ -112,12 +114,17 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
         check_override(word)
         _check_group(*word.lstrip("+").partition("=")[::2])
     parser = OverridesParser.create(GlobalHydra.instance().config_loader())
-    values = dict(map(_values, parser.parse_overrides(command.overrides)))
+    pairs = list(map(_values, parser.parse_overrides(command.overrides)))
+    values = dict(pairs)
     keys = {name.lstrip("+"): words for name, words in values.items()}
     if len(keys.get("exp", ())) > 1:
         raise InputError(f"+exp: expected one experiment, got {len(keys['exp'])}: type a command for each")
+    _check_once([name for name, _ in pairs])
+    if "protocol.name" in keys:
+        raise InputError("protocol.name: expected protocol=NAME, which sets what is measured too, not its name alone")
     all_scenes = keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys
     base = _compose([words[0] for name, words in values.items() if name != "scene"])
+    _check_launcher(list(keys), base.launch)
     axes = [f"{name}={text}" for name, text in (base.hydra.sweeper.params or {}).items()]
     if not (command.multirun or all_scenes or axes or base.launch.by != "local"):
         _check_single(values)
@@ -132,6 +139,23 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
         axes_first.pop("scene", None)
         axes_first["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
     return [list(run) for run in itertools.product(*axes_first.values())], True
+
+
+def _check_once(names: Sequence[str]) -> None:
+    """Raise InputError if a config is added twice, of which a sweep would drop one; a launcher may replace another."""
+    for name, count in Counter(names).items():
+        if count > 1 and name.startswith("+") and facts(name.lstrip("+")).role != "launching":
+            raise InputError(f"{name}: expected it once, got it {count} times: leave out the others")
+
+
+def _check_launcher(keys: Sequence[str], launch: DictConfig) -> None:
+    """Raise InputError if a key belongs to a launcher that was not chosen, and so would do nothing."""
+    for name in keys:
+        readers = ["parallel", "slurm"] if name == "launch.at_once" else ["slurm"]
+        does_nothing = launch.by not in readers and (name, launch.at_once) != ("launch.at_once", 1)
+        if name.startswith("launch.") and name != "launch.by" and does_nothing:
+            choices = " or ".join(f"+launch={reader}" for reader in readers)
+            raise InputError(f"{name}: expected {choices}, which reads it: add it, or leave {name} out")
 
 
 def compose_run(overrides: Sequence[str]) -> RunConfig:
@@ -194,7 +218,13 @@ def explain(error: Exception) -> str:
         keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
         if keys and cause.key not in keys:
             return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
-        return f"config key '{cause.full_key}': {str(cause).splitlines()[0]}"
+        message = str(cause).splitlines()[0]
+        if "is not a subclass of" in message:
+            inner = ", ".join(cause.parent_node[cause.key])
+            return f"config key '{cause.full_key}': expected values of its keys, {inner}, got a value of the group"
+        if message.startswith("Cannot convert 'dict'"):
+            return f"config key '{cause.full_key}': expected a value, it has no keys"
+        return f"config key '{cause.full_key}': {message}"
     return " ".join(str(error).split())
 
 

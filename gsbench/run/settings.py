@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,12 +60,19 @@ def check_values(config: Config) -> None:
     _check_keys(config)
     for dotted, value in flat(dataclasses.asdict(config)):
         facts(dotted).check(dotted, value)
+    check_device_name(config.device)
     _check_steps(config)
     for hook in hook_types(elsewhere=()):  # others import torch
         hook.check(config)
     _check_coarse(config.train.coarse or [])
     for name, rate in config.model.lr.items():
         _check_rate(f"model.lr.{name}", rate)
+
+
+def check_device_name(name: str) -> None:
+    """Raise InputError unless `name` is that of a device: cpu, cuda, or one of several, such as cuda:1."""
+    if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name):
+        raise InputError(f"device '{name}' is not known. {did_you_mean(name, ['cpu', 'cuda', 'cuda:1'])}")
 
 
 def _check_keys(value: Any, place: str = "") -> None:

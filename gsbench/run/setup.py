@@ -10,7 +10,7 @@ import torch
 
 from gsbench import models, scenes
 from gsbench.config import Config
-from gsbench.errors import InputError, did_you_mean, one_line
+from gsbench.errors import InputError, one_line
 from gsbench.kernels.backends import resolve
 from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
@@ -18,7 +18,7 @@ from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
-from gsbench.run.settings import lpips_weights
+from gsbench.run.settings import check_device_name, lpips_weights
 from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
 from gsbench.train.batches import generator
@@ -211,9 +211,7 @@ def check_folder(folder: Path) -> None:
 
 def check_device(name: str) -> None:
     """Raise InputError unless `name` is a device that torch can use on this machine."""
-    kind = name.partition(":")[0]
-    if kind not in ("cpu", "cuda") or name.startswith("cpu:"):
-        raise InputError(f"device '{name}' is not known. {did_you_mean(kind, ['cpu', 'cuda'])}")
+    check_device_name(name)
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:

@@ -73,6 +73,10 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
     [
         ("+exp=mini data.scenes=[]", "empty list"),
         ("+exp=mini,dnerf", "expected one experiment"),
+        ("+exp=mini -m seed=0,1 +exp=dnerf", r"\+exp: expected it once, got it 2 times"),
+        ("+exp=mini protocol.name=published", "protocol.name: expected protocol=NAME"),
+        ("+exp=mini launch.at_once=2", r"launch.at_once: expected \+launch=parallel or \+launch=slurm"),
+        ("+exp=mini +launch=parallel launch.cpus=2", r"launch.cpus: expected \+launch=slurm, which reads it"),
         ("+exp=mini model=7", "model '7' is not known"),
         ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
@@ -93,8 +97,9 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
     ],
 )
 def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
-    """Catches a sweep of no run that ends well, options of Hydra that would be dropped in silence, a scene that is no
-    scene, and a job that is submitted and fails, or is never requeued, for a number out of its range."""
+    """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
+    silence, a scene that is no scene, and a job that is submitted and fails, or is never requeued, for a number out of
+    its range."""
     with pytest.raises(InputError, match=message):
         [compose_run(run) for run in runs_of(parse(words.split()))[0]]
 

@@ -305,15 +305,17 @@ def test_latex_is_balanced_and_every_row_has_every_column():
 
 @pytest.mark.parametrize("width", [120, 80, 40])
 def test_the_terminal_form_fits(width):
-    """Catches a line that wraps, also with several seeds, every column and a long model name, a lost column, and a
-    text or a note that is not printed."""
+    """Catches a line that wraps, also with several seeds, every column and a long model name, rows of two variants
+    that look alike, a lost column, and a text or a note that is not printed."""
     metrics = make().metrics | {"lpips_vgg": 0.25, "psnr_best_on_test": 26.5}
     runs = [*every_row(), make(seed=3, metrics=metrics, missing={})]
-    runs += [make("a_model_with_a_name_of_forty_letters_____", seed=seed) for seed in (0, 1)]
+    names = [f"a_model_with_a_name_of_more_than_{n}_letters_____" for n in ("forty", "fifty")]
+    runs += [make(name, seed=seed) for name in names for seed in (0, 1)]
     sections = output.tables(results(*runs))
     lines = text.terminal(sections, width).splitlines()
     assert max(map(len, lines)) <= width
     assert any("for lack of width" in line for line in lines)
+    assert all(any(f"{name[:21]}..{name[-21:]}"[: width - 2] in line for line in lines) for name in names)
     printed = "".join("".join(lines).split())
     words = [part for section in sections for part in (section.title, section.text, *section.notes)]
     assert all("".join(part.split()) in printed for part in words)

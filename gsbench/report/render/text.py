@@ -38,7 +38,7 @@ def terminal(sections: Sequence[Section], width: int = 120) -> str:
 
 def _terminal(section: Section, width: int) -> Iterator[str]:
     """Yield the lines of a section: title, table with the rows of each scene below its name, text and notes."""
-    table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text).map(lambda text: text[:WIDEST])
+    table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text).map(_narrow)
     has_scenes = "scene" in table.columns[:1]
     scenes = list(dict.fromkeys(table.scene)) if has_scenes else [""]
     names = list(table)[has_scenes:]
@@ -60,6 +60,12 @@ def _terminal(section: Section, width: int) -> Iterator[str]:
     words = [section.text, *(f"- {note}" for note in section.notes)]
     words += [f"- for lack of width: {', '.join(names[len(shown) :])}"] if len(shown) < len(names) else []
     yield from ("", *(part for text in words for part in _wrapped(text, width)), "")
+
+
+def _narrow(text: str) -> str:
+    """Return the text of a cell; of a long one the beginning and the end, as names of variants begin alike."""
+    half = WIDEST // 2 - 1
+    return text if len(text) <= WIDEST else f"{text[:half]}..{text[-half:]}"
 
 
 def _wrapped(text: str, width: int) -> list[str]:
