@@ -16,15 +16,17 @@ Row = dict[str, Any]
 class Cost(NamedTuple):
     """Milliseconds of a call, and the MiB it holds at most beside what was there before (0 on the CPU)."""
 
-    ms: float  # median
+    ms: float  # median of single calls, before and after each of which the device is waited for
     p10: float
     p90: float
+    back_to_back: float  # mean of calls that follow each other without waiting; where a call waits itself, that counts
     mib: float
 
     @classmethod
-    def of(cls, times: list[float], peak: int) -> "Cost":
+    def of(cls, times: list[float], in_all: float, peak: int) -> "Cost":
+        """Return the cost of calls by the `times` of single ones, and the time of as many back to back."""
         deciles = statistics.quantiles(times, n=10, method="inclusive")
-        return cls(statistics.median(times), deciles[0], deciles[-1], peak / 2**20)
+        return cls(statistics.median(times), deciles[0], deciles[-1], in_all / len(times), peak / 2**20)
 
 
 @dataclass
@@ -42,29 +44,34 @@ class Place:
         return [x.to(self.device) for x in tensors]
 
     def cost(self, call: Call, repeats: int = 30) -> Cost:
-        """Time a call after a few to warm up; on a GPU by events, the device waited for between calls."""
-        for _ in range(5 if self.on_gpu else 1):
-            call()
+        """Time a call after a few to warm up, on a GPU by events."""
+
+        def in_a_row(count: int) -> None:
+            for _ in range(count):
+                call()
+
+        in_a_row(5 if self.on_gpu else 1)
         if not self.on_gpu:
-            return Cost.of([1e3 * timed(call) for _ in range(3)], 0)
+            return Cost.of([self.timed(call) for _ in range(3)], self.timed(lambda: in_a_row(3)), 0)
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
-        held, times = torch.cuda.memory_allocated(), []
-        for _ in range(repeats):
-            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            torch.cuda.synchronize()
-            start.record()
+        held, times = torch.cuda.memory_allocated(), [self.timed(call) for _ in range(repeats)]
+        peak = torch.cuda.max_memory_allocated()
+        return Cost.of(times, self.timed(lambda: in_a_row(repeats)), peak - held)
+
+    def timed(self, call: Call) -> float:
+        """Return the milliseconds of a call, and of all work that it gives a GPU."""
+        if not self.on_gpu:
+            began = time.perf_counter()
             call()
-            end.record()
-            torch.cuda.synchronize()
-            times.append(start.elapsed_time(end))
-        return Cost.of(times, torch.cuda.max_memory_allocated() - held)
-
-
-def timed(call: Call) -> float:
-    began = time.perf_counter()
-    call()
-    return time.perf_counter() - began
+            return 1e3 * (time.perf_counter() - began)
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize()
+        start.record()
+        call()
+        end.record()
+        torch.cuda.synchronize()
+        return start.elapsed_time(end)
 
 
 @dataclass
@@ -125,4 +132,6 @@ def compared(section: str, case: str, way: str, ours: Cost, other: Cost | None) 
     for who, cost in (("ours", ours), ("theirs", other)):
         if cost is not None:
             row |= {f"{who}_{name}": value for name, value in cost._asdict().items()}
-    return row | ({"ratio": other.ms / ours.ms} if other else {})
+    if other is None:
+        return row
+    return row | {"ratio": other.ms / ours.ms, "ratio_back_to_back": other.back_to_back / ours.back_to_back}

@@ -12,8 +12,9 @@ import pytest
 import torch
 
 from benchmarks import __main__ as command
-from benchmarks import against, rows, scene
+from benchmarks import against, gpu, rows, scene
 from benchmarks.against import Built, built
+from benchmarks.compare import Place, compared
 from benchmarks.roofline import Limits
 from benchmarks.stages import MODELS, SUCCESSORS, blended_alphas, recorded, stages
 from benchmarks.timing import Cost, Row
@@ -28,6 +29,25 @@ section, _, folder, _, name = sys.argv[1:]
 rows = {"rows": [{"section": section, "name": "a", "median": gsbench.MILLISECONDS}]}
 open(f"{folder}/{name}.json", "w").write(json.dumps(rows))
 """
+
+
+def test_calls_are_timed_alone_and_back_to_back(monkeypatch):
+    """Catches a row of calls whose time is that of one call, or of all, and a table without it."""
+    calls: list[float] = []
+
+    def timed(_: Place, call) -> float:
+        before = sum(calls)
+        call()
+        return sum(calls) - before
+
+    monkeypatch.setattr(Place, "timed", timed)
+    ours, other = (Place("cpu").cost(lambda ms=ms: calls.append(ms)) for ms in (2.0, 3.0))
+    assert ours == (2.0, 2.0, 2.0, 2.0, 0)
+    row = compared("raster", "small", "forward", ours, other)
+    assert row["ratio"] == row["ratio_back_to_back"] == 1.5
+    assert "| raster | small | forward | 2.000 | 3.000 | 1.500 | 2.000 | 3.000 | 1.500 |" in gpu.table(
+        {"gsplat": "1", "git_commit": "1"}, [row]
+    )
 
 
 def test_no_two_rows_have_one_name(monkeypatch):
