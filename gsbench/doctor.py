@@ -108,7 +108,7 @@ def _requirements() -> tuple[list[str], dict[str, list[str]]]:
 
 def requirements() -> list[str]:
     """Return what the installed distribution of gsbench requires, whatever its name is; [] if it is not installed."""
-    for command in metadata.entry_points(group="console_scripts", name="gsbench"):
+    for command in metadata.entry_points(group="console_scripts"):
         if command.value == COMMAND and command.dist is not None:
             return command.dist.requires or []
     return []

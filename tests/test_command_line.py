@@ -10,6 +10,7 @@ import pytest
 import torch
 from tiny_run import ROOT, gsbench, main_here, overrides, write_moving_square
 
+from gsbench import __main__ as command
 from gsbench.config import CONF
 from gsbench.errors import TooLargeError
 from gsbench.measure import record
@@ -274,6 +275,12 @@ def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_
     statuses = {run.seed: (run.status, run.reason) for run in map(record.read, record.find(tmp_path))}
     reason = "out of memory: pictures need 9.0 MiB: lower the picture's size"
     assert statuses == {0: ("failed", reason), 1: ("ok", None)}
+
+
+def test_a_warning_of_gsbench_is_one_line():
+    """Catches the line of code that Python adds, and a warning of another package under gsbench's name."""
+    assert command._in_one_line("slow", UserWarning, str(ROOT / "gsbench/a.py"), 3) == "gsbench: warning: slow\n"
+    assert command._in_one_line("slow", UserWarning, "/a.py", 3) == "/a.py:3: UserWarning: slow\n"
 
 
 @pytest.mark.parametrize(

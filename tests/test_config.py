@@ -144,6 +144,21 @@ def test_what_depends_on_a_key(dotted, value, trains, measures):
     assert bool(measuring_differences(PLAIN, other)) == measures
 
 
+def test_where_a_run_lies_and_how_it_is_launched_changes_nothing():
+    """Catches a run that is trained again because its data, its results or its name in tables have moved."""
+    by_role: dict[str, set[str]] = {}
+    for name, of_key in KEYS.items():
+        by_role.setdefault(of_key.role, set()).add(name)
+    assert by_role["place"] == {
+        *("model.gate", "scene.released_as", "data.root", "data.published", "data.scenes", "init.ply"),
+        *("train.checkpoint_minutes", "protocol.lpips_alex", "protocol.lpips_vgg"),
+    }
+    assert by_role["launching"] == {"results", "resume", "log", *(name for name in KEYS if name.startswith("launch."))}
+    assert by_role["measuring"] - {name for name in KEYS if name.startswith("protocol.")} == {
+        *("experiment", "data.dataset", "data.paper_dataset"),
+    }
+
+
 def test_differences_are_named():
     """Catches a difference with the two values exchanged."""
     assert training_differences(PLAIN, changed("train.iterations", 8)) == ["train.iterations 8 instead of 9"]

@@ -108,7 +108,7 @@ def test_a_gpu_is_named_with_its_kernels(built, capsys, monkeypatch):
     """Catches a GPU that renders by the slow reference without a word."""
     device = type("Device", (), {"name": "Invented GPU", "total_memory": 80 << 30})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: device)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", [device].__getitem__)
     monkeypatch.setattr(cuda, "_cuda", torch if built else None)
     listed = checks(capsys, status=0 if built else 1)["gpu"]
     assert "Invented GPU, 80 GiB" in listed.detail
@@ -120,6 +120,18 @@ def test_what_is_absent_breaks_nothing(capsys, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _: None)
     listed = checks(capsys)
     assert (listed["gpu"], listed["compiler"].state) == (Check("gpu", ABSENT, "none; the CPU trains", ""), ABSENT)
+
+
+def test_the_commit_is_named_and_data_that_are_here(capsys, monkeypatch, tmp_path):
+    """Catches a wheel taken for a checkout, and advice to fetch what is there."""
+    (tmp_path / "data" / "dnerf").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for commit, words in ((f"{'a' * 40}-dirty", ", commit aaaaaaaaaaaa-dirty, in "), (None, ", from a wheel, in ")):
+        monkeypatch.setattr(doctor, "git_commit", lambda commit=commit: commit)
+        listed = checks(capsys)
+        assert words in listed["gsbench"].detail
+    assert listed["data"].detail == "the embedded scenes, data/dnerf"
+    assert listed["data"].todo == "for more: python -m gsbench.fetch pbr"
 
 
 def test_weights_that_are_here_need_no_advice(capsys, monkeypatch):

@@ -14,7 +14,7 @@ from gsbench.measure.record import Record
 from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, View
-from gsbench.score import main, of_other_papers, other_metrics
+from gsbench.score import _matching, main, of_other_papers, other_metrics
 
 VIEWS = ("r_0", "r_1")  # of the split test
 SIZE = 16
@@ -78,6 +78,8 @@ def test_floats_of_an_own_run_have_its_numbers(trained, square, tmp_path, capsys
     }
     assert (record.cost.num_gaussians, record.cost.fps, record.cost.train_s, record.cost.bytes) == (7, 50.0, None, None)
     assert (tmp_path / "results/dnerf/square/other/seed0/pictures.png").is_file()
+    assert main([str(tmp_path / "npy"), *words_of(square, tmp_path / "npy/r_0.npy"), "--name", "other"]) == 2
+    assert "results: expected a folder that can be written" in capsys.readouterr().err
 
 
 def test_pngs_differ_by_no_more_than_rounding(trained, square, tmp_path):
@@ -113,6 +115,31 @@ def test_wrong_words_are_refused_in_a_line(more, words, square, tmp_path, capsys
     assert words in error
     assert error.count("\n") == 1
     assert not list(tmp_path.rglob("*.json"))
+
+
+@pytest.mark.parametrize(("count", "more"), [(5, ""), (6, ", ..")])
+def test_a_long_list_of_views_is_shortened(count, more):
+    """Catches a line of 200 names, and one that leaves out the last view or counts wrong."""
+    renders = SimpleNamespace(
+        files=[*map(str, range(count))], facts=SimpleNamespace(kind="floats", matched="order"), others=[*"abcdefg"]
+    )
+    line = _matching(renders, [SimpleNamespace(name=f"a{i}") for i in range(count)])
+    assert line.startswith(f"{count} images (floats), matched to the views by order: 0 is a0, 1 is a1, ")
+    assert line.endswith(f", 3 is a3{more}, {count - 1} is a{count - 1}; not read: a, b, c, d, e")
+
+
+def test_memory_that_runs_out_is_told(square, tmp_path, monkeypatch, capsys):
+    """Catches an empty line for a MemoryError, and an error of the program that is told as one of the user."""
+    for error, words in (
+        (MemoryError("full"), "gsbench.score: out of memory: full\n"),
+        (OSError("bad"), "gsbench.score: bad\n"),
+    ):
+        monkeypatch.setattr("gsbench.score.load_scene", lambda _, error=error: (_ for _ in ()).throw(error))
+        assert main([str(tmp_path), *words_of(square, tmp_path / "results"), "--name", "other"]) == 2
+        assert capsys.readouterr().err == words
+    monkeypatch.setattr("gsbench.score.load_scene", lambda _: (_ for _ in ()).throw(RuntimeError("shape")))
+    with pytest.raises(RuntimeError, match="shape"):
+        main([str(tmp_path), *words_of(square, tmp_path / "results"), "--name", "other"])
 
 
 def test_the_ssim_of_other_papers():

@@ -74,9 +74,6 @@ def main(arguments: list[str] | None = None) -> int:
         return stopped.code
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # the program that reads the output has ended, such as `head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
 
 
 def lines(experiment: Experiment, runs: Sequence[RunStatus]) -> list[str]:

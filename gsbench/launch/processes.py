@@ -153,14 +153,11 @@ def _end(running: Running, signal_number: int) -> None:
 
 
 def _import_torch() -> None:
-    """Import what a run needs, so that its process has it; if memory is too small, each run says so itself."""
+    """Import what a run needs, so that its process has it; if that fails, each run says so itself."""
     if too_little_address_space() is not None:
         return
-    try:
+    with contextlib.suppress(ImportError, OSError, MemoryError):
         import gsbench.run.execution  # noqa: F401
-    except (ImportError, OSError, MemoryError) as error:
-        if not is_out_of_memory(error):
-            raise
 
 
 def _work(config: RunConfig, folder: Path, run_number: int, request: Request, parent: int, at_once: int) -> None:

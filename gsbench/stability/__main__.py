@@ -5,7 +5,6 @@ Each image is rendered again in float64. The audit of hard cases is `make stabil
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +17,7 @@ from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.run.load import load_run, scene_of
 from gsbench.run.setup import evaluated_views
-from gsbench.scenes.gaussian_ply import MAX_DEGREE, read_trained
-from gsbench.schedule import ActiveComponents
+from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.stability.float32_error import Shot, measure
 from gsbench.train.batches import generator
 
@@ -50,7 +48,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
     parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of a PLY's picture")
     options = parser.parse_args(arguments)
-    os.environ.setdefault("MPLBACKEND", "Agg")
     from gsbench.stability import report  # imports matplotlib
 
     try:
@@ -102,10 +99,8 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
 def _of_ply(path: Path, out: Path) -> Subject:
     """Load a PLY as a 3DGS model, with views of an orbit around the median of its means."""
     trained = read_trained(path)
-    model = build("3dgs", sh_degree=MAX_DEGREE)
+    model = build("3dgs")
     model.start_from(trained, 1.0, generator(0))
-    model.set_active(ActiveComponents(MAX_DEGREE, refine=False, tunes_lambda=False))
-    model.requires_grad_(False)
     middle = trained.means.median(0).values
     distance = DISTANCE * float((trained.means - middle).norm(dim=-1).median())
     note = f"Views: {VIEWS} on an orbit around the median of the means, {distance:.3g} world units away."

@@ -9,8 +9,8 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ROUNDING_SCALE, STEPS, to_bytes
@@ -101,7 +101,8 @@ def draw(exactness: Exactness, path: Path) -> None:
     """Write a picture of the view with the largest bound: the image, the error of float32, and its bound."""
     name, image, exact = exactness.shown
     error = STEPS * (image.double() - exact.image).abs().amax(-1)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained")
+    figure = Figure(figsize=(12, 4), layout="constrained")  # not of pyplot, which looks for a screen
+    axes = figure.subplots(1, 3)
     axes[0].imshow(to_bytes(exact.image.float().numpy()))
     scale = LogNorm(*ROUNDING_SCALE)
     for pane, values in zip(axes[1:], (error, STEPS * exact.bound), strict=True):
@@ -111,5 +112,4 @@ def draw(exactness: Exactness, path: Path) -> None:
     figure.colorbar(drawn, ax=axes[1:], label="steps of 8 bits")
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=110)
-    plt.close(figure)
     write_atomically(path, png.getvalue())

@@ -217,6 +217,16 @@ def test_a_hostile_or_damaged_archive_is_refused(
     assert not (tmp_path / "evil").exists()
 
 
+def test_an_archive_without_scenes_says_so(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Catches a line that ends in the middle where an archive has other files than it should."""
+    Handler.files["dnerf.zip"] = zipped({"a.txt": b"a"})
+    for _ in ("unpacked", "there"):
+        assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
+        assert capsys.readouterr().out.endswith("; no scene with a transforms_train.json is in it\n")
+
+
 def test_weights_go_where_they_are_looked_for(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

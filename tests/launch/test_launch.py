@@ -1,9 +1,13 @@
 """Sweeps as they are launched: the plan, several processes, retry, and ablations that change what they say."""
 
 import json
+import os
 import re
 import shutil
+import signal
+import time
 from pathlib import Path
+from typing import Any
 
 import crowd
 import pytest
@@ -12,13 +16,15 @@ from interrupted import assert_same_bits, bits
 from tiny_run import gsbench, main_here, overrides
 
 from gsbench.errors import InputError
-from gsbench.launch import plan, status
+from gsbench.launch import plan, processes, status
 from gsbench.launch import sweep as launcher
 from gsbench.launch.__main__ import main as sweep_main
 from gsbench.launch.command import RunConfig, compose_run, hydra_with
 from gsbench.launch.plan import Ended, Plan, identity
 from gsbench.launch.status import RecordStatus
 from gsbench.launch.sweep import retry
+from gsbench.run import execution
+from gsbench.run.execution import UnrecordedError
 
 SCENE = ("scene=", "scene.name=")
 
@@ -93,9 +99,10 @@ def test_a_retry_launches_with_the_settings_that_it_gets(tmp_path: Path, monkeyp
 
 
 def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a sweep that ends badly because of a run of another sweep in the same folder of results."""
+    """Catches a sweep that ends badly because of a run of another sweep in the same folder of results, and a plan that
+    is left of a sweep whose runs were all refused as they began."""
     words = ["+exp=mini", "scene=suzanne", "model=3dgs", f"results={tmp_path}"]
-    ends = {"0": Ended(reason="step 0: nan"), "1": Ended("mini/record.json")}
+    ends = {"0": Ended(reason="step 0: nan"), "1": Ended("mini/record.json"), "2": Ended(reason="no", is_refused=True)}
     monkeypatch.setattr(
         launcher,
         "do_planned",
@@ -106,7 +113,60 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.Monk
     )
     with hydra_with(None):
         outcomes = [launcher.launch([compose_run([*words, f"seed={seed}"])], None) for seed in ends]
-    assert [[run.reason for run in outcome.broken] for outcome in outcomes] == [["step 0: nan"], []]
+    assert [[run.reason for run in outcome.broken] for outcome in outcomes] == [["step 0: nan"], [], []]
+    assert [outcome.is_refused for outcome in outcomes] == [False, False, True]
+    assert {outcome.experiment for outcome in outcomes} == {tmp_path / "mini"}
+    assert len(plan.find(tmp_path / "mini")) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "reason", "is_refused", "traces"),
+    [
+        (MemoryError("full"), "out of memory: full", False, False),
+        (ValueError("a\nb"), "ValueError: a", False, True),
+        (UnrecordedError("no record"), "no record", False, False),
+        (InputError("no scene"), "no scene", True, False),
+    ],
+)
+def test_a_run_that_raises_ends_with_a_reason(
+    error: Exception,
+    reason: str,
+    is_refused: bool,
+    traces: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Catches an error that ends the sweep, one told as another, and a stack trace for what users can mend."""
+    monkeypatch.setattr(execution, "execute", lambda _: (_ for _ in ()).throw(error))
+    with hydra_with(None):
+        ended = processes.do(compose_run(["+exp=mini", "scene=suzanne", f"results={tmp_path}"]))
+    assert ended == Ended(reason=reason, is_refused=is_refused)
+    errors = capsys.readouterr().err
+    assert errors.endswith(f"gsbench: error: suzanne: {reason}\n")
+    assert ("Traceback" in errors) == traces
+
+
+def test_a_path_that_only_a_node_knows_is_left_to_its_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches TMPDIR of a node that is refused before its job, one not refused here, and a stack trace there."""
+    monkeypatch.delenv("DISK_OF_NODE", raising=False)
+    words = ["+exp=dnerf", "scene=trex", "data.root=${oc.env:DISK_OF_NODE}", f"results={tmp_path}"]
+    with hydra_with(None):
+        with pytest.raises(InputError, match="DISK_OF_NODE"):
+            compose_run(words)
+        ended = processes.do(compose_run([*words, "+launch=slurm"]))
+    assert ended.is_refused
+    assert "DISK_OF_NODE" in str(ended.reason)
+
+
+def test_a_run_looks_for_its_parent_without_haste(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a thread that takes a CPU from the training, and a run that goes on when its parent is gone."""
+    parents, done = iter([7, 7, 1]), list[Any]()
+    monkeypatch.setattr(os, "getppid", lambda: next(parents))
+    monkeypatch.setattr(os, "kill", lambda *call: done.append(call))
+    monkeypatch.setattr(time, "sleep", done.append)
+    processes._end_with(7)
+    assert done == [processes.POLL, processes.POLL, (os.getpid(), signal.SIGTERM)]
 
 
 def test_without_slurm_the_error_says_where_to_go(

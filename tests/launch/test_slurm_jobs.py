@@ -12,10 +12,10 @@ import pytest
 from tiny_run import ROOT, gsbench, overrides
 
 from gsbench.errors import InputError
-from gsbench.launch import plan, status
+from gsbench.launch import plan, processes, status
 from gsbench.launch.__main__ import main
-from gsbench.launch.command import compose_run, hydra_with
-from gsbench.launch.plan import Plan
+from gsbench.launch.command import RunConfig, compose_run, hydra_with
+from gsbench.launch.plan import Ended, Plan
 from gsbench.launch.slurm import SCRIPT, STOPPED, in_container
 from gsbench.launch.sweep import retry
 from gsbench.run import stop
@@ -112,6 +112,25 @@ def test_a_job_listens_before_it_reads_its_plan(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(sys, "path", [*sys.path])
     assert main(["job", str(tmp_path), "0"]) == 2  # there is no plan
     assert heard
+
+
+def test_a_job_ends_with_the_status_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a run that failed in a job that Slurm shows as completed, another run of the plan, and a user's model in
+    the folder of the command that cannot be imported."""
+    monkeypatch.setattr(stop, "listen", lambda: None)
+    monkeypatch.setattr(sys, "path", [])
+    plan.write(Plan("slurm", [["+exp=mini", "scene=suzanne", f"seed={seed}"] for seed in (5, 6)]), tmp_path)
+    for ended, code in ((Ended("record.json"), 0), (Ended(reason="it diverged"), 1)):
+        done: list[tuple[int, int, int]] = []
+
+        def do(config: RunConfig, _: Path, number: int, at_once: int, ended: Ended = ended) -> Ended:
+            done.append((config.config.seed, number, at_once))  # noqa: B023  it is called in this round
+            return ended
+
+        monkeypatch.setattr(processes, "do_planned", do)
+        assert main(["job", str(tmp_path), "1"]) == code
+        assert done == [(6, 1, 0)]
+    assert os.getcwd() in sys.path
 
 
 def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path, tmp_path: Path) -> None:

@@ -17,10 +17,11 @@ from tiny_run import ROOT
 from gsbench.launch import plan, status
 from gsbench.launch.__main__ import lines, main
 from gsbench.launch.plan import Ended, Plan
-from gsbench.launch.slurm import Queue
+from gsbench.launch.slurm import Queue, ask
 from gsbench.launch.status import RunStatus
 from gsbench.run import progress
 from gsbench.run.progress import Progress, born
+from gsbench.run.stop import Stopped
 
 RUN = ("7dgs", "lego", 0)
 WORDS = crowd.overrides(*RUN)
@@ -86,6 +87,8 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
         # no trace but the plan
         (None, {"plan_of": {}}, "planned", None),
         (None, {"plan_of": GONE}, "not started", None),
+        (None, {"plan_of": OTHER}, "planned", None),
+        (None, {"plan_of": OTHER | {"started": time.time() - 660}}, "not started", None),
         (Queue({"7_0": "PENDING Priority"}), {"plan_of": JOB}, "queued", "Priority"),
         (Queue({}), {"plan_of": JOB}, "lost", "never started"),
         (SILENT, {"plan_of": JOB}, "planned", None),
@@ -323,6 +326,36 @@ def test_a_folder_without_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFix
     main(["status", str(tmp_path)])
     assert capsys.readouterr().out == f"{tmp_path}: no run was asked for\n"
     assert main(["status", str(tmp_path / "nothing")]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert f"{tmp_path}/nothing: expected the folder of an experiment" in err
+
+
+def test_the_parts_of_an_experiment_are_in_order(tmp_path: Path) -> None:
+    """Catches runs in the order in which a file system lists their folders, and another experiment's."""
+    for seed in (3, 1, 4, 0, 5, 2):
+        folder = tmp_path / f"crowd.{seed}" / "run"
+        folder.mkdir(parents=True)
+        progress.write(folder, Progress(crowd.overrides("7dgs", "lego", seed), steps=400))
+    (tmp_path / "crowds").mkdir()
+    progress.write(tmp_path / "crowds", Progress(crowd.overrides("7dgs", "lego", 6), steps=400))
+    seeds = [run.overrides[-1] for run in status.status(status.read(tmp_path / "crowd"))]
+    assert seeds == [f"seed={seed}" for seed in range(6)]
+
+
+@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt(), 130), (Stopped(15), 143)])
+def test_a_watch_that_is_interrupted_has_the_status_of_the_signal(
+    end: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a stack trace, or a success, for Ctrl-C."""
+    traced(tmp_path, progress_of={})
+    monkeypatch.setattr(time, "sleep", lambda _: (_ for _ in ()).throw(end))
+    assert main(["status", str(tmp_path), "--watch"]) == code
+
+
+def test_slurm_that_does_not_answer_is_a_reason() -> None:
+    """Catches a status that waits for ever, or ends in a stack trace."""
+    assert "timed out" in str(ask("sleep", "5", seconds=0.05))
 
 
 def test_status_is_repeated_until_nothing_goes_on(

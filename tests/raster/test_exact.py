@@ -125,17 +125,19 @@ def test_the_exact_image_is_that_of_brute_force() -> None:
         assert (images(arguments)[1].image - true).abs().max() <= 1e-12, name
 
 
-HARD_AND_EASY = {  # the severity and the number of a case in which rounding decides, and of one in which it does not
-    SKIPPED: ("alpha_at_its_limits", (1.0, 2), (1.0, 3)),
-    STOPPED: ("transmittance_at_the_stop", (1.0, 0), (0.4, 0)),
-    ORDERED: ("equal_depths", (1.0, 0), (0.0, 0)),
-}
+HARD_AND_EASY = (  # the severity and the number of a case in which rounding decides, and of one in which it does not
+    (SKIPPED, "alpha_at_its_limits", (1.0, 2), (1.0, 3)),
+    (STOPPED, "transmittance_at_the_stop", (1.0, 0), (0.4, 0)),
+    (ORDERED, "equal_depths", (1.0, 0), (0.0, 0)),
+)
 
 
-@pytest.mark.parametrize("branch", HARD_AND_EASY)
-def test_a_branch_that_rounding_decides_is_named(branch: int) -> None:
+@pytest.mark.parametrize(("branch", "name", "hard", "easy"), HARD_AND_EASY)
+def test_a_branch_that_rounding_decides_is_named(
+    branch: int, name: str, hard: tuple[float, int], easy: tuple[float, int]
+) -> None:
     """Catches a pixel that may jump and is not counted, and one that is counted where nothing can jump."""
-    name, *cases = HARD_AND_EASY[branch]
+    cases = hard, easy
     for (severity, which), undecided in zip(cases, (True, False), strict=True):
         bounded = images(CASES[name](severity)[which])[1]
         assert bool((bounded.branches & branch).any()) == undecided
@@ -160,6 +162,7 @@ def test_without_gaussians_the_image_is_the_background() -> None:
         image, bounded, _ = images(arguments)
         assert torch.equal(bounded.image.float(), image)
         assert (bounded.culprit == -1).all()
+        assert bounded.median_bound == 0
         assert bounded.bound.max() < 1e-6
 
 

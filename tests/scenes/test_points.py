@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gsbench.config import DataConfig
-from gsbench.errors import InputError
+from gsbench.errors import InputError, TooLargeError
+from gsbench.process import memory
 from gsbench.run.fitting import initial_points
 from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.points import frustum_points, nearest_distances, random_points, read_ply
@@ -121,6 +122,14 @@ def test_bad_ply(tmp_path: Path, fault: str) -> None:
     assert "points3d.ply" in str(caught.value)
     assert part in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_an_ascii_ply_without_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a process that Linux kills while it parses text, which takes many times the size of the file."""
+    path = save(tmp_path, ply(np.ones(120_000, VERTEX), "ascii"))
+    monkeypatch.setattr(memory, "available", lambda: 64 << 20)
+    with pytest.raises(TooLargeError, match=r"720000 values in ascii need .* write a binary PLY"):
+        read_ply(path)
 
 
 TRAINED = (

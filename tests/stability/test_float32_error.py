@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from tiny_run import main_here, overrides, write_moving_square
@@ -14,10 +16,12 @@ from tiny_training import compose, moving_square
 
 from gsbench import kernels
 from gsbench.errors import InputError
+from gsbench.measure.images import inferno
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.factors import KINDS
 from gsbench.models.render import render
+from gsbench.raster.exact import ExactImage
 from gsbench.run import setup
 from gsbench.run.load import load_run
 from gsbench.scenes import Points, View
@@ -73,11 +77,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(path.parent for path in root.rglob("checkpoint.pt"))
 
 
-def write_ply(path: Path) -> Path:
+def write_ply(path: Path, spread: float = 1.0) -> Path:
     """A PLY of ten Gaussians around the origin."""
     g = torch.Generator().manual_seed(0)
     fields = {
-        "means": torch.randn(10, 3, generator=g),
+        "means": spread * torch.randn(10, 3, generator=g),
         "log_scales": torch.full((10, 3), -1.0),
         "quats": torch.randn(10, 4, generator=g),
         "logits": torch.zeros(10),
@@ -137,10 +141,17 @@ def centers(subject: Subject) -> torch.Tensor:
 
 
 def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out."""
+    """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out.
+
+    Also an orbit of another size or middle, one of a PLY without extent, and a PLY seen otherwise than by itself.
+    """
     ply = stability.load(write_ply(run / "a.ply"), run)
     assert {(shot.camera.width, shot.camera.height, shot.time) for shot in ply.shots} == {(400, 400, None)}
-    assert ply.model.active.sh_degree == 3
+    assert (ply.model.active.sh_degree, ply.background, ply.antialias) == (3, BLACK, False)
+    means = ply.model.splats["means"]
+    assert (centers(ply) - means.median(0).values).norm(dim=-1).tolist() == pytest.approx([2.98] * 10, abs=0.005)
+    at_one_point = stability.load(write_ply(run / "point.ply", spread=0.0), run)
+    assert centers(at_one_point).norm(dim=-1).tolist() == pytest.approx([1e-6] * 10)
     monkeypatch.setattr(stability, "scene_of", lambda *_: (_ for _ in ()).throw(InputError("gone")))
     subject = stability.load(run, run)
     assert subject.note == "No photographs, so 10 views of an orbit: gone"
@@ -194,6 +205,19 @@ def test_the_report_word_for_word() -> None:
     hard = Conditioning({"joint factor": [1.0, 2.0, 3.0, 4.0, 5.0]}, {"schur": 0.5}, {"schur": 0.1})
     assert report.text(Exactness("a run", 20, [of_front, of_back], worst, hard, None)) == REPORT  # type: ignore[arg-type]
     assert float32_error.BRANCHES.keys() < report.MEANINGS.keys()
+
+
+def test_the_picture_shows_image_error_and_bound(tmp_path: Path) -> None:
+    """Catches panes in another order, and a linear scale, on which all errors are black."""
+    image, plane = torch.full((8, 8, 3), 0.5, dtype=torch.float64), torch.ones(8, 8, dtype=torch.float64)
+    exact = ExactImage(image, plane / 255, plane.int(), plane.byte())
+    shown = ("front", (image + 1e-3 / 255).float(), exact)  # an error of 1e-3 steps, and a bound of one
+    report.draw(Exactness("a run", 1, [], [], None, shown), tmp_path / "a.png")
+    picture = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB).astype(int)
+    middle, brightest = (inferno(np.array([[level]]))[0, 0] for level in (0.5, 1.0))
+    columns = [np.nonzero((np.abs(picture - color) <= 4).all(-1))[1] for color in ((128,) * 3, middle, brightest)]
+    assert min(map(len, columns)) > 20_000  # pixels
+    assert np.median(columns[0]) < np.median(columns[1]) < np.median(columns[2])
 
 
 def test_an_indefinite_covariance_is_a_reason() -> None:

@@ -28,6 +28,7 @@ def test_full_run_is_the_recipe_as_published() -> None:
 def test_short_run_keeps_the_proportions(iterations: int) -> None:
     """Catches a step that does not scale: each happens at the same part of the run as in the recipe."""
     short = schedule(iterations)
+    assert schedule(30).scaled(500) == schedule(60).scaled(500) == 1  # the least
     for recipe in (500, 1_000, 3_000, 15_000):
         assert short.scaled(recipe) == max(1, round(recipe / 30_000 * iterations))
     assert short.active(iterations - 1).sh_degree == 3

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from gsbench.errors import TooLargeError
-from gsbench.export import direction, main
+from gsbench.export import direction, main, parser
 from gsbench.measure.images import to_bytes
 from gsbench.models import CameraTime, GaussianModel, Gaussians3D, build, cameras
 from gsbench.models.render import render
@@ -82,7 +82,8 @@ def test_a_ply_says_how_it_differs_from_the_model(
 ) -> None:
     """Catches Beta profiles or an antialiasing filter that are lost without a word, and a word where there are none."""
     assert exports(folder, *option, *ALONG)
-    assert len(capsys.readouterr().out.splitlines()) == 1
+    (line,) = capsys.readouterr().out.splitlines()
+    assert (" at time 0, " in line) == (option[0] == "--ply")
     shutil.rmtree("a", ignore_errors=True)
     run = load_run(folder)
     run.config.raster.antialias = True
@@ -194,6 +195,16 @@ def test_a_clip_that_fails_leaves_nothing(
     assert len(calls) == 3
     assert ("no Gaussian can be seen from this place at time 1:" in capsys.readouterr().err) == (failure is None)
     assert [*tmp_path.rglob("*")] == ([tmp_path / "clip"] if is_there else [])
+
+
+def test_defaults_are_those_that_the_help_names() -> None:
+    """Catches a help that says another default than there is."""
+    named = {"fps": 30, "seconds": 4, "supersample": 1, "path": "orbit", "device": "cpu", "json": False}
+    options = vars(parser().parse_args(["run"]))
+    assert {name: value for name, value in options.items() if value is not None} == named | {"run": Path("run")}
+    text = " ".join(parser().format_help().split())
+    for words in ("frames a second (30)", "an orbit, a spiral or --plys (4)", "and average (1)"):
+        assert words in text
 
 
 def test_a_direction_has_no_length() -> None:
@@ -369,9 +380,9 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
         (CLIP, "--direction"),
         ((*CLIP, *ALONG, "--time", "0.5"), "--time"),
         ((*CLIP, *ALONG, "--fps", "1", "--seconds", "1.4"), "at least 2 files"),
-        (("--plys", "nowhere/clip", *ALONG), "nowhere"),
+        (("--plys", "nowhere/clip", *ALONG), "to write into, there is none: make it first"),
         (("--plys", "full", *ALONG), "full has files"),
-        (("--plys", "full/file", *ALONG), "is a file"),
+        (("--plys", "full/file", *ALONG), "is a file: name another"),
     ],
 )
 def test_what_is_asked_wrong_is_answered_in_one_line(
