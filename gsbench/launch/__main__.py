@@ -17,7 +17,7 @@ from statistics import fmean
 from gsbench.errors import InputError, printable
 from gsbench.launch import plan
 from gsbench.launch.plan import identity
-from gsbench.launch.status import BROKEN, GOING, STATES, Experiment, RunStatus, read, status
+from gsbench.launch.status import BROKEN, DAMAGED, GOING, STATES, Experiment, RunStatus, read, status
 from gsbench.process.ending import end_with
 from gsbench.reading import as_json
 from gsbench.run import stop
@@ -142,10 +142,11 @@ def _retry(folder: Path, launch: list[str]) -> int:
     stop.listen()
     folder = folder.resolve()  # runs are launched from the folder that the first command was typed in
     experiment = read(folder)
-    single = [
+    broken = [
         run for run in status(experiment) if run.state in BROKEN and identity(run.overrides) not in experiment.planned
     ]
     count = retry(experiment, launch)
+    single = [run for run in broken if not " ".join(run.overrides).startswith(DAMAGED)]  # their lines say what to do
     for run in single[:MOST_COMMANDS]:
         words = " ".join(map(shlex.quote, (*run.overrides, f"results={quoted_value(str(folder.parent))}")))
         print(
@@ -155,7 +156,7 @@ def _retry(folder: Path, launch: list[str]) -> int:
         )
     if len(single) > MOST_COMMANDS:
         print(f"gsbench.launch: and {len(single) - MOST_COMMANDS} more runs of no sweep", file=sys.stderr)
-    if not count and not single:
+    if not count and not broken:
         print(f"{folder}: no run was stopped, failed, is lost or not started", file=sys.stderr)
     return _verdict(_show(folder, False))
 

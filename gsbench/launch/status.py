@@ -23,6 +23,7 @@ from gsbench.run.progress import SILENT, Progress, born, is_alive
 STATES = ("done", "running", "queued", "planned", "stopped", "not started", "failed", "lost")
 GOING = ("running", "queued", "planned")
 BROKEN = ("stopped", "not started", "failed", "lost")  # `retry` launches these again
+DAMAGED = "the run in"  # stands, before its folder, for the overrides of a run with a damaged record
 # Lines of a log that name a cause, and lines that report an error; a progress bar may precede the error on its line.
 CAUSE = re.compile(r"exceeded.* memory|oom.kill|out of memory|no space left", re.IGNORECASE)
 ERROR = re.compile(r"([\w.-]+: )*\w*error\b.*", re.IGNORECASE)
@@ -247,7 +248,7 @@ def _read_runs(folder: Path, experiment: Experiment) -> None:
     for path in _files(folder):
         if path.name == RECORD:
             overrides, record = record_status(path)
-            run = identity(overrides) or (f"the run in {path.parent}",)  # a damaged record
+            run = identity(overrides) or (f"{DAMAGED} {path.parent}",)
             experiment.records_by_path[path] = record
             if run not in experiment.records or experiment.records[run].written < record.written:
                 experiment.records[run] = record

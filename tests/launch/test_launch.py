@@ -73,14 +73,17 @@ def test_retry_passes_over_what_cannot_be_launched(
 def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a retry that says that no run failed, beside a status that lists one."""
+    """Catches a retry that says that no run failed, beside a status that lists one, and a command for a damaged record,
+    whose words are not known."""
     run, folder = ("7dgs", "lego", 0), tmp_path / "mini" / "seed0"
     folder.mkdir(parents=True)
     broken = crowd.record(*run) | {"status": "failed", "reason": "out of memory"}
     (folder / "record.json").write_text(json.dumps(broken, default=str))
+    (folder.parent / "record.json").write_text("{}")
     assert sweep_main(["retry", str(tmp_path / "mini")]) == 1
     errors = capsys.readouterr().err
     assert f"python -m gsbench {' '.join(identity(crowd.overrides(*run)))} results={tmp_path}" in errors
+    assert errors.count("python -m gsbench") == 1
     assert "no run was stopped" not in errors
 
 
