@@ -279,6 +279,40 @@ def test_the_first_gaussian_counts() -> None:
     assert exactness.views[0].median_bound > 0
 
 
+def test_the_worst_gaussians_have_the_largest_sums() -> None:
+    """Catches the least ones, a Gaussian twice, one of a view in which it is less hard, and another sum than that of
+    its pixels."""
+    model = small_model()
+    double, sums = float32_error.float64_model(model), []
+    for view in VIEWS[:2]:
+        exact = float32_error.render_twice(model, double, view.camera, view.time, torch.zeros(3), False).exact
+        shown = exact.culprit >= 0
+        sums.append(torch.zeros(len(model)).double().index_add(0, exact.culprit[shown].long(), exact.bound[shown]))
+    largest, at = torch.stack(sums).max(0)
+    order = largest.argsort(descending=True)[: float32_error.WORST]
+    worst = float32_error.measure(model, [*map(float32_error.Shot.of, VIEWS[:2])], BLACK, "").worst
+    assert [(culprit.index, culprit.view) for culprit in worst] == [(int(i), VIEWS[at[i]].name) for i in order]
+    assert [culprit.bound for culprit in worst] == pytest.approx((255 * largest[order]).tolist())
+
+
+def test_what_is_said_of_a_view() -> None:
+    """Catches a number in other units, and a bound on the change of PSNR that is not that of its pixels."""
+    image, plane = torch.full((2, 2, 3), 0.5, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
+    branches = torch.tensor([[0, 1], [0, 0]], dtype=torch.uint8)
+    shot = float32_error.Shot("a", VIEWS[0].camera, None, torch.full((2, 2, 3), 0.4))
+    single = image.float()
+    single[0, 0, 0] += 0.02
+    for bound, share in ((0.01, 0.21), (0.1, 3.0)):  # (2 x 0.1 x bound + bound^2) / 0.1^2
+        exact = ExactImage(image, bound * plane, plane.int(), branches)
+        known = float32_error.compare(shot, single, exact)
+        assert known.largest == pytest.approx(255 * 0.02, rel=1e-4)
+        assert known.rms == pytest.approx(255 * 0.02 / math.sqrt(12), rel=1e-4)
+        assert (known.bound, known.median_bound) == pytest.approx((255 * bound, 255 * bound))
+        assert known.undecided == 0.25
+        assert known.psnr_change == pytest.approx(-10 * math.log10((11 * 0.01 + 0.12**2) / 0.12), rel=1e-4)
+        assert known.psnr_bound == pytest.approx(-10 * math.log10(1 - share) if share < 1 else math.inf, rel=1e-4)
+
+
 @pytest.mark.parametrize(("name", "motion"), [("7dgs", 300), ("7dgs_nodir", 3000)])
 def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name: str, motion: int) -> None:
     """Catches a Gaussian whose published covariance is indefinite in float32 and is not named, or the reverse."""
