@@ -30,6 +30,7 @@ _VARYING = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape, tor
 _aten = torch.ops.aten
 _ALLOCATE = {_aten.empty.memory_format, _aten.empty_strided.default, _aten.empty_like.default, _aten.new_empty.default}
 _ALLOCATE_ZEROS = {_aten.zeros.default, _aten.zeros_like.default, _aten.new_zeros.default}
+_COPY = {_aten.clone.default, _aten._to_copy.default}
 
 
 class OutdatedError(Exception):
@@ -112,8 +113,10 @@ class Recording(TorchDispatchMode):
             self._calls.append(partial(operation, *args, **kwargs))
         elif operation in _ALLOCATE_ZEROS:
             self._calls.append(result.zero_)
+        elif operation in _COPY:
+            self._calls.append(partial(result.copy_, args[0]))
         elif not operation.is_view and operation not in _ALLOCATE:
-            self._calls.append(partial(_redo, result, partial(operation, *args, **kwargs)))
+            self._calls.append(_over(result, operation, args, kwargs))
         return result
 
     def add(self, call: Callable[[], Any]) -> None:
@@ -185,8 +188,28 @@ def _varies(operation: Any, args: Any) -> bool:
     return not _VARYING.isdisjoint(operation.tags)
 
 
-def _redo(result: Any, operation: Callable[[], Any]) -> None:
-    """Write the result of an operation over its earlier result, a tensor or several tensors."""
+def _over(result: Any, operation: Any, args: Any, kwargs: Any) -> Callable[[], Any]:
+    """Return a call that writes the result of an operation over its earlier result, a tensor or several tensors."""
+    if (variant := _variant_over(operation)) is None:
+        return partial(_copy_over, result, partial(operation, *args, **kwargs))
+    call, names = variant
+    results = result if isinstance(result, tuple) else (result,)
+    return partial(call, *args, **kwargs, **dict(zip(names, results, strict=True)))
+
+
+@functools.cache
+def _variant_over(operation: Any) -> tuple[Any, list[str]] | None:
+    """Return torch's variant of an operation that writes over tensors, and the names of these; None: it has none."""
+    arguments = [(x.name, str(x.type)) for x in operation._schema.arguments]
+    for name in operation.overloadpacket.overloads():
+        variant = getattr(operation.overloadpacket, name)
+        listed = variant._schema.arguments
+        if [(x.name, str(x.type)) for x in listed if not x.is_out] == arguments and any(x.is_out for x in listed):
+            return variant, [x.name for x in listed if x.is_out]
+    return None
+
+
+def _copy_over(result: Any, operation: Callable[[], Any]) -> None:
     new = operation()
     if isinstance(result, Tensor):
         result.copy_(new)

@@ -27,14 +27,15 @@ def repeated(recording: Recording) -> None:
 
 
 def test_a_repetition_has_the_results_of_the_present_values() -> None:
-    """Catches an operation that is left out: in place, of several results, into zeros, or through a view."""
+    """Catches an operation that is left out: in place, of several results, a copy, into zeros, or through a view."""
 
     def work(x: Tensor) -> list[Tensor]:
         summed = torch.zeros_like(x)
         summed += x.exp()
         summed[1:] *= 2
         halves = torch.linalg.qr(x.view(4, 2)[:2])
-        return [summed, *halves, x.new_full((2,), 3.0) + x[[1, 3]], torch.cat([x, summed]).sum()]
+        doubles = x.double().view(2, 4).T.clone() * 2
+        return [summed, *halves, x.new_full((2,), 3.0) + x[[1, 3]], torch.cat([x, summed]).sum(), doubles]
 
     inputs = numbers(8)
     with Recording() as recording:

@@ -79,26 +79,31 @@ def launched(fitted: Training) -> Training:
         ("7dgs", (), 31, 115),
     ],
 )
-def test_calls_of_a_launched_step(
+def test_calls_of_a_step(
     model: str, options: tuple[str, ...], kernels: int, operations: int, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches a change after which a step of four views launches more: each call takes a GPU at least two microseconds,
     and Python five; and a value that the CPU waits for."""
-    fitted, called, call = launched(start(model, *options)), Counter[str](), CudaLibrary.call
+    called, call = Counter[str](), CudaLibrary.call
 
     def count(library: CudaLibrary, name: str, *arguments: Any) -> None:
         called[name] += 1
         call(library, name, *arguments)
 
-    fitted.step, fitted.schedule.densify_stop = 90, 100  # when all parts of a model learn
-    fitted.train_step()
-    fitted.step = 91
     monkeypatch.setattr(CudaLibrary, "call", count)
-    with Calls() as calls:
-        fitted.train_step()
-    assert called.total() <= kernels, called
-    assert calls.counted.total() <= operations, calls.counted
-    assert not [name for name in calls.counted if "local_scalar" in name or "nonzero" in name]
+    for is_repeated in (False, True):
+        fitted = start(model, *options) if is_repeated else launched(start(model, *options))
+        fitted.step, fitted.schedule.densify_stop = 90, 100  # when all parts of a model learn
+        for _ in range(3):
+            fitted.train_step()
+        fitted.step = 91
+        called.clear()
+        with Calls() as calls:
+            fitted.train_step()
+        assert fitted.gradients.replay.counts["replayed"] == 2 * is_repeated
+        assert called.total() <= kernels, called
+        assert calls.counted.total() <= operations + is_repeated, calls.counted
+        assert not [name for name in calls.counted if "local_scalar" in name or "nonzero" in name]
 
 
 # The SH degree rises after steps 3, 6 and 9, AGR starts at 10, Gaussians are densified and sorted after 12, their
