@@ -13,13 +13,14 @@ import pytest
 import torch
 from worlds import brightening, filmed, moving, small_mover, still
 
+from gsbench import scenes
 from gsbench.errors import InputError
 from gsbench.gates import __main__ as command
 from gsbench.gates import permutation_test, static_fit_residuals
-from gsbench.gates.messages import lines, of_screen
+from gsbench.gates.messages import lines, of_comparison, of_screen
 from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import LEAST_FREE, screen_time
-from gsbench.measure.record import Direction, Gate, OnDemand, TimeScreen
+from gsbench.measure.record import Candidate, Direction, Gate, ModelComparison, OnDemand, TimeScreen
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.scenes.scene import Camera, Scene, View
 
@@ -163,13 +164,23 @@ def test_the_waves_that_are_looked_for(wave: int, is_slow: bool) -> None:
     assert p == 0.001 if is_slow else p > 0.05
 
 
+def test_only_those_that_can_be_chosen_tie() -> None:
+    """Catches a tie with a training that exceeds the budget, and one that is not told."""
+    fast, slow = Candidate("3dgs", 30.0, 1.0), Candidate("7dgs", 30.0, 9.0, "9 ms a frame")
+    assert "cannot decide" not in of_comparison(ModelComparison(7, "3dgs", [fast, slow]))
+    tie = of_comparison(ModelComparison(7, "6dgs", [fast, Candidate("6dgs", 30.0, 2.0), slow]))
+    assert "after 7 iterations: PSNR cannot decide between 3dgs, 6dgs, so the last of them is taken\n" in tie
+
+
 def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a command whose JSON is not what the page promises, and bad input that ends in a stack trace."""
+    """Catches a command whose JSON is not what the page promises, another seed, and a stack trace for bad input."""
     assert command.main([str(EMBEDDED / "moving-matte"), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)["time"]
     assert answer["decision"] == "on"
     assert answer["p"] == 0.001
     assert answer.keys() >= {"z", "free", "seconds", "reason"}
+    assert answer["z"] == screen_time(scenes.load(EMBEDDED / "moving-matte"), 0).z
+    assert 0 < answer["seconds"] < 600
     for wrong, line in (
         ([], "expected one of"),
         (["x", "--checkpoint", "y"], "expected one of"),
