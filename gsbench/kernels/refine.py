@@ -71,7 +71,9 @@ class _Inputs(NamedTuple):
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
         """Return the gradients of the original weights from those of the weights that `layers` returns."""
         read = g["weight_in"].shape[1]
-        g_in = torch.cat([g["weight_in"] / self.units[:read], torch.outer(g["bias_in"], self.gamma)], 1)
+        g_in = g["bias_in"].new_empty(self.weight_in.shape)
+        torch.div(g["weight_in"], self.units[:read], out=g_in[:, :read])
+        torch.outer(g["bias_in"], self.gamma.detach(), out=g_in[:, read:])
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
 
 

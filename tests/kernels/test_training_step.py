@@ -76,7 +76,7 @@ def launched(fitted: Training) -> Training:
         ("4dgs", (), 23, 54),
         ("4dgs", ("optim=sparse_adam",), 23, 56),
         ("7dgs_noagr", (), 23, 40),
-        ("7dgs", (), 31, 115),
+        ("7dgs", (), 31, 111),
     ],
 )
 def test_calls_of_a_step(
