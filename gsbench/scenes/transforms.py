@@ -130,7 +130,7 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
     is ignored, because in these data sets it has random points.
 
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
-    each pixel (`View.regions`). Masks are not used in training or measurement.
+    each pixel (`View.regions`). Masks are measured with (`psnr_object`), not trained with.
     """
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
