@@ -216,7 +216,7 @@ def bin_tiles(splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(C * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
-    pairs = checked_count(recording.read(total, lambda values: values[0] <= room)[0])
+    pairs = _checked_count(recording.read(total, lambda values: values[0] <= room)[0])
     room = pairs if recording.current() is None else int(ROOM * pairs)  # repetitions use the same memory
     require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
     ids = like.new_empty(room, dtype=torch.int32)
@@ -313,7 +313,7 @@ def room_for(pairs: int) -> int:
     Raises:
         InputError: there are more than int32 can count.
     """
-    return min(int(MARGIN * checked_count(pairs)) + 1, MAX_PAIRS)
+    return min(int(MARGIN * _checked_count(pairs)) + 1, MAX_PAIRS)
 
 
 @torch.no_grad()
@@ -341,7 +341,7 @@ def add_density(
     library_of(drawn.device.type).call("add_density", slots, drawn)
 
 
-def checked_count(pairs: int) -> int:
+def _checked_count(pairs: int) -> int:
     """Return the number of tile intersections; raise InputError if int32 cannot count them."""
     if pairs > MAX_PAIRS:
         raise InputError(

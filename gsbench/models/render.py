@@ -39,8 +39,8 @@ def rasterize_slices(
     gaussians, camera = stacked(slices), cameras[0]
     return rasterize(
         *gaussians[:4],
-        _together([x.viewmat for x in cameras]),
-        _together([x.K for x in cameras]),
+        in_one([x.viewmat for x in cameras]),
+        in_one([x.K for x in cameras]),
         camera.width,
         camera.height,
         background=_behind(gaussians, background),
@@ -51,8 +51,8 @@ def rasterize_slices(
     )
 
 
-def _together(tensors: list[Tensor]) -> Tensor:
-    """Stack tensors, without a copy if there is only one."""
+def in_one(tensors: list[Tensor]) -> Tensor:
+    """Stack the tensors of several views, without a copy if there is only one."""
     return tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
 
 

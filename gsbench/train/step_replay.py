@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsbench.kernels.recording import OutdatedError, Recording
+from gsbench.models.render import in_one
 from gsbench.scenes import Camera, View
 
 GRAPHED_ON = ("cuda",)  # types of devices on which what is recorded becomes CUDA graphs
@@ -33,9 +34,7 @@ class Observed(NamedTuple):
 
     def targets(self) -> Tensor:
         """Return the images that the loss takes, [V, H, W, 3]."""
-        if self.together is not None:
-            return self.together
-        return self.images[0][None] if len(self.images) == 1 else torch.stack(self.images)
+        return in_one(self.images) if self.together is None else self.together
 
     def copy(self) -> Observed:
         """Return a copy in memory of its own, which `overwrite` changes."""

@@ -47,7 +47,7 @@ def models(chapter: Results) -> tuple[dict[tuple[bool, ...], stats.Key], dict[tu
     return cells, cells | {cell: key for cell, key in zip(has, keys, strict=True) if key[0] in NESTED}
 
 
-def is_single(name: str) -> bool:
+def _is_single(name: str) -> bool:
     """Tell whether a gain is that of one effect, not an interaction or a mean over models."""
     return " × " not in name and "mean over" not in name
 
@@ -58,7 +58,7 @@ def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
     by_unit = {quantity: tests[tests.quantity == quantity].set_index("name") for quantity in UNITS}
     assert all(table.index.is_unique for table in by_unit.values())
     gains = by_unit["psnr_db"]
-    is_shown = gains.index.map(lambda name: is_single(name) or not name.endswith("nested"))
+    is_shown = gains.index.map(lambda name: _is_single(name) or not name.endswith("nested"))
     gains = gains[(gains.scenes > 0) & is_shown.to_numpy(bool)]
     if gains.empty:
         return None
