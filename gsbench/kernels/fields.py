@@ -22,32 +22,14 @@ linear = Operation(
     memory="layers of networks",
 )
 
-# A layer of H units with ReLU, then heads of one more such layer and one without ReLU each. Their outputs y lie side by
-# side: head h has those from ends[h - 1] to ends[h]. Hidden layers are not stored; rows are left out as in `linear`.
-heads = Operation(
-    "heads",
-    inputs={
-        "x": Input("N C"),
-        "first_weight": Input("H C", Gradient.SUMMED),
-        "first_bias": Input("H", Gradient.SUMMED),
-        "hidden_weight": Input("heads H H", Gradient.SUMMED),
-        "hidden_bias": Input("heads H", Gradient.SUMMED),
-        "last_weight": Input("K H", Gradient.SUMMED),
-        "last_bias": Input("K", Gradient.SUMMED),
-        "ends": Input("heads", Gradient.REFUSED, (torch.int32,)),
-    },
-    outputs={"y": Output("N K")},
-    memory="outputs of networks",
-)
-
-
 # The numbers of channels, of levels and of nodes along each axis of the planes, see `sample_planes`.
-SIZE: dict[str, type] = dict.fromkeys(("C", "levels", "x", "y", "z", "t"), int)
+SPACE: dict[str, type] = dict.fromkeys(("C", "levels", "x", "y", "z"), int)
+SIZE: dict[str, type] = SPACE | {"t": int}
 
 
 def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return the numbers of nodes in all planes of all levels, and of features."""
-    channels, levels, x, y, z, t = (numbers[name] for name in SIZE)
+    channels, levels, x, y, z, t = (numbers.get(name, 2) for name in SIZE)
     if not (1 <= levels <= 8 and min(x, y, z, t) >= 2 and max(x, y, z, t) <= 4096):
         raise InputError(f"planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
     return {
@@ -61,21 +43,46 @@ def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
 # of its planes, bilinear and constant beyond the border: at positions from `first` to `last`, and a time from -1 to 1.
 # `of_space` and `of_time` have the nodes of all levels, in each those of three planes, and in each the rows of nodes
 # along its first axis. x, y, z and t are the numbers of nodes in the first level; of x, y and z, each level has twice
-# as many as the level before.
+# as many as the level before. The products of the samples in space do not change with the time.
 sample_planes = Operation(
     "sample_planes",
     inputs={
         "positions": Input("N 3"),
         "first": Input("3", Gradient.REFUSED),
         "last": Input("3", Gradient.REFUSED),
-        "time": Input("", Gradient.REFUSED),
         "of_space": Input("in_space C", Gradient.SUMMED),
-        "of_time": Input("in_time C", Gradient.SUMMED),
     },
-    outputs={"features": Output("N F")},
-    numbers=SIZE,
+    outputs={"products": Output("N F")},
+    numbers=SPACE,
     derive=_sizes,
     memory="features of planes",
+)
+
+# The network of a field at one time. It reads the features, which are `products` times the samples in planes with t. A
+# layer of H units with ReLU is followed by heads of one more such layer and one without ReLU each. Their outputs y lie
+# side by side: head h has those from ends[h - 1] to ends[h]. Features and hidden layers are not stored; rows are left
+# out as in `linear`.
+field = Operation(
+    "field",
+    inputs={
+        "products": Input("N F", Gradient.ADDED),
+        "positions": Input("N 3", Gradient.ADDED),
+        "first": Input("3", Gradient.REFUSED),
+        "last": Input("3", Gradient.REFUSED),
+        "time": Input("", Gradient.REFUSED),
+        "of_time": Input("in_time C", Gradient.ADDED),
+        "first_weight": Input("H F", Gradient.SUMMED),
+        "first_bias": Input("H", Gradient.SUMMED),
+        "hidden_weight": Input("heads H H", Gradient.SUMMED),
+        "hidden_bias": Input("heads H", Gradient.SUMMED),
+        "last_weight": Input("K H", Gradient.SUMMED),
+        "last_bias": Input("K", Gradient.SUMMED),
+        "ends": Input("heads", Gradient.REFUSED, (torch.int32,)),
+    },
+    outputs={"y": Output("N K")},
+    numbers=SIZE,
+    derive=_sizes,
+    memory="outputs of networks",
 )
 
 # The sum over planes of the mean square of second differences along the rows, and for those with t of the mean distance

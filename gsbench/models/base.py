@@ -6,7 +6,7 @@ neural refinement).
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -48,6 +48,7 @@ class GaussianModel(nn.Module, ABC):
     initial_opacity: ClassVar[float] = 0.1
     kernel: Operation | None = None  # the kernel that computes slices as `condition` does; None: torch does
     warm_up: float = 0.0  # share of a training in which `active.warms_up`; a model with a static first stage sets it
+    shared: Sequence[Tensor] = ()  # in a training step: what `shared_by_views` has returned, without its `grad_fn`
 
     def __init_subclass__(cls, **more: Any) -> None:
         """Let torch slice a model that overrides `condition` and inherits the kernel of its base."""
@@ -126,6 +127,10 @@ class GaussianModel(nn.Module, ABC):
             centers: of the cameras of the step's views, [V, 3].
             drawn: which Gaussians these views see, [V, N] bool.
         """
+
+    def shared_by_views(self) -> list[Tensor]:
+        """Return what slices read and no camera or time changes; a training step computes it once, as `shared`."""
+        return []
 
     def penalty(self) -> Tensor | None:
         """Return a term of the loss that depends on the parameters alone, [], or None.

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsbench.kernels.backends import CPU
-from gsbench.kernels.fields import heads, plane_penalty, sample_planes
+from gsbench.kernels.fields import field, plane_penalty, sample_planes
 from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number, check_whole
 from gsbench.models.base import Raw
@@ -89,10 +89,28 @@ class HexPlaneModel(Gaussians3DModel):
         if self.active.warms_up:
             return raw
         assert query.time is not None
-        changes = self.network(self.planes(raw["means"], query.time)).split(list(self.outputs.values()), -1)
+        changes = self.changes(raw["means"], query.time).split(list(self.outputs.values()), -1)
         by_name = zip(self.outputs, changes, strict=True)
         changed = collect_gradients(*(raw[name] + change.view_as(raw[name]) for name, change in by_name))
         return raw | dict(zip(self.outputs, changed, strict=True))
+
+    def changes(self, means: Tensor, time: Tensor) -> Tensor:  # [N, 3] [] -> [N, sum of outputs]
+        """Return what the field adds to the raw parameters of Gaussians at these means, side by side."""
+        if not CPU.serves(means):
+            return self.network(self.planes(means, time))
+        planes, (products, *weights) = self.planes, self.shared or self._timeless(means)
+        arguments = products, means, planes.high, planes.low, time, planes.of_time, *weights, self.network.ends
+        return field(*arguments, *planes.size)[0]
+
+    def shared_by_views(self) -> list[Tensor]:
+        means = self.splats["means"]
+        if self.active.warms_up or self.refines or not CPU.serves(means):
+            return []
+        return self._timeless(means)
+
+    def _timeless(self, means: Tensor) -> list[Tensor]:
+        """Return what the kernel of the field reads and time does not change."""
+        return [self.planes.products(means), *self.network.stacked()]
 
     def penalty(self) -> Tensor | None:
         return None if self.active.warms_up else self.planes.penalty(*self.weights)
@@ -157,8 +175,6 @@ class Planes(nn.Module):
         From the lowest to the highest corner of the box, coordinates fall from 1 to -1. Time is used as it is, so only
         the second half of the nodes along t is read, as in the authors' code.
         """
-        if CPU.serves(positions):
-            return sample_planes(positions, self.high, self.low, time, self.of_space, self.of_time, *self.size)[0]
         # NaN would end the process in the gradient of grid_sample.
         coordinates = ((positions - self.high) * 2 / (self.low - self.high) - 1).nan_to_num()
         at = dict(zip("xyzt", (*coordinates.unbind(-1), time.expand(len(coordinates))), strict=True))
@@ -169,6 +185,10 @@ class Planes(nn.Module):
             return F.grid_sample(plane, grid, padding_mode="border", align_corners=True)[0, :, 0].T  # [N, C]
 
         return torch.cat([reduce(torch.mul, starmap(sample, level.items())) for level in self.levels()], -1)
+
+    def products(self, positions: Tensor) -> Tensor:  # [N, 3] -> [N, levels C]
+        """Return the products of the samples of the planes without t, by a kernel of the CPU."""
+        return sample_planes(positions, self.high, self.low, self.of_space, *self.size[:-1])[0]
 
     def penalty(self, space_smoothness: float, time_smoothness: float, time_sparsity: float) -> Tensor:
         """Return the sum over planes of three weighted terms, [].
@@ -217,10 +237,11 @@ class Network(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:  # [N, inputs] -> [N, sum of outputs]
         """Return the outputs of all heads, side by side."""
-        if CPU.serves(features):
-            weights, biases, last_weights, last_biases = zip(*(head.parameters() for head in self.heads), strict=True)
-            hidden = torch.stack(weights), torch.stack(biases)
-            last = torch.cat(last_weights), torch.cat(last_biases)
-            return heads(features, self.first.weight, self.first.bias, *hidden, *last, self.ends)[0]
         hidden = self.first(features)
         return torch.cat([head(hidden) for head in self.heads], -1)
+
+    def stacked(self) -> list[Tensor]:
+        """Return the weights and biases of the first layer, of all heads' hidden layers and of all last ones."""
+        weights, biases, last_weights, last_biases = zip(*(head.parameters() for head in self.heads), strict=True)
+        hidden = torch.stack(weights), torch.stack(biases)
+        return [self.first.weight, self.first.bias, *hidden, torch.cat(last_weights), torch.cat(last_biases)]

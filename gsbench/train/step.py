@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.tape import Tape, add_to
@@ -132,6 +132,7 @@ class Step:
         self.stages = stages
         self.terms: Sequence[LossTerm] = ()
         self.maps: Sequence[ImageMap] = ()
+        self.leaves: list[Tensor] = []  # what the views of a step share, in the same memory in each
         self.replay: StepReplay[PartResult] = StepReplay()
 
     def __call__(
@@ -148,25 +149,43 @@ class Step:
             TooLargeError: the memory does not suffice.
         """
         self.terms, self.maps = terms, maps
-        sources = [parameter for parameter in self.parameters if parameter.requires_grad]
+        with self.stages("slice"), Tape() as tape:
+            shared = self._shared()
+        sources = [x for x in (*self.parameters, *self.leaves) if x.requires_grad]
         parts = self._parts(views)
         workers = min(len(parts), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(parts) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(parts), bounds)
         seed = self.background.new_full((max(map(len, parts)),), 1 / len(views))
-        results = self.replay(
-            self._signature(views, parts, sources, workers),
-            [[views[i] for i in part] for part in parts],
-            lambda i, observed, stages: self._of_part(parts[i], observed, sources, sums[i], seed, stages),
-            lambda work: self._of_all(work, bounds),
-        )
+        self.model.shared = self.leaves
+        try:
+            results = self.replay(
+                self._signature(views, parts, sources, workers),
+                [[views[i] for i in part] for part in parts],
+                lambda i, observed, stages: self._of_part(parts[i], observed, sources, sums[i], seed, stages),
+                lambda work: self._of_all(work, bounds),
+            )
+        finally:
+            self.model.shared = ()
         with self.stages("backward"):
             total = add_up([result.sums for result in results])
-            for parameter in sources:
+            for x, leaf in zip(shared, self.leaves, strict=True):
+                if (g := total.get(id(leaf))) is not None:
+                    tape.backward(x, g, self.parameters, total)
+            for parameter in self.parameters:
                 parameter.grad = total.get(id(parameter))
             if (penalty := self.model.penalty()) is not None:
                 penalty.backward()
         return results
+
+    def _shared(self) -> list[Tensor]:
+        """Compute what all views of a step read, and copy it to the leaves by which the views are differentiated."""
+        shared = self.model.shared_by_views()
+        if [x.shape for x in shared] != [leaf.shape for leaf in self.leaves]:
+            self.leaves = [torch.empty_like(x).requires_grad_() for x in shared]
+        for leaf, x in zip(self.leaves, shared, strict=True):
+            leaf.data.copy_(x)
+        return shared
 
     def _parts(self, views: Sequence[View]) -> list[list[int]]:
         """Return the indices of the views of each part; what is done to single views needs parts of one view."""
@@ -182,7 +201,7 @@ class Step:
         return list(parts.values())
 
     def _signature(
-        self, views: Sequence[View], parts: list[list[int]], sources: list[nn.Parameter], workers: int
+        self, views: Sequence[View], parts: list[list[int]], sources: list[Tensor], workers: int
     ) -> Hashable:
         """Return all that the calls of a step depend on, except values of tensors; None if they must not be repeated.
 
@@ -193,7 +212,7 @@ class Step:
         work = sum([work_of(len(model), view.camera.width * view.camera.height) for view in views])
         if self.terms or self.maps or not by_kernels or work > MOST_RECORDED:
             return None
-        tensors = [*self.parameters, *([] if sets is None else [sets.orders, sets.intervals])]
+        tensors = [*self.parameters, *self.leaves, *([] if sets is None else [sets.orders, sets.intervals])]
         addresses = tuple([None if x is None else (x.data_ptr(), x.shape) for x in tensors])
         counts = None if sets is None else (sets.refined, sets.conditioned)
         options = tuple([x for x in vars(model).values() if isinstance(x, int | float | str)])
@@ -213,7 +232,7 @@ class Step:
             return [result for part in side_by_side(run, range(workers), workers) for result in part]
 
     def _of_part(
-        self, part: list[int], observed: Observed, sources: list[nn.Parameter], sums: Sums, seed: Tensor, stages: Stages
+        self, part: list[int], observed: Observed, sources: list[Tensor], sums: Sums, seed: Tensor, stages: Stages
     ) -> PartResult:
         """Render the views `part` of a batch and add the gradients of their losses to `sums`.
 

@@ -1,4 +1,4 @@
-"""A layer of a network, and a network of heads, against torch's, with rows that have no gradient and with NaN."""
+"""A layer of a network, and the network of a field, against torch's, with rows without a gradient and with NaN."""
 
 import math
 
@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsbench.kernels.fields import heads, linear
-from gsbench.models.hexplane import Network
+from gsbench.kernels.fields import field, linear
+from gsbench.models.hexplane import HexPlaneModel, Network, Planes
 
 LAYERS = pytest.mark.parametrize(
     ("rows", "inputs", "outputs", "relu"), [(300, 349, 256, True), (37, 13, 30, False), (1, 93, 10, True)]
@@ -50,27 +50,43 @@ def test_rows_without_a_gradient_change_nothing() -> None:
         assert torch.equal(gradient, same)
 
 
-def gradients(network: Network, x: Tensor, upstream: Tensor) -> list[Tensor]:
-    """The outputs, and the gradients of the inputs and of all weights."""
-    x = x.clone().requires_grad_()
-    y = network(x)
-    return [y.detach(), *torch.autograd.grad(y, [x, *network.parameters()], upstream)]
+def field_of(channels: int, levels: int, width: int, outputs: list[int]) -> HexPlaneModel:
+    """A field of random nodes and weights whose box is [-1, 1]^3."""
+    g = torch.Generator().manual_seed(0)
+    model = HexPlaneModel(channels=channels, levels=levels, resolution=5, time_resolution=6)
+    corners = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    model.planes = Planes(corners, model.nodes, levels, channels, g)
+    model.network = Network(levels * channels, width, outputs, g)
+    for nodes in model.planes.parameters():
+        nodes.data.uniform_(0.5, 1.5, generator=g)
+    return model
+
+
+def gradients(model: HexPlaneModel, positions: Tensor, time: float, upstream: Tensor) -> list[Tensor]:
+    """The outputs of a field, and the gradients of the positions and of all nodes and weights."""
+    positions = positions.clone().requires_grad_()
+    y = model.changes(positions, positions.new_tensor(time))
+    return [y.detach(), *torch.autograd.grad(y, [positions, *model.parameters()], upstream)]
 
 
 @pytest.mark.usefixtures("instruction_set")
+@pytest.mark.parametrize("time", [0.0, 0.37, 1.0, 1.5])
 @pytest.mark.parametrize(
-    ("rows", "inputs", "width", "outputs"), [(700, 64, 64, [3, 3, 4]), (150, 21, 13, [3, 1, 40, 4]), (1, 5, 33, [2])]
+    ("rows", "channels", "levels", "width", "outputs"),
+    [(700, 32, 2, 64, [3, 3, 4]), (150, 7, 3, 13, [3, 1, 40, 4]), (1, 20, 1, 33, [2])],
 )
-def test_heads_and_their_gradients_are_torch_s(rows: int, inputs: int, width: int, outputs: list[int]) -> None:
-    """Catches outputs or a hidden layer of another head, a lost layer, bias or ReLU, a chunk or column that is left
-    out, and rows whose gradients other rows get: some have none."""
+def test_a_field_and_its_gradients_are_torch_s(
+    rows: int, channels: int, levels: int, width: int, outputs: list[int], time: float
+) -> None:
+    """Catches a wrong line, share or level, channels beyond the last, outputs or a hidden layer of another head, a lost
+    layer, bias or ReLU, a chunk or column that is left out, and rows whose gradients other rows get: some have none."""
     g = torch.Generator().manual_seed(0)
-    network = Network(inputs, width, outputs, g)
-    x, upstream = torch.randn(rows, inputs, generator=g), torch.randn(rows, sum(outputs), generator=g)
+    positions, upstream = torch.randn(rows, 3, generator=g), torch.randn(rows, sum(outputs), generator=g)
     upstream[2:90:3] = 0
     upstream[300:600] = 0
-    computed = gradients(network, x, upstream)
-    expected = gradients(network.double(), x.double(), upstream.double())
+    model = field_of(channels, levels, width, outputs)
+    computed = gradients(model, positions, time, upstream)
+    expected = gradients(model.double(), positions.double(), time, upstream.double())
     for a, b in zip(computed, expected, strict=True):
         torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=1e-4)
     assert not computed[1][(upstream == 0).all(1)].any()
@@ -78,11 +94,13 @@ def test_heads_and_their_gradients_are_torch_s(rows: int, inputs: int, width: in
 
 def test_every_output_has_a_head() -> None:
     """Catches an output that no head writes, and memory beyond the outputs that a head reads or writes."""
-    x, first, hidden, last = torch.rand(9, 4), torch.rand(5, 4), torch.rand(3, 5, 5), torch.rand(6, 5)
-    biases = torch.rand(5), torch.rand(3, 5), torch.rand(6)
-    tensors = x, first, biases[0], hidden, biases[1], last, biases[2]
+    of_planes = torch.rand(9, 4), torch.rand(9, 3), *torch.rand(2, 3), torch.rand(()), torch.rand(12, 4)
+    layers = torch.rand(5, 4), torch.rand(5), torch.rand(3, 5, 5), torch.rand(3, 5), torch.rand(6, 5), torch.rand(6)
     for ends, same in (([2, 1, 0], [2, 2, 6]), ([-1, 4, 9], [0, 4, 6]), ([7, 7, 7], [6, 6, 6])):
-        y, expected = (heads(*tensors, torch.tensor(numbers, dtype=torch.int32))[0] for numbers in (ends, same))
+        y, expected = (
+            field(*of_planes, *layers, torch.tensor(numbers, dtype=torch.int32), 4, 1, 2, 2, 2, 2)[0]
+            for numbers in (ends, same)
+        )
         assert torch.equal(y, expected)
         assert y.isfinite().all()
 
@@ -92,4 +110,6 @@ def test_nan_stays() -> None:
     x, weight, bias = layer(20, 8, 4)
     x.data[3, 5] = math.nan
     assert linear(x, weight, bias, True)[0].isnan().all(1).nonzero().tolist() == [[3]]
-    assert Network(8, 6, [3, 2], torch.Generator())(x).isnan().all(1).nonzero().tolist() == [[3]]
+    model = field_of(4, 2, 6, [3, 2])
+    model.network.first.bias.data[1] = math.nan
+    assert model.changes(torch.zeros(2, 3), torch.tensor(0.5)).isnan().all()

@@ -4,7 +4,6 @@ import copy
 import math
 from typing import Any
 
-import pytest
 import torch
 from interrupted import assert_resumes
 from small import CAMERA, fresh, lively, raw, same, seeded
@@ -150,31 +149,13 @@ def test_the_field_has_the_gradients_of_its_values() -> None:
     assert torch.autograd.gradcheck(changes, values, fast_mode=True)
 
 
-@pytest.mark.usefixtures("threads")
-def test_features_have_the_same_bits_for_any_number_of_threads() -> None:
-    """Catches a sum over the points that read a node whose order depends on the threads, as that of x[index] does."""
-    positions = torch.randn(5000, 3, generator=seeded(0))
-    planes = Planes(positions / 2, (9, 8, 7, 6), 1, 40, seeded(1))
-    inputs = [positions.requires_grad_(), *planes.parameters()]
-    upstream = torch.randn(5000, 40, generator=seeded(2))
-
-    def computed(threads: int) -> list[Tensor]:
-        torch.set_num_threads(threads)
-        features = planes(positions, torch.tensor(0.3))
-        return [features.detach(), *torch.autograd.grad(features, inputs, upstream)]
-
-    first = computed(1)
-    for threads in (2, 3, 5):
-        assert all(torch.equal(a, b) for a, b in zip(first, computed(threads), strict=True))
-
-
 def test_points_in_a_plane_make_no_nan() -> None:
     """Catches a division by the box's width of zero, a gradient that is infinite there, and a
     crash at NaN."""
     points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
     planes = Planes(points, (4, 4, 4, 4), 1, 2, seeded(1))
     positions = torch.cat([points, points + 1, torch.full((1, 3), math.nan)]).requires_grad_()
-    planes(positions, torch.tensor(0.5)).sum().backward()
+    planes.products(positions).sum().backward()
     assert positions.grad is not None
     assert positions.grad.isfinite().all()
 

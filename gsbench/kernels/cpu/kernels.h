@@ -113,57 +113,61 @@ struct LinearGrads {
 };
 GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
 
-// A network of a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each; head h has
-// the outputs from ends[h - 1] to ends[h] of all K.
-struct HeadsArgs {
-    int64_t N;
-    int C, H, heads, K;
-    const float *x, *first_weight, *first_bias;  // [N, C] [H, C] [H]
-    const float *hidden_weight, *hidden_bias;    // [heads, H, H] [heads, H]
-    const float *last_weight, *last_bias;        // [K, H] [K]
-    const int32_t* ends;                         // [heads]
-    int threads;
-};
-GSB_FIELDS(HeadsArgs, INPUTS, N, C, H, heads, K, x, first_weight, first_bias, hidden_weight, hidden_bias, last_weight,
-           last_bias, ends, threads)
-
-struct HeadsGrads {
-    float *x, *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias;  // zero on entry, but x
-};
-GSB_FIELDS(HeadsGrads, GRADS, x, first_weight, first_bias, hidden_weight, hidden_bias, last_weight, last_bias)
-
-// Planes of features over two of the axes x, y, z and over one of them and t; on a GPU torch samples them.
+// Planes of features over two of the axes x, y, z, read at points; on a GPU torch samples them.
 constexpr int MOST_LEVELS = 8;
 
 struct PlaneArgs {
     int64_t N;
-    int C, levels, x, y, z, t;          // nodes along each axis in the first level; of x, y, z, the next has twice as many
-    const float *positions, *first, *last;      // [N, 3] [3] [3] of the points, of the first and the last nodes
-    const float *time, *of_space, *of_time;     // [] in [-1, 1], [M, C] [T, C] nodes
+    int C, levels, x, y, z;                 // nodes along each axis in the first level; the next has twice as many
+    const float *positions, *first, *last;  // [N, 3] [3] [3] of the points, of the first and the last nodes
+    const float* of_space;                  // [M, C] nodes
     int threads;
 };
-GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, t, positions, first, last, time, of_space,
-           of_time, threads)
+GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, positions, first, last, of_space, threads)
 
-struct Features {
-    float* features;  // [N, levels C]
+struct Products {
+    float* products;  // [N, levels C]
 };
-GSB_FIELDS(Features, OUTPUTS, features)
+GSB_FIELDS(Products, OUTPUTS, products)
 
-struct FeatureGrads {
-    const float* features;
+struct ProductGrads {
+    const float* products;
 };
-GSB_FIELDS(FeatureGrads, GIVEN, features)
+GSB_FIELDS(ProductGrads, GIVEN, products)
 
 struct PlaneGrads {
-    float *positions, *of_space, *of_time;  // of nodes: zero on entry
+    float *positions, *of_space;  // of nodes: zero on entry
 };
-GSB_FIELDS(PlaneGrads, GRADS, positions, of_space, of_time)
+GSB_FIELDS(PlaneGrads, GRADS, positions, of_space)
+
+// Products of samples in space, planes over one of the axes x, y, z and time, and a network that reads F = levels C
+// features: a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each. Head h has the
+// outputs from ends[h - 1] to ends[h] of all K.
+struct FieldArgs {
+    int64_t N;
+    int C, levels, x, y, z, t, F, H, heads, K;
+    const float *products, *positions, *first, *last;  // [N, F] and as in PlaneArgs
+    const float *time, *of_time;                       // [] in [-1, 1], [T, C] nodes
+    const float *first_weight, *first_bias;            // [H, F] [H]
+    const float *hidden_weight, *hidden_bias;          // [heads, H, H] [heads, H]
+    const float *last_weight, *last_bias;              // [K, H] [K]
+    const int32_t* ends;                               // [heads]
+    int threads;
+};
+GSB_FIELDS(FieldArgs, INPUTS, N, C, levels, x, y, z, t, F, H, heads, K, products, positions, first, last, time, of_time,
+           first_weight, first_bias, hidden_weight, hidden_bias, last_weight, last_bias, ends, threads)
+
+struct FieldGrads {
+    float *products, *positions, *of_time;  // added to
+    float *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias;  // zero on entry
+};
+GSB_FIELDS(FieldGrads, GRADS, products, positions, of_time, first_weight, first_bias, hidden_weight, hidden_bias,
+           last_weight, last_bias)
 
 // How rough these planes are along their rows, and how far from 1 those of time, with a weight for each.
 struct PenaltyArgs {
     int C, levels, x, y, z, t;
-    const float *of_space, *of_time;  // as in PlaneArgs
+    const float *of_space, *of_time;  // as in PlaneArgs and FieldArgs
     float space_smoothness, time_smoothness, time_sparsity;
     int threads;
 };
@@ -195,10 +199,10 @@ GSB_FIELDS(NodeGrads, GRADS, of_space, of_time)
     kernel(exact_image, ExactArgs, ExactPicture)   \
     kernel(linear, LinearArgs, Layer)              \
     kernel(linear_backward, LinearArgs, LayerState, LayerGrads, LinearGrads) \
-    kernel(heads, HeadsArgs, Layer)                \
-    kernel(heads_backward, HeadsArgs, LayerGrads, HeadsGrads) \
-    kernel(sample_planes, PlaneArgs, Features)     \
-    kernel(sample_planes_backward, PlaneArgs, FeatureGrads, PlaneGrads) \
+    kernel(field, FieldArgs, Layer)                \
+    kernel(field_backward, FieldArgs, LayerGrads, FieldGrads) \
+    kernel(sample_planes, PlaneArgs, Products)     \
+    kernel(sample_planes_backward, PlaneArgs, ProductGrads, PlaneGrads) \
     kernel(plane_penalty, PenaltyArgs, Penalty)    \
     kernel(plane_penalty_backward, PenaltyArgs, PenaltyGrad, NodeGrads)
 

@@ -1,11 +1,13 @@
-// A network of a layer and heads, each of two more layers, for the rows x of an array, and its gradients. ReLU is behind
-// all layers but the last ones.
+// A field that changes Gaussians over time: features of space times samples of planes of time, read by a network of a
+// layer and heads, each of two more layers; and its gradients. ReLU is behind all layers but the last ones.
 //
-// A chunk of rows goes through all layers while it is in cache. Hidden layers are never written to memory; the backward
-// pass computes them again. As in linear.cpp, every number is one sum in order, gradients of the weights are summed by
-// chunks, and rows without a gradient are left out of the backward pass.
+// All points of a view share its time, so planes of time are lines to them. A chunk of rows goes through all layers
+// while it is in cache. Features and hidden layers are never written to memory; the backward pass computes them again.
+// As in linear.cpp, every number is one sum in order, gradients of the weights are summed by chunks, and rows without a
+// gradient are left out of the backward pass.
 #include "buffer.h"
 #include "isa.h"
+#include "lines.h"
 #include "matrices.h"
 #include "rows.h"
 
@@ -80,15 +82,15 @@ struct Weights {
     Buffer<float> memory;
     Matrix first_T, hidden_T, last_T, first, hidden, last;
 
-    explicit Weights(const HeadsArgs& a)
-        : memory(static_cast<size_t>(floats(a.C, a.H) + floats(a.H, a.heads * a.H) + floats(a.H, a.K) +
-                                     floats(a.H, a.C) + floats(a.heads * a.H, a.H) + floats(a.K, a.H))) {
+    explicit Weights(const FieldArgs& a)
+        : memory(static_cast<size_t>(floats(a.F, a.H) + floats(a.H, a.heads * a.H) + floats(a.H, a.K) +
+                                     floats(a.H, a.F) + floats(a.heads * a.H, a.H) + floats(a.K, a.H))) {
         memory.zero();
         float* next = memory.data();
-        transpose_weights(a.first_weight, a.H, a.C, first_T = take(next, a.C, a.H));
+        transpose_weights(a.first_weight, a.H, a.F, first_T = take(next, a.F, a.H));
         transpose_weights(a.hidden_weight, a.heads * a.H, a.H, hidden_T = take(next, a.H, a.heads * a.H));
         transpose_weights(a.last_weight, a.K, a.H, last_T = take(next, a.H, a.K));
-        copy_weights(a.first_weight, a.H, a.C, first = take(next, a.H, a.C));
+        copy_weights(a.first_weight, a.H, a.F, first = take(next, a.H, a.F));
         copy_weights(a.hidden_weight, a.heads * a.H, a.H, hidden = take(next, a.heads * a.H, a.H));
         copy_weights(a.last_weight, a.K, a.H, last = take(next, a.K, a.H));
     }
@@ -98,21 +100,21 @@ struct Weights {
 struct Layers {
     Matrix first, hidden;
 
-    static int64_t size(const HeadsArgs& a) { return floats(CHUNK, a.H) + floats(CHUNK, a.heads * a.H); }
-    Layers(const HeadsArgs& a, float*& memory)
+    static int64_t size(const FieldArgs& a) { return floats(CHUNK, a.H) + floats(CHUNK, a.heads * a.H); }
+    Layers(const FieldArgs& a, float*& memory)
         : first(take(memory, CHUNK, a.H)), hidden(take(memory, CHUNK, a.heads * a.H)) {}
 };
 
-void hidden_layers(const HeadsArgs& a, const Weights& w, const Left& x, int64_t rows, const Layers& out) {
+void hidden_layers(const FieldArgs& a, const Weights& w, const Left& x, int64_t rows, const Layers& out) {
     const int hidden = a.heads * a.H;
-    product(x, rows, w.first_T, 0, a.C, a.H, at_bias(a.first_bias, a.H), write_relu(out.first, a.H));
+    product(x, rows, w.first_T, 0, a.F, a.H, at_bias(a.first_bias, a.H), write_relu(out.first, a.H));
     product(out.first.as_it_is(), rows, w.hidden_T, 0, a.H, hidden, at_bias(a.hidden_bias, hidden),
             write_relu(out.hidden, hidden));
 }
 
 // Calls f(head, first output, number of outputs) for each head. All outputs have a head, whatever `ends` says.
 template <class F>
-void for_each_head(const HeadsArgs& a, F f) {
+void for_each_head(const FieldArgs& a, F f) {
     for (int head = 0, first = 0; head < a.heads; ++head) {
         const int end = head + 1 == a.heads || a.ends[head] > a.K ? a.K : a.ends[head] < first ? first : a.ends[head];
         f(head, first, end - first);
@@ -120,20 +122,21 @@ void for_each_head(const HeadsArgs& a, F f) {
     }
 }
 
-// The gradients of the weights by one chunk, one after the other.
+// The gradients of the weights, and of the lines, by one chunk, one after the other.
 struct WeightGrads {
-    float *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias, *end;
+    float *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias, *lines, *end;
 
-    WeightGrads(const HeadsArgs& a, float* memory)
+    WeightGrads(const FieldArgs& a, const Lines& of_time, float* memory)
         : first_weight(memory),
-          first_bias(first_weight + int64_t{a.H} * a.C),
+          first_bias(first_weight + int64_t{a.H} * a.F),
           hidden_weight(first_bias + a.H),
           hidden_bias(hidden_weight + int64_t{a.heads} * a.H * a.H),
           last_weight(hidden_bias + a.heads * a.H),
           last_bias(last_weight + int64_t{a.K} * a.H),
-          end(last_bias + a.K) {}
+          lines(last_bias + a.K),
+          end(lines + of_time.size) {}
 
-    void add_to(const HeadsGrads& out) const {
+    void add_to(const FieldGrads& out, float* g_lines) const {
         const auto add = [](const float* from, const float* end, float* to) {
             for (; from < end; ++from, ++to) *to += *from;
         };
@@ -142,7 +145,8 @@ struct WeightGrads {
         add(hidden_weight, hidden_bias, out.hidden_weight);
         add(hidden_bias, last_weight, out.hidden_bias);
         add(last_weight, last_bias, out.last_weight);
-        add(last_bias, end, out.last_bias);
+        add(last_bias, lines, out.last_bias);
+        add(lines, end, g_lines);
     }
 };
 
@@ -155,16 +159,19 @@ void sum_rows(const Matrix& x, int64_t rows, int columns, float* out) {
 
 }  // namespace
 
-void heads(const HeadsArgs& a, const Layer& out) {
+void field(const FieldArgs& a, const Layer& out) {
     const Weights w(a);
-    const int64_t scratch_size = Layers::size(a);
+    Lines lines(a);
+    const int64_t scratch_size = floats(CHUNK, a.F) + Layers::size(a);
     Buffer<float> scratch(static_cast<size_t>(scratch_size * a.threads));
 #pragma omp parallel for num_threads(a.threads) schedule(dynamic, 1) if (a.N > CHUNK)
     for (int64_t begin = 0; begin < a.N; begin += CHUNK) {
         const int64_t rows = a.N - begin < CHUNK ? a.N - begin : CHUNK;
         float* memory = scratch.data() + scratch_size * thread_index();
+        const Matrix x = take(memory, CHUNK, a.F);
         const Layers layers(a, memory);
-        hidden_layers(a, w, {a.x + begin * a.C, a.C, 1}, rows, layers);
+        for (int64_t i = 0; i < rows; ++i) lines.features(a, begin + i, x.start + i * x.row);
+        hidden_layers(a, w, x.as_it_is(), rows, layers);
         for_each_head(a, [&](int head, int first, int width) {
             product(layers.hidden.as_it_is(head * a.H), rows, w.last_T, first, a.H, width,
                     at_bias(a.last_bias + first, width), write_to(out.y + begin * a.K + first, a.K, width));
@@ -172,29 +179,27 @@ void heads(const HeadsArgs& a, const Layer& out) {
     }
 }
 
-void heads_backward(const HeadsArgs& a, const LayerGrads& grads, const HeadsGrads& out) {
+void field_backward(const FieldArgs& a, const LayerGrads& grads, const FieldGrads& out) {
     Buffer<int32_t> kept(static_cast<size_t>(a.N));
     const int64_t total = rows_with_gradient(grads.y, a.N, a.K, a.threads, kept.data());
     const Weights w(a);
+    Lines lines(a);
+    Buffer<float> g_lines(static_cast<size_t>(lines.size));
+    g_lines.zero();
     const int hidden = a.heads * a.H;
-    const int64_t weights = WeightGrads(a, nullptr).end - static_cast<float*>(nullptr);
-    const int64_t scratch_size = 2 * Layers::size(a) + floats(CHUNK, a.C) + floats(CHUNK, a.K) + weights;
+    const int64_t weights = WeightGrads(a, lines, nullptr).end - static_cast<float*>(nullptr);
+    const int64_t scratch_size = 2 * Layers::size(a) + floats(CHUNK, a.F) + floats(CHUNK, a.K) + weights;
     Buffer<float> scratch(static_cast<size_t>(scratch_size * a.threads));
-    for (int64_t i = 0, first = 0; i <= total; ++i) {
-        const int64_t end = i < total ? kept[static_cast<size_t>(i)] : a.N;
-        fill_zero(out.x, a.C, first, end);
-        first = end + 1;
-    }
 #pragma omp parallel for ordered num_threads(a.threads) schedule(static, 1) if (total > CHUNK)
     for (int64_t begin = 0; begin < total; begin += CHUNK) {
         const int64_t count = total - begin < CHUNK ? total - begin : CHUNK;
         const int32_t* rows = kept.data() + begin;
         float* memory = scratch.data() + scratch_size * thread_index();
         const Layers layers(a, memory), g(a, memory);
-        const Matrix x = take(memory, CHUNK, a.C), g_y = take(memory, CHUNK, a.K);
-        const WeightGrads g_weights(a, memory);
+        const Matrix x = take(memory, CHUNK, a.F), g_y = take(memory, CHUNK, a.K);
+        const WeightGrads g_weights(a, lines, memory);
         for (int64_t i = 0; i < count; ++i) {
-            __builtin_memcpy(x.start + i * x.row, a.x + int64_t{rows[i]} * a.C, sizeof(float) * static_cast<size_t>(a.C));
+            lines.features(a, rows[i], x.start + i * x.row);
             __builtin_memcpy(g_y.start + i * g_y.row, grads.y + int64_t{rows[i]} * a.K,
                              sizeof(float) * static_cast<size_t>(a.K));
         }
@@ -209,17 +214,23 @@ void heads_backward(const HeadsArgs& a, const LayerGrads& grads, const HeadsGrad
                 write_to(g_weights.hidden_weight, a.H, a.H));
         product(g.hidden.as_it_is(), count, w.hidden, 0, hidden, a.H, at_zero,
                 write_passed(layers.first, g.first, 0, a.H));
-        product(g.first.transposed(), a.H, x, 0, count, a.C, at_zero, write_to(g_weights.first_weight, a.C, a.C));
-        product(g.first.as_it_is(), count, w.first, 0, a.H, a.C, at_zero, [&](Vec by_x, int64_t i, int column) {
-            const int n = lanes_from(column, a.C);
-            if (n > 0) store_first(by_x, out.x + int64_t{rows[i]} * a.C + column, n);
-        });
+        product(g.first.transposed(), a.H, x, 0, count, a.F, at_zero, write_to(g_weights.first_weight, a.F, a.F));
+        product(g.first.as_it_is(), count, w.first, 0, a.H, a.F, at_zero, write_to(x.start, x.row, a.F));
         sum_rows(g_y, count, a.K, g_weights.last_bias);
         sum_rows(g.hidden, count, hidden, g_weights.hidden_bias);
         sum_rows(g.first, count, a.H, g_weights.first_bias);
+        __builtin_memset(g_weights.lines, 0, sizeof(float) * static_cast<size_t>(lines.size));
+        for (int64_t i = 0; i < count; ++i) {
+            lines.features_backward(a, rows[i], x.start + i * x.row, out, g_weights.lines);
+        }
 #pragma omp ordered
-        g_weights.add_to(out);
+        g_weights.add_to(out, g_lines.data());
     }
+    lines.for_each(a, out.of_time, g_lines.data(), [&](int n, float* before, float* after, float* line) {
+        const Vec g = load_some(line, n), later = g * Vec(lines.time.share);
+        add_first(g - later, before, n);
+        add_first(later, after, n);
+    });
 }
 
 }  // namespace GSB_ISA
