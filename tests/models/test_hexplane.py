@@ -4,6 +4,7 @@ import copy
 import math
 from typing import Any
 
+import pytest
 import torch
 from interrupted import assert_resumes
 from small import CAMERA, fresh, lively, raw, same, seeded
@@ -202,6 +203,23 @@ def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:
     alone = torch.autograd.grad(model.penalty(), list(model.planes.parameters()))
     for without, added, expected in zip(*gradients, alone, strict=True):
         torch.testing.assert_close(added, without + expected)
+
+
+def test_views_of_a_step_share_what_time_does_not_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches samples in space that each view takes anew, and gradients of them that are lost or counted twice."""
+    gradients = []
+    for share, expected in ((True, 1), (False, 3)):
+        fitted = trainer("hexplane", "train.batch_size=3")
+        model: Any = fitted.model
+        model.set_active(FULL)
+        samples, calls = model.planes.products, []
+        monkeypatch.setattr(model.planes, "products", lambda x, of=samples, to=calls: (to.append(1), of(x))[1])
+        if not share:
+            monkeypatch.setattr(model, "shared_by_views", list)
+        fitted.gradients(fitted.scene.train[:3])
+        assert len(calls) == expected
+        gradients.append([x.grad.clone() for x in model.parameters()])
+    torch.testing.assert_close(*gradients)
 
 
 def test_a_training_goes_on_from_its_checkpoint() -> None:
