@@ -18,6 +18,7 @@ from gsbench.measure import record as files
 from gsbench.measure.record import Record
 from gsbench.report import study
 from gsbench.report.columns import CURVES, RUNS, VIEWS
+from gsbench.report.plausible import implausible
 
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
@@ -57,7 +58,7 @@ class Results:
 
 
 def load(root: Path) -> Results:
-    """Read all records and studies under `root`; damaged and duplicate ones are left out, and `faults` says why.
+    """Read all records and studies under `root`; wrong and duplicate ones are left out, and `faults` says why.
 
     Raises:
         InputError: the folder is missing or has no record.
@@ -66,28 +67,35 @@ def load(root: Path) -> Results:
 
 
 def records_in(root: Path) -> tuple[Records, list[str]]:
-    """Return all records under `root` with the paths of their files, and why damaged ones are left out.
+    """Return all records under `root` with the paths of their files, and why wrong ones are left out.
 
     Raises:
         InputError: the folder is missing or has no record.
     """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
-    records, faults = [], []
+    read: Records = []
+    faults = []
     for path in files.find(root):
         try:
-            records.append((path, files.read(path)))
+            read.append((path, files.read(path)))
         except InputError as error:
             faults.append(printable(error))
     for folder in study.find(root):
         try:
             of_study, damaged = study.read(folder)
-            records += [(folder / study.RUNS_FILE, record) for record in of_study]
+            read += [(folder / study.RUNS_FILE, record) for record in of_study]
             faults += damaged
         except InputError as error:
             faults.append(printable(error))
-    if not records and not faults:
+    if not read and not faults:
         raise InputError(f"{root}: expected results, found no {files.FILE_NAME} or {study.RUNS_FILE} in it or below")
+    records = []
+    for path, record in read:
+        if why := implausible(record):
+            faults.append(printable(f"{path}: {record.path}: {why}"))
+        else:
+            records.append((path, record))
     return records, faults
 
 
@@ -153,11 +161,9 @@ def value_at(node: Any, place: str) -> Any:
 
 
 def _views(run: int, r: Record) -> Iterator[dict[str, Any]]:
-    """Yield the scores of each view; a finished run without scores of views has one view without a name."""
+    """Yield the scores of each view."""
     for view in r.per_view:
         yield {"run": run, "view": view.name} | {name: getattr(view, field) for name, field in VIEWS.items()}
-    if r.status == "ok" and not r.per_view:
-        yield {"run": run, "view": "", "psnr_db": (r.metrics or {}).get("psnr")}
 
 
 def psnr_val(r: Record) -> float:

@@ -51,14 +51,13 @@ def grids(results: Results, quantity: str = "psnr_db") -> Grids:
     """Return a quantity of the finished runs as arrays, with the same seeds and views for all models of a scene.
 
     Differences of models are then those on the same view with the same seed. A missing run or view is NaN. PSNR has a
-    column for each view; other quantities, and PSNR of runs without scores of views, have one column.
+    column for each view, other quantities have one.
     """
     names = ["scene", "seed", "model", "variant"]
     runs = results.finished.runs
     runs = runs[np.isfinite(runs[quantity].astype(float))]
     if quantity == "psnr_db":
-        table = results.views.drop_duplicates(["run", "view"], keep="last")
-        table = table.merge(runs[names], left_on="run", right_index=True, validate="many_to_one")
+        table = results.views.merge(runs[names], left_on="run", right_index=True, validate="many_to_one")
     else:
         table = runs[[*names, quantity]].assign(view="")
     arrays: Grids = {}

@@ -11,7 +11,6 @@ from records import HOSTILE, but, elsewhere, frontier, lost, make, on_demand
 from tiny_run import ROOT
 
 from gsbench.errors import InputError
-from gsbench.measure.curve import Point
 from gsbench.measure.record import Record, ViewScore
 from gsbench.report import contributors, merge, study
 from gsbench.report.__main__ import main
@@ -126,20 +125,10 @@ def test_a_run_that_two_publish_counts_once_and_other_numbers_are_told(tmp_path)
         (lost(make(seed=9)), "failed: out of memory"),
         (but(make(seed=9), provenance={"git_commit": "0123-dirty"}), "its commit is 0123-dirty"),
         (but(make(seed=9), provenance={"git_commit": HOSTILE}), "which does not reproduce it"),
-        (but(make(seed=9), metrics={"psnr": 60.0}), "psnr_db: expected 25, the mean of its views, got 60"),
-        (but(make(seed=9, psnr=400.0)), "psnr_db: expected -100 to 100, got 400"),
-        (
-            but(make(seed=9), curve=[Point(500, 45.0, 150.0), Point(1000, 90.0, 25.0)]),
-            "curve: psnr_val: expected -100 to 100, got 150",
-        ),
-        (but(make(seed=9), curve=[Point(500, -45.0, 20.0)]), "curve: seconds: expected 0 to 1e+12, got -45"),
-        (but(make(seed=9), metrics={"ssim": 1.5}), "ssim: expected -1 to 1, got 1.5"),
-        (but(make(seed=9), cost={"train_s": -1.0}), "train_s: expected 0 to 1e+12, got -1"),
-        (but(make(seed=9), cost={"num_gaussians": 10**15}), "gaussians: expected 0 to 1e+12, got 1e+15"),
         (but(make(seed=9), protocol={"background": HOSTILE}), "protocol: expected at most 300 characters"),
     ],
 )
-def test_what_cannot_be_is_left_out_in_a_line(bad, reason, tmp_path):
+def test_what_nobody_can_repeat_is_left_out_in_a_line(bad, reason, tmp_path):
     """Catches a made-up or unfinished run that ranks among others, and one that keeps everyone else's out."""
     results = merge.read(published(tmp_path, alice=[make()], mallory=[make(seed=1), bad]))
     assert results.runs.seed.tolist() == [0, 1]

@@ -27,7 +27,8 @@ def runs(*seeds, change=lambda r: r, **more):
 
 
 def moved(r, psnr):
-    return but(r, metrics={"psnr": r.metrics["psnr"] + psnr})
+    views = [dataclasses.replace(view, psnr=view.psnr + psnr) for view in r.per_view]
+    return but(r, metrics={"psnr": r.metrics["psnr"] + psnr}, per_view=views)
 
 
 def by(psnr, *more):

@@ -1,0 +1,75 @@
+"""Tell what of a record cannot be, as somebody may have edited it: a number out of range, a mean not of its views."""
+
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from gsbench.measure.exact_views import MOST_PSNR
+from gsbench.measure.record import Record
+from gsbench.report.columns import VIEWS
+
+MEASURED = ("metrics", "per_view", "cost", "regions", "on_demand", "stop", "averaged", "length_choice")
+RANGES = (  # of a number by its name; the first pattern that fits counts
+    ("psnr.*", 0.0, MOST_PSNR),
+    ("ssim.*", -1.0, 1.0),
+    (r"ms_ssim|dssim\d", 0.0, 1.0),
+    ("lpips.*", 0.0, 10.0),
+    ("flicker.*|static_drift", 0.0, 255.0),
+    (".*_db", -MOST_PSNR, MOST_PSNR),  # changes of PSNR
+    ("z", -math.inf, math.inf),
+    (".*", 0.0, 1e15),  # seconds, counts, bytes, shares
+)
+OF_PIXELS = ("psnr_moving", "psnr_object")  # views without such pixels have none
+ROUNDING = 1e-6  # by which a mean may differ from that of its views
+
+
+def implausible(record: Record) -> str:
+    """Return what of a record cannot be, with its place in record.json; "" if nothing is wrong."""
+    measured = {name: msgspec.to_builtins(getattr(record, name)) for name in MEASURED}
+    measured |= {"curve": [point._asdict() for point in record.curve], "parts.score": record.parts.get("score")}
+    for place, number in _numbers(measured):
+        low, high = _range(place.rpartition(".")[2])
+        if not low <= number <= high:
+            return f"{place}: expected {low:g} to {high:g}, got {number:g}"
+    return _of_views(record)
+
+
+def _of_views(record: Record) -> str:
+    """Return what is wrong with the views of a record, or with a metric that is not the mean of theirs."""
+    names = [view.name for view in record.per_view]
+    if record.status == "ok" and not names:
+        return "per_view: expected each evaluated view, got none"
+    if len(set(names)) < len(names):
+        return f"per_view: expected each view once, got {max(names, key=names.count)} more than once"
+    for score in VIEWS.values():
+        mean = (record.metrics or {}).get(score)
+        values = [value for view in record.per_view if (value := getattr(view, score)) is not None]
+        if mean is None or not (values or score == "psnr"):
+            continue
+        if len(values) < len(names) and score not in OF_PIXELS:
+            return f"per_view: expected {score} of all {len(names)} views, as metrics has it, got it of {len(values)}"
+        if not abs(mean - np.mean(values)) <= ROUNDING:
+            return f"metrics.{score}: expected {np.mean(values):g}, the mean of its views, got {mean:g}"
+    return ""
+
+
+def _numbers(node: Any, place: str = "") -> Iterator[tuple[str, float]]:
+    """Yield each number of plain JSON with its place, such as "cost.stage_s.loss"."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            yield from _numbers(value, f"{place}.{key}".lstrip("."))
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            yield from _numbers(value, f"{place}[{i}]")
+    elif isinstance(node, int | float):
+        yield place, node
+
+
+@cache
+def _range(name: str) -> tuple[float, float]:
+    return next((low, high) for pattern, low, high in RANGES if re.fullmatch(pattern, name))

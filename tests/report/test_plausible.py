@@ -1,0 +1,73 @@
+"""Records that somebody changed by hand: what cannot be is in no table, and is told with its place and the reason."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from records import but, elsewhere, make, on_demand, run, write_all
+
+from gsbench.measure.curve import Point
+from gsbench.measure.record import Record
+from gsbench.report import study
+from gsbench.report.frame import load
+
+RUN = run(seed=9)  # of two views, of 25 and 26 dB
+FIRST, SECOND = RUN.per_view
+CURVE = make().curve
+GATED = on_demand([make(seed=9)])[0]
+
+
+@pytest.mark.parametrize(
+    ("edited", "reason"),
+    [
+        (but(RUN, metrics={"psnr": 60.0}), "metrics.psnr: expected 25.5, the mean of its views, got 60"),
+        (replace(RUN, per_view=[FIRST]), "metrics.psnr: expected 25, the mean of its views, got 25.5"),
+        (replace(RUN, per_view=[]), "per_view: expected each evaluated view, got none"),
+        (
+            replace(RUN, per_view=[FIRST, SECOND] * 2),
+            "per_view: expected each view once, got test/r_000 more than once",
+        ),
+        (
+            replace(RUN, per_view=[FIRST, replace(SECOND, psnr=None)]),
+            "per_view: expected psnr of all 2 views, as metrics has it, got it of 1",
+        ),
+        (make(seed=9, psnr=400.0), "metrics.psnr: expected 0 to 100, got 400"),
+        (make(seed=9, psnr=-1.0), "metrics.psnr: expected 0 to 100, got -1"),
+        (but(RUN, metrics={"ssim": 3.0}), "metrics.ssim: expected -1 to 1, got 3"),
+        (but(RUN, metrics={"lpips_alex": -0.1}), "metrics.lpips_alex: expected 0 to 10, got -0.1"),
+        (but(RUN, metrics={"flicker": 256.0}), "metrics.flicker: expected 0 to 255, got 256"),
+        (replace(RUN, per_view=[FIRST, replace(SECOND, ssim=1.5)]), "per_view[1].ssim: expected -1 to 1, got 1.5"),
+        (replace(RUN, curve=[CURVE[0]._replace(psnr_val=150.0)]), "curve[0].psnr_val: expected 0 to 100, got 150"),
+        (replace(RUN, curve=[Point(500, -45.0, 20.0)]), "curve[0].seconds: expected 0 to 1e+15, got -45"),
+        (but(RUN, cost={"train_s": -1.0}), "cost.train_s: expected 0 to 1e+15, got -1"),
+        (but(RUN, cost={"stage_s": {"loss": -1.0}}), "cost.stage_s.loss: expected 0 to 1e+15, got -1"),
+        (but(RUN, cost={"num_gaussians": -5}), "cost.num_gaussians: expected 0 to 1e+15, got -5"),
+        (replace(RUN, averaged=-5), "averaged: expected 0 to 1e+15, got -5"),
+        (but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-101.0)]}), "-100 to 100"),
+        (
+            replace(elsewhere(RUN, "other"), parts={"score": {"ms_ssim": 1.5}}),
+            "parts.score.ms_ssim: expected 0 to 1, got 1.5",
+        ),
+    ],
+)
+def test_what_cannot_be_is_left_out_in_a_line(edited: Record, reason: str, tmp_path: Path) -> None:
+    """Catches a record that was changed by hand and ranks among others, also where it is a row of a study."""
+    write_all([make(), edited], tmp_path / "results")
+    study.write([make(), edited], tmp_path / "study")
+    for folder, file in (("results", edited.path / "record.json"), ("study", "runs.csv")):
+        results = load(tmp_path / folder)
+        assert results.runs.seed.tolist() == [0]
+        (fault,) = results.faults
+        assert fault.startswith(f"{tmp_path / folder / file}: {edited.path}: ")
+        assert reason in fault
+
+
+def test_what_can_be_is_kept(tmp_path: Path) -> None:
+    """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a run that failed."""
+    gained = but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-0.3)]})
+    moving = replace(
+        but(RUN, metrics={"psnr_moving": 20.0, "psnr_object": 21.0}),
+        per_view=[replace(FIRST, psnr_moving=20.0), SECOND],
+        seed=1,
+    )
+    assert load(write_all([gained, moving], tmp_path)).faults == ()
