@@ -30,6 +30,13 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f"{guess}Valid: {', '.join(choices)}."
 
 
+def refuse_options(options: object, names: Iterable[str], task: str) -> None:
+    """Raise InputError if an option of a command line is set that a task, such as "--page", does not read."""
+    for name in names:
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')}: expected none with {task}, which does not read it")
+
+
 def how_to_install(
     extra: str,  # such as view
 ) -> str:

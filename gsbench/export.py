@@ -23,6 +23,14 @@ from gsbench.view.video import check_file, check_parent
 
 PATHS = {"orbit": video.orbit, "spiral": video.spiral}
 WRITTEN = ("ply", "plys", "video", "images")  # options that name what is written
+READERS = {  # of an option: what is written by it
+    "time": ("ply", "video", "images"),
+    "direction": ("ply", "plys"),
+    **dict.fromkeys(("fps", "seconds"), ("plys", "video", "images")),
+    **dict.fromkeys(("path", "width", "height", "supersample"), ("video", "images")),
+}
+OF_TEST_VIEWS = {"fps": ("plys", "video"), "seconds": ("plys",)}  # the same with --path test, which has as many frames
+DEFAULTS = {"path": "orbit", "fps": 30.0, "seconds": 4.0, "supersample": 1}
 MOST_FRAMES = 100_000
 LEAST_FILES = 2  # of --plys: SuperSplat takes a single file for a model that stands still
 MOST_STEP = 1e-4  # of the cameras' distance: a pixel is 1e-3 of it; larger roundings of means are reported
@@ -78,12 +86,12 @@ def parser() -> argparse.ArgumentParser:
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--camera", metavar="I", help="a training view's number, or a view's name; it stands still")
     place.add_argument("--direction", metavar="X,Y,Z", help="of sight, for --ply and --plys: from afar")
-    add("--path", choices=[*PATHS, "test"], default="orbit", help="of the camera; test: the views it was measured on")
-    add("--fps", type=float, default=30, help="frames a second (30)")
-    add("--seconds", type=float, default=4, help="length of an orbit, a spiral or --plys (4)")
+    add("--path", choices=[*PATHS, "test"], help="of the camera (orbit); test: the views it was measured on")
+    add("--fps", type=float, help="frames a second (30)")
+    add("--seconds", type=float, help="length of an orbit, a spiral or --plys (4)")
     add("--width", type=int, metavar="PIXELS", help="of the frames (of images: the training's)")
     add("--height", type=int, metavar="PIXELS", help="of the frames (in proportion to --width)")
-    add("--supersample", type=int, default=1, metavar="N", help="render N times as large, and average (1)")
+    add("--supersample", type=int, metavar="N", help="render N times as large, and average (1)")
     add("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
     add("--model-module", metavar="MODULE", help="that registers the run's model")
     add("--device", default="cpu", help="cpu or cuda")
@@ -95,6 +103,7 @@ def prepare(options: argparse.Namespace) -> Export:
     """Check the options of the export and load the run and its data set; raise InputError if this fails."""
     if not any(getattr(options, name) for name in WRITTEN):
         raise InputError("expected --ply OUT.ply, --plys FOLDER, --video OUT.mp4 or --images FOLDER, got none of them")
+    check_read(options)
     if options.time is not None and not 0 <= options.time <= 1:
         raise InputError(f"--time: expected a number in [0, 1], got {options.time}")
     if not 0 < options.fps <= 1000 or not 1 <= options.fps * options.seconds <= MOST_FRAMES:
@@ -133,6 +142,19 @@ def prepare(options: argparse.Namespace) -> Export:
     is_filmed = options.video or options.images
     needs_data = options.camera is not None or (is_filmed and options.path == "test")
     return Export(run, scene_of(run, options.data_root) if needs_data else None, options)
+
+
+def check_read(options: argparse.Namespace) -> None:
+    """Raise InputError if an option would do nothing for what is written; give others their defaults."""
+    if options.path is not None and options.camera is not None:
+        raise InputError("--path: expected no --camera beside it, which stands still: leave one of them out")
+    for name, readers in (READERS | (OF_TEST_VIEWS if options.path == "test" else {})).items():
+        if getattr(options, name) is not None and not any(getattr(options, reader) for reader in readers):
+            beside = " beside --path test" if readers != READERS[name] else ""
+            raise InputError(f"--{name}: expected --{' or --'.join(readers)}{beside}, which reads it: leave it out")
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
 
 
 def check_clip(options: argparse.Namespace) -> None:

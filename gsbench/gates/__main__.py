@@ -11,7 +11,7 @@ from typing import Any
 
 from gsbench import scenes
 from gsbench.config_roles import facts
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, refuse_options
 from gsbench.gates import messages
 from gsbench.gates.screen import screen_time
 from gsbench.models.registry import import_models
@@ -27,9 +27,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m gsbench.gates", description=__doc__.partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE_FOLDER", help="of a data set that gsbench reads")
     parser.add_argument("--json", action="store_true", help="the answer as JSON")
-    parser.add_argument("--seed", type=_whole, default=0, help="of the points and the permutations")
+    parser.add_argument("--seed", type=_whole, help="of the points and the permutations")
     parser.add_argument("--checkpoint", type=Path, metavar="RUN_FOLDER", help="gate this run into one beside it")
-    parser.add_argument("--budget-db", type=float, default=BUDGET.default, help=BUDGET.help)
+    parser.add_argument("--budget-db", type=float, help=f"{BUDGET.help} ({BUDGET.default:g})")
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
     parser.add_argument("--data-root", help="where the data set of the run is now")
     options = parser.parse_args(arguments)
@@ -54,18 +54,23 @@ def _answer(options: argparse.Namespace) -> Answer:
     """Check the options, do the task that they name, and return its result for JSON and as lines."""
     if (options.scene is None) == (options.checkpoint is None):
         raise InputError("expected one of SCENE_FOLDER and --checkpoint RUN_FOLDER")
-    if not 0 <= options.seed < 2**63:
-        raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(options.seed)[:30]}")
-    BUDGET.check("--budget-db", options.budget_db)
+    if options.checkpoint is not None:
+        refuse_options(options, ("seed",), "--checkpoint")
+    else:
+        refuse_options(options, ("budget_db", "data_root", "model_module"), "SCENE_FOLDER")
+    seed, budget = options.seed or 0, BUDGET.default if options.budget_db is None else options.budget_db
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(seed)[:30]}")
+    BUDGET.check("--budget-db", budget)
     import_models(options.model_module)
     if options.checkpoint is not None:
         from gsbench.gates.finished import gate_finished  # imported here, because a screen needs no training code
 
-        record, new = gate_finished(options.checkpoint, options.budget_db, options.data_root)
+        record, new = gate_finished(options.checkpoint, budget, options.data_root)
         assert record.on_demand is not None  # what the gate removed
         lines = [*messages.lines(record.on_demand), f"Written: {new}"]
         return {"on_demand": record.on_demand, "written": new}, lines
-    screen = screen_time(scenes.load(options.scene), options.seed)
+    screen = screen_time(scenes.load(options.scene), seed)
     return {"time": screen}, [messages.of_screen(screen)]
 
 

@@ -169,6 +169,10 @@ def _job(folder: Path, run_number: int) -> int:
     stop.listen()
     sys.path.append(os.getcwd())  # `python -P` leaves it out, but a model of the user's may be there
     planned = plan.read(folder / plan.FILE_NAME)
+    if not 0 <= run_number < len(planned.runs):
+        raise InputError(
+            f"job: expected the number of a run in {folder}, 0 to {len(planned.runs) - 1}, got {run_number}"
+        )
     with hydra_with(Path(planned.config_dir) if planned.config_dir else None):
         config = compose_run(planned.runs[run_number])
         return 0 if do_planned(config, folder, run_number, at_once=0).reason is None else 1

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, refuse_options
 from gsbench.models import GaussianModel, build
 from gsbench.models.cameras import around
 from gsbench.models.registry import import_models
@@ -23,6 +23,7 @@ from gsbench.train.batches import generator
 
 VIEWS = 10  # of an orbit
 SIZE = 400  # pixels a side of the images of a PLY
+OUT = Path("results/stability")
 DISTANCE = 3.0  # of an orbit around a PLY, in median distances of its Gaussians from their middle
 
 
@@ -46,13 +47,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print all numbers as JSON, and draw no picture")
     parser.add_argument("--data-root", metavar="FOLDER", help="of the run's data set, where it has moved")
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
-    parser.add_argument("--out", type=Path, default=Path("results/stability"), help="folder of a PLY's picture")
+    parser.add_argument("--out", type=Path, help="folder of a PLY's picture (results/stability)")
     options = parser.parse_args(arguments)
     from gsbench.stability import report  # imports matplotlib
 
     try:
+        if is_ply(options.model):
+            refuse_options(options, ("data_root", "model_module"), "a PLY")
+        else:
+            refuse_options(options, ("out",), "a run")
         import_models(options.model_module)
-        subject = load(options.model, options.out, options.data_root)
+        subject = load(options.model, options.out or OUT, options.data_root)
         exactness = measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
         if options.json:
             print(report.json_of(exactness))
@@ -78,7 +83,12 @@ def load(
     Raises:
         InputError: the folder has no checkpoint, or the file is not a PLY of trained Gaussians.
     """
-    return _of_ply(path, out) if path.suffix.lower() == ".ply" else _of_run(path, data_root)
+    return _of_ply(path, out) if is_ply(path) else _of_run(path, data_root)
+
+
+def is_ply(path: Path) -> bool:
+    """Tell whether a path names a PLY, and not the folder of a run."""
+    return path.suffix.lower() == ".ply"
 
 
 def _of_run(folder: Path, data_root: str | None) -> Subject:

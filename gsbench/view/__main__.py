@@ -7,8 +7,10 @@ import time
 import warnings
 from pathlib import Path
 
-from gsbench.errors import InputError, how_to_install, one_line
+from gsbench.errors import InputError, how_to_install, one_line, refuse_options
 from gsbench.process.ending import end_with
+
+HOST, PORT = "localhost", 8080
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -16,8 +18,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m gsbench.view", description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_FOLDER", help="results/EXPERIMENT/SCENE/MODEL/seedK")
     parser.add_argument("--page", type=Path, metavar="OUT.html", help="write a page that compares two runs, and end")
-    parser.add_argument("--host", default="localhost", help="the address to listen on (localhost: this machine only)")
-    parser.add_argument("--port", type=int, default=8080, help="to listen on, or the next free one (8080)")
+    parser.add_argument("--host", help="the address to listen on (localhost: this machine only)")
+    parser.add_argument("--port", type=int, help="to listen on, or the next free one (8080)")
     parser.add_argument("--data-root", metavar="FOLDER", help="of the data set, where it has moved")
     parser.add_argument("--model-module", metavar="MODULE", help="that registers the run's model")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
@@ -41,8 +43,12 @@ def serve(options: argparse.Namespace) -> None:
     """
     if options.page is None and importlib.util.find_spec("viser") is None:
         raise InputError(f"the viewer needs viser: {how_to_install('view')}", docs="viewing.md#the-viewer")
-    if not 0 < options.port < 65536:
-        raise InputError(f"--port: expected 1 to 65535, got {options.port}")
+    if options.page is not None:
+        refuse_options(options, ("host", "port"), "--page")
+    host = HOST if options.host is None else options.host
+    port = PORT if options.port is None else options.port
+    if not 0 < port < 65536:
+        raise InputError(f"--port: expected 1 to 65535, got {port}")
     from gsbench.models.registry import import_models
     from gsbench.run.load import load_run
     from gsbench.run.setup import check_device
@@ -61,13 +67,13 @@ def serve(options: argparse.Namespace) -> None:
         return
     from gsbench.view.viewer import Viewer
 
-    viewer = Viewer(runs, options.host, options.port, options.data_root)
+    viewer = Viewer(runs, host, port, options.data_root)
     for renderer in viewer.renderers:
         print(f"{renderer.name}: {', '.join(renderer.label[1:])} ({renderer.run.folder})")
     if isinstance(viewer.scene, str):
         print(f"no training cameras: {viewer.scene}")
-    host = f"[{options.host}]" if ":" in options.host else options.host
-    print(f"Open http://{host}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
+    shown = f"[{host}]" if ":" in host else host
+    print(f"Open http://{shown}:{viewer.server.get_port()} in a browser; Ctrl-C ends it.", flush=True)
     try:
         while True:
             time.sleep(1)  # not longer: Ctrl-C may reach another thread, and acts when this one wakes up

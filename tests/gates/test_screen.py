@@ -186,7 +186,9 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
         (["x", "--checkpoint", "y"], "expected one of"),
         (["/nowhere"], "/nowhere"),
         (["--checkpoint", "/nowhere"], "/nowhere"),
-        (["x", "--budget-db", "nan"], "--budget-db"),
+        (["--checkpoint", "x", "--budget-db", "nan"], "--budget-db: expected a finite number"),
+        (["x", "--data-root", "y"], "--data-root: expected none with SCENE_FOLDER"),
+        (["--checkpoint", "x", "--seed", "1"], "--seed: expected none with --checkpoint"),
         *((["x", "--seed", seed], "--seed") for seed in ("-1", str(2**63), "9" * 5000)),
     ):
         assert command.main(wrong) == 2

@@ -377,6 +377,14 @@ def test_status_is_repeated_until_nothing_goes_on(
         (folder / "record.json").unlink()
 
 
+@pytest.mark.parametrize("number", ["1", "-1"])
+def test_a_job_of_no_run_is_refused(number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a stack trace, and the last run in place of none."""
+    plan.write(Plan("slurm", [["+exp=mini", "scene=dust"]], None), tmp_path)
+    assert main(["job", str(tmp_path), number]) == 2
+    assert f"{tmp_path}, 0 to 0, got {number}" in capsys.readouterr().err
+
+
 def test_the_help_says_what_each_command_does(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

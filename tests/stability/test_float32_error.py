@@ -165,11 +165,14 @@ def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pyte
 
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a stack trace for a folder without a run, a file that is no PLY, and an --out that is a file."""
+    """Catches a stack trace for a folder without a run, a file that is no PLY, an --out that is a file, and options
+    that are not read."""
     (tmp_path / "broken.ply").write_text("no")
     for arguments, expected in (
         ([tmp_path], "expected the folder of a run"),
         ([tmp_path / "broken.ply"], "expected a PLY"),
+        ([tmp_path / "broken.ply", "--data-root", tmp_path], "--data-root: expected none with a PLY"),
+        ([tmp_path, "--out", tmp_path], "--out: expected none with a run"),
         ([write_ply(tmp_path / "right.ply"), "--out", tmp_path / "broken.ply"], f"{tmp_path / 'broken.ply'}"),
     ):
         assert main([*map(str, arguments)]) == 2

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from gsbench.errors import TooLargeError
-from gsbench.export import direction, main, parser
+from gsbench.export import check_read, direction, main, parser
 from gsbench.measure.images import to_bytes
 from gsbench.models import CameraTime, GaussianModel, Gaussians3D, build, cameras
 from gsbench.models.render import render
@@ -200,8 +200,10 @@ def test_a_clip_that_fails_leaves_nothing(
 def test_defaults_are_those_that_the_help_names() -> None:
     """Catches a help that says another default than there is."""
     named = {"fps": 30, "seconds": 4, "supersample": 1, "path": "orbit", "device": "cpu", "json": False}
-    options = vars(parser().parse_args(["run"]))
-    assert {name: value for name, value in options.items() if value is not None} == named | {"run": Path("run")}
+    options = parser().parse_args(["run", "--video", "a.mp4"])
+    check_read(options)
+    has = {name: value for name, value in vars(options).items() if value is not None}
+    assert has == named | {"run": Path("run"), "video": Path("a.mp4")}
     text = " ".join(parser().format_help().split())
     for words in ("frames a second (30)", "an orbit, a spiral or --plys (4)", "and average (1)"):
         assert words in text
@@ -235,7 +237,7 @@ def test_time_runs_once_unless_it_stands_still(words: tuple[str, ...], moves: bo
 
 def test_images_are_what_the_model_renders(folder: Path) -> None:
     """Catches swapped colours, and test views that are rendered at other times than their own."""
-    assert exports(folder, "--images", "a", "--path", "test", *FOUR)
+    assert exports(folder, "--images", "a", "--path", "test")
     run = load_run(folder)
     for file, view in zip(sorted(Path("a").iterdir()), load_scene(run.config).test, strict=True):
         rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
@@ -383,6 +385,12 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
         (("--plys", "nowhere/clip", *ALONG), "to write into, there is none: make it first"),
         (("--plys", "full", *ALONG), "full has files"),
         (("--plys", "full/file", *ALONG), "is a file: name another"),
+        ((*PLY, "--seconds", "2"), "--seconds: expected --plys or --video or --images, which reads it"),
+        ((*PLY, "--path", "orbit"), "--path: expected --video or --images"),
+        ((*VIDEO, *ALONG), "--direction: expected --ply or --plys"),
+        (("--images", "a", "--path", "test", "--fps", "8"), "--fps: expected --plys or --video beside --path test"),
+        ((*VIDEO, "--path", "test", "--seconds", "2"), "--seconds: expected --plys beside --path test"),
+        ((*VIDEO, "--path", "orbit", "--camera", "0"), "--path: expected no --camera beside it"),
     ],
 )
 def test_what_is_asked_wrong_is_answered_in_one_line(
@@ -433,7 +441,7 @@ def test_a_disk_that_refuses_a_video_is_named(
     assert path.read_bytes() == whole
 
 
-@pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4"), ("--images", "a")])
+@pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4", *FOUR), ("--images", "a", *FOUR)])
 def test_memory_that_runs_out_ends_in_one_line(
     words: tuple[str, ...],
     folder: Path,
@@ -456,13 +464,13 @@ def test_memory_that_runs_out_ends_in_one_line(
     monkeypatch.setattr("gsbench.view.video.render", fails)
     monkeypatch.setattr("gsbench.view.slice_ply.ply_of", fails)
     while len(errors) > 1:
-        assert not exports(folder, *words, "--camera", "0", *FOUR)
+        assert not exports(folder, *words, "--camera", "0")
         (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
         assert line.startswith("gsbench.export: out of memory: ")
         assert not [path for path in tmp_path.rglob("*") if path.is_file()]
         errors.pop()
     with pytest.raises(RuntimeError, match="another shape"):
-        exports(folder, *words, "--camera", "0", *FOUR)
+        exports(folder, *words, "--camera", "0")
 
 
 def test_a_folder_without_a_checkpoint_and_other_data_are_refused(

@@ -144,6 +144,7 @@ def test_a_wrong_command_is_answered_in_one_line(
     wrong = [
         ([str(tmp_path)], f"{tmp_path}: expected the folder of a run"),
         ([str(folder), "--port", "0"], "--port"),
+        ([str(folder), "--page", "a.html", "--port", "9"], "--port: expected none with --page"),
         *(([str(folder), "--host", host], "--host") for host in hosts),
     ]
     for words, text in wrong:
