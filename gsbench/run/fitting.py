@@ -17,7 +17,7 @@ from gsbench.run.load import plain_description
 from gsbench.run.setup import evaluated_views
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
-from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen
+from gsbench.scenes.points import frustum_points, is_seen, random_points, share_of_points_seen
 from gsbench.scenes.scene import STANDARD
 from gsbench.train import checkpoint
 from gsbench.train.batches import generator
@@ -38,7 +38,7 @@ def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: Traine
     if start is not None:
         model.start_from(start, scene.extent, random)
     else:
-        model.initialise(scene.points or initial_points(config.data, scene, random), scene.extent, random)
+        model.initialise(initial_points(config.data, scene, random), scene.extent, random)
     model.to(config.device)
     return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
 
@@ -131,14 +131,22 @@ def _check_fitted(trainer: Trainer) -> None:
 
 
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
-    """Sample initial points for a data set without points, in a cube or in the frustum that all cameras share.
+    """Return the points of a data set, or sample some in a cube or in the frustum that all cameras share.
 
-    The share of the points that at least one training camera sees is printed.
+    The share of sampled points that at least one training camera sees is printed.
 
     Raises:
-        InputError: cameras see too few of the points.
+        InputError: cameras see none of the points beyond `data.near`, or too few of sampled ones.
     """
-    cameras = [view.to("cpu").camera for view in scene.train]
+    cameras = [view.camera.to("cpu") for view in scene.train]
+    if scene.points is not None:
+        means = scene.points.means.cpu()
+        if data.near is not None and not any(is_seen(means, camera, camera.near).any() for camera in cameras):
+            raise InputError(
+                f"{scene.name}: expected initial points beyond data.near={data.near:g}, the training cameras see none "
+                f"of {len(means)} there: lower data.near"
+            )
+        return scene.points
     if data.initial_half_width is None:
         return frustum_points(data.initial_points, cameras, scene.extent, random)
     points = random_points(data.initial_points, data.initial_half_width, random)
@@ -147,9 +155,10 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
     if share < LEAST_SEEN:
         away = sum(bool(camera.viewmat[2, 3] < 0) for camera in cameras)  # the depth of the origin
         axes = "; {} of {} cameras look away from it: are their axes right (in transforms*.json x right, y up, z back)?"
+        near = "" if data.near is None else f"lower data.near={data.near:g}, or "
         raise InputError(
             f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
-            f"{share:.1%}: set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
+            f"{share:.1%}: {near}set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
             f"at), or null for points that all cameras see{axes.format(away, len(cameras)) if away else ''}"
         )
     print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)

@@ -181,7 +181,7 @@ def check_start(trained: TrainedGaussians, scene: Scene) -> None:
     if share == 0:
         raise InputError(
             f"init.ply: expected Gaussians of {scene.name}, no training camera sees one of the "
-            f"{len(trained)}: is the file of another scene, or in other coordinates or units?",
+            f"{len(trained)}: is the file of another scene, in other coordinates or units, or nearer than data.near?",
             docs="viewing.md#start-from-a-ply",
         )
     if share < ENOUGH_SEEN:

@@ -147,7 +147,8 @@ def share_seen(
     """Return the share of Gaussians that at least one camera sees; at least `enough`, once it is reached.
 
     A camera sees a Gaussian of opacity 1/255 or more if a ball of three of its largest standard deviations reaches into
-    the camera's pyramid of view, and is at least one pixel wide. What stands in front of it does not count.
+    the camera's pyramid of view, is at least one pixel wide, and has its mean beyond the near plane. What stands in
+    front of it does not count.
     """
     unseen = (torch.sigmoid(trained.logits) >= ALPHA_MIN).nonzero()[:, 0]
     hidden, N = len(trained) - len(unseen), len(trained)
@@ -156,10 +157,10 @@ def share_seen(
         if 1 - (hidden + len(unseen)) / N >= enough:
             break
         K, viewmat = camera.K.double(), camera.viewmat.double()
-        sides = torch.stack([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1], K[2]])
-        sides = sides / sides.norm(dim=1, keepdim=True)  # [5, 3] unit normals into the pyramid
+        sides = torch.stack([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1]])
+        sides = sides / sides.norm(dim=1, keepdim=True)  # [4, 3] unit normals into the pyramid
         centers, radius = means[unseen] @ viewmat[:3, :3].T + viewmat[:3, 3], radii[unseen]
-        outside = (centers @ sides.T < -radius[:, None]).any(1)
+        outside = (centers @ sides.T < -radius[:, None]).any(1) | (centers[:, 2] <= camera.near)
         unseen = unseen[outside | (2 * radius * K[0, 0] < centers[:, 2])]
     return 1 - (hidden + len(unseen)) / N
 

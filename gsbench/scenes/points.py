@@ -62,29 +62,33 @@ def frustum_points(
         inside = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3] in the camera
         rotation, translation = viewmats[chosen, :3, :3], viewmats[chosen, :3, 3]
         points = (rotation.mT @ (inside - translation)[:, :, None])[..., 0]
-        visible = torch.stack([is_seen(points, camera) for camera in cameras]).all(0)
+        visible = torch.stack([is_seen(points, camera, camera.near) for camera in cameras]).all(0)
         drawn = torch.cat([drawn, points[visible]])
         if len(drawn) >= count:
             colors = 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255
             return Points(drawn[:count].contiguous(), colors)
     raise InputError(
         f"initial points: expected training cameras that see something in common, {len(drawn)} of "
-        f"{ROUNDS * count} random points are seen by all: set data.initial_half_width"
+        f"{ROUNDS * count} random points are seen by all: set data.initial_half_width, or lower data.near"
     )
 
 
-def is_seen(points: Tensor, camera: Camera) -> Tensor:  # [P, 3] in the dtype of the camera -> [P] bool
+def is_seen(
+    points: Tensor,  # [P, 3] in the dtype of the camera
+    camera: Camera,
+    near: float = 0.0,  # least depth, world units
+) -> Tensor:  # [P] bool
     """Return which points are inside the image of a camera."""
     x = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.to(points).T
     pixel = x[:, :2] / x[:, 2:]
-    return (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
+    return (x[:, 2] > near) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
 
 
 def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
-    """Return the share of points that are inside the image of at least one camera."""
+    """Return the share of points that are inside the image of at least one camera, and beyond its near plane."""
     visible = torch.zeros(len(points.means), dtype=torch.bool)
     for camera in cameras:
-        visible |= is_seen(points.means, camera)
+        visible |= is_seen(points.means, camera, camera.near)
     return float(visible.float().mean())
 
 

@@ -1,6 +1,7 @@
 """PLYs of trained Gaussians as they are found: in any encoding, of any degree, with and without what is not needed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +238,8 @@ def test_another_file_says_what_opens_it(
 
 
 def test_the_share_of_gaussians_that_a_camera_sees() -> None:
-    """Catches Gaussians behind all cameras, beside the image, too transparent or smaller than a pixel that count."""
+    """Catches Gaussians behind all cameras, beside the image, too transparent, smaller than a pixel or nearer
+    than a camera draws that count."""
     eye = torch.eye(4)
     ahead = Camera(eye, torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 60)
     aside = Camera(torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]), ahead.K, 100, 60)
@@ -265,3 +267,4 @@ def test_the_share_of_gaussians_that_a_camera_sees() -> None:
     assert share_seen(flat, [ahead], 1) == pytest.approx(2 / 7)
     assert share_seen(flat, [ahead, aside], 1) == pytest.approx(3 / 7)
     assert share_seen(flat, [ahead, aside], 0.1) == pytest.approx(2 / 7)  # enough
+    assert share_seen(flat, [replace(ahead, near=4.5)], 1) == 0

@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from gsbench.process import memory
 from gsbench.run.fitting import initial_points
 from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.scenes.points import frustum_points, nearest_distances, random_points, read_ply
-from gsbench.scenes.scene import Camera, Scene, View
+from gsbench.scenes.scene import Camera, Points, Scene, View
 
 VERTEX = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint"}
@@ -213,6 +214,20 @@ def test_cameras_that_look_away_are_told() -> None:
     scene = Scene("away", train, [], [], (0.0, 0.0, 0.0), 1.0, None, "made here")
     with pytest.raises(InputError, match="2 of 2 cameras look away from it: are their axes right"):
         initial_points(DataConfig(initial_points=200, initial_half_width=1.3), scene, torch.Generator())
+
+
+@pytest.mark.parametrize("half_width", [1.3, None])
+@pytest.mark.parametrize("points", [None, Points(torch.zeros(9, 3), torch.ones(9, 3))])
+def test_a_near_plane_beyond_all_points_is_refused(points: Points | None, half_width: float | None) -> None:
+    """Catches a training of an empty picture, as no camera draws a Gaussian nearer than data.near."""
+    config, g = DataConfig(initial_points=200, initial_half_width=half_width), torch.Generator().manual_seed(0)
+    train = [View(f"train/{i}", camera, None, torch.zeros(40, 24, 3)) for i, camera in enumerate(opposed(8.0))]
+    scene = Scene("near", train, [], [], (0.0, 0.0, 0.0), 1.0, points, "made here")
+    for near in (None, 3.0):
+        seen = scene if near is None else scene.with_near(near)
+        assert len(initial_points(replace(config, near=near), seen, g).means) == (200 if points is None else 9)
+    with pytest.raises(InputError, match=r"near: expected .* lower data.near|in common.* lower data.near"):
+        initial_points(replace(config, near=1000.0), scene.with_near(1000.0), g)
 
 
 def test_points_between_cameras_that_face_each_other() -> None:
