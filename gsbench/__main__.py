@@ -70,6 +70,7 @@ def _run(parsed: command.Command) -> int:
         if not is_sweep:
             ended = processes.do(configs[0])
             return 0 if ended.reason is None else BAD_INPUT if ended.is_refused else FAILED
+        command.check_distinct(configs)
         outcome = sweep.launch(configs, parsed.config_dir)
     if outcome.broken:
         print(

@@ -14,6 +14,7 @@ from gsbench.config_key import Key, described
 
 Plain = dict[str, Any]  # a resolved config in plain JSON
 
+OWN_NAMES = ("exp", "model", "scene")  # the config groups that have a place in a run's path
 _MOST_NAMED = 5  # the most differences that a message contains
 
 
@@ -44,6 +45,11 @@ def training_keys(plain: Plain) -> Plain:
         for key, value in whole.items()
         if facts(key).role == "training" and ((needed := facts(key).needs) is None or is_set(needed))
     }
+
+
+def names_variant(group: str) -> bool:
+    """Tell whether the choice of a config group is part of the name of a run's variant."""
+    return group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
 
 
 def training_hash(plain: Plain) -> str:

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, PATHS, register_schema
-from gsbench.config_roles import facts
+from gsbench.config_roles import config_hash, facts, names_variant, training_hash
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
@@ -175,6 +175,29 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
     except OmegaConfBaseException as error:
         raise InputError(explain(error)) from None
     return RunConfig(list(overrides), config, choices)
+
+
+def check_distinct(runs: Sequence[RunConfig]) -> None:
+    """Raise InputError if two runs of a sweep are one run, in one folder, although their command lines differ.
+
+    This happens if an override such as scene.name=X takes away what a sweep varies, or if a sweep varies a key that has
+    no place in a run's folder, such as data.root.
+    """
+    before: dict[str, RunConfig] = {}
+    for run in runs:
+        plain: Any = OmegaConf.to_container(_with_paths(run.config), resolve=True)
+        groups = {group: choice for group, choice in run.choices.items() if names_variant(group)}
+        key = config_hash({"": [plain["results"], plain["experiment"], training_hash(plain), groups]})
+        other = before.setdefault(key, run)
+        if other is run:
+            continue
+        words = [" ".join(each.overrides) for each in (other, run)]
+        is_named = any("scene.name=" in word for word in run.overrides)
+        instead = "add scene=custom, or leave scene.name out" if is_named else "leave one of them out"
+        raise InputError(
+            f"expected runs of different trainings, these two would be one run in one folder: '{words[0]}' and "
+            f"'{words[1]}': {instead}"
+        )
 
 
 def _with_paths(config: DictConfig) -> DictConfig:

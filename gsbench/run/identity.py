@@ -13,7 +13,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import CONF, Config
-from gsbench.config_roles import Plain, flat, recorded, repeating, training_keys
+from gsbench.config_roles import OWN_NAMES, Plain, flat, names_variant, recorded, repeating, training_keys
 from gsbench.errors import InputError
 from gsbench.measure import record as records
 from gsbench.reading import read_file
@@ -22,7 +22,6 @@ from gsbench.run.settings import label_of
 from gsbench.scenes.files import digest
 from gsbench.scenes.ply import MAX_FILE
 
-OWN_NAMES = ("exp", "model", "scene")  # the groups that have a place in a run's path
 LONGEST_VARIANT = 80  # characters; longer names could exceed the limits of a path
 
 
@@ -99,11 +98,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
         InputError: a setting of the model was deleted, which no name could tell.
     """
     standard = _standard_choices()
-    groups = {
-        group: choice
-        for group, choice in choices.items()
-        if choice and group not in OWN_NAMES and not group.startswith(("hydra", "launch"))
-    }
+    groups = {group: choice for group, choice in choices.items() if choice and names_variant(group)}
     words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if standard.get(group) != choice]
     # The overrides that compose the experiment as it is, with this model, scene and seed, to compare with.
     base = [

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from gsbench.config import CONF
 from gsbench.config_roles import flat
 from gsbench.errors import InputError
-from gsbench.launch.command import compose_run, hydra_with, parse, runs_of
+from gsbench.launch.command import check_distinct, compose_run, hydra_with, parse, runs_of
 from gsbench.launch.plan import identity
 
 JOB = "+exp=mini scene=suzanne +launch=slurm"
@@ -82,6 +82,8 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
         ("+exp=mini --multi", "--multi: expected -m"),
         ("+exp=mini data.scenes=[new] scene=newer", "scene 'newer' is not known"),
+        ("+exp=mini scene.name=suzanne", "one run in one folder: .* scene=moving-matte' and .*: add scene=custom"),
+        ("+exp=mini -m scene=dust data.root=a,b", "one run in one folder: .*: leave one of them out"),
         *(
             (f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d")
             for word in (
@@ -98,10 +100,16 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
 )
 def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
     """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
-    silence, a scene that is no scene, and a job that is submitted and fails, or is never requeued, for a number out of
-    its range."""
+    silence, a scene that is no scene, one folder that several runs share, and a job that is submitted and fails, or is
+    never requeued, for a number out of its range."""
     with pytest.raises(InputError, match=message):
-        [compose_run(run) for run in runs_of(parse(words.split()))[0]]
+        check_distinct([compose_run(run) for run in runs_of(parse(words.split()))[0]])
+
+
+def test_runs_of_different_folders_are_distinct() -> None:
+    """Catches a sweep over protocols or folders of results, which trains the same, that is refused as one run."""
+    for words in ("protocol=gsbench,published", "results=a,b"):
+        check_distinct([compose_run(run) for run in runs_of(parse(["+exp=mini", "-m", "scene=dust", words]))[0]])
 
 
 def test_a_question_is_left_to_hydra() -> None:
