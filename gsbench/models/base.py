@@ -78,6 +78,8 @@ class GaussianModel(nn.Module, ABC):
         check_whole(agr_octaves, "agr_octaves", 0, 32)
         self.new_refinement: Callable[..., Changes] = Refinement
         if agr_depth is not None:
+            if not agr:
+                raise InputError("agr_depth: expected agr=true too, as it describes AGR's network")
             width, octaves = 64 if agr_width is None else agr_width, agr_mean_octaves or 0
             check_whole(agr_depth, "agr_depth", 1, 64)
             check_whole(width, "agr_width", 1, 4096)

@@ -105,6 +105,7 @@ def test_wrong_options_are_refused(name: str) -> None:
         ("freetime", {"duration": 0.0}, "duration"),
         ("7dgs", {"agr_width": 32}, "expected agr_depth too"),
         ("7dgs", {"agr_mean_octaves": 10}, "expected agr_depth too"),
+        ("7dgs", {"agr_depth": 4}, "agr_depth: expected agr=true too"),
         ("ubs", {"modulation": "white"}, "modulation 'white'"),
     ],
 )
