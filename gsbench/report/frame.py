@@ -93,7 +93,7 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
     records = []
     for path, record in read:
         if why := implausible(record):
-            faults.append(printable(f"{path}: {record.path}: {why}"))
+            faults.append(printable(f"{path}: {record.path}: {why}: was it edited? delete it, and run again"))
         else:
             records.append((path, record))
     return records, faults
