@@ -7,7 +7,7 @@ import pytest
 from records import but, elsewhere, make, on_demand, run, write_all
 
 from gsbench.measure.curve import Point
-from gsbench.measure.record import Record
+from gsbench.measure.record import LengthChoice, Record, Region, Stop
 from gsbench.report import study
 from gsbench.report.frame import load
 
@@ -31,6 +31,10 @@ GATED = on_demand([make(seed=9)])[0]
             replace(RUN, per_view=[FIRST, replace(SECOND, psnr=None)]),
             "per_view: expected psnr of all 2 views, as metrics has it, got it of 1",
         ),
+        (
+            replace(RUN, per_view=[replace(FIRST, psnr=None), replace(SECOND, psnr=None)]),
+            "per_view: expected psnr of all 2 views, as metrics has it, got it of 0",
+        ),
         (make(seed=9, psnr=400.0), "metrics.psnr: expected 0 to 100, got 400"),
         (make(seed=9, psnr=-1.0), "metrics.psnr: expected 0 to 100, got -1"),
         (but(RUN, metrics={"ssim": 3.0}), "metrics.ssim: expected -1 to 1, got 3"),
@@ -42,6 +46,9 @@ GATED = on_demand([make(seed=9)])[0]
         (but(RUN, cost={"train_s": -1.0}), "cost.train_s: expected 0 to 1e+15, got -1"),
         (but(RUN, cost={"stage_s": {"loss": -1.0}}), "cost.stage_s.loss: expected 0 to 1e+15, got -1"),
         (but(RUN, cost={"num_gaussians": -5}), "cost.num_gaussians: expected 0 to 1e+15, got -5"),
+        (replace(RUN, stop=Stop(-5, 1)), "stop.iteration: expected 0 to 1e+15, got -5"),
+        (replace(RUN, length_choice=LengthChoice(-5, [])), "length_choice.kept: expected 0 to 1e+15, got -5"),
+        (replace(RUN, regions={"moving": Region("masks", -5, 0.1, "")}), "regions.moving.views: expected 0 to"),
         (replace(RUN, averaged=-5), "averaged: expected 0 to 1e+15, got -5"),
         (but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-101.0)]}), "-100 to 100"),
         (
@@ -63,8 +70,9 @@ def test_what_cannot_be_is_left_out_in_a_line(edited: Record, reason: str, tmp_p
 
 
 def test_what_can_be_is_kept(tmp_path: Path) -> None:
-    """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a run that failed."""
-    gained = but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-0.3)]})
+    """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a negative z."""
+    screen = replace(GATED.on_demand.screen, z=-1.7)
+    gained = but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-0.3)], "screen": screen})
     moving = replace(
         but(RUN, metrics={"psnr_moving": 20.0, "psnr_object": 21.0}),
         per_view=[replace(FIRST, psnr_moving=20.0), SECOND],
