@@ -224,8 +224,8 @@ def test_a_near_plane_beyond_all_points_is_refused(points: Points | None, half_w
     train = [View(f"train/{i}", camera, None, torch.zeros(40, 24, 3)) for i, camera in enumerate(opposed(8.0))]
     scene = Scene("near", train, [], [], (0.0, 0.0, 0.0), 1.0, points, "made here")
     for near in (None, 3.0):
-        seen = scene if near is None else scene.with_near(near)
-        assert len(initial_points(replace(config, near=near), seen, g).means) == (200 if points is None else 9)
+        shown = scene if near is None else scene.with_near(near)
+        assert len(initial_points(replace(config, near=near), shown, g).means) == (200 if points is None else 9)
     with pytest.raises(InputError, match=r"near: expected .* lower data.near|in common.* lower data.near"):
         initial_points(replace(config, near=1000.0), scene.with_near(1000.0), g)
 
