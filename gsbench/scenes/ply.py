@@ -73,9 +73,10 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     if not data.startswith(b"ply") or end is None:
         raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
-    encoding, before, vertices = _read_header(lines, path)
+    encoding, before, vertices, is_last = _read_header(lines, path)
     if encoding == "ascii":
-        return _read_ascii(data[end.end() :], sum(element.values for element in before), vertices, path)
+        skipped = sum(element.values for element in before)
+        return _read_ascii(data[end.end() :], skipped, vertices, path, is_last=is_last)
     start = end.end() + sum(element.size for element in before)
     available = max(len(data) - start, 0)
     if vertices.size > available:
@@ -83,11 +84,20 @@ def read_vertices(path: Path) -> NDArray[np.void]:
             f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
             f"{available}: truncated"
         )
+    if is_last and data[start + vertices.size :].strip():
+        raise _too_long(path, vertices)
     return np.frombuffer(data, vertices.dtype, vertices.rows, start)
 
 
-def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _Element]:
-    """Return the encoding of a PLY, the elements before the vertices, and the vertices."""
+def _too_long(path: Path, vertices: _Element) -> InputError:
+    return InputError(
+        f"{path}: element vertex: expected the file to end after the {vertices.rows} rows that its header names, it "
+        f"goes on: is the number right?"
+    )
+
+
+def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _Element, bool]:
+    """Return the encoding of a PLY, the elements before the vertices, the vertices, and whether they are the last."""
     words = [line.split() for line in lines[1:]]
     words = [line for line in words if line and line[0] not in ("comment", "obj_info")]
     match words:
@@ -108,7 +118,7 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _El
         if name == "vertex":
             if not element.values:
                 raise InputError(f"{path}: element vertex: expected points, got {count} of {len(fields)} properties")
-            return encoding, before, element
+            return encoding, before, element, not rest
         before.append(element)
     raise InputError(f"{path}: expected an 'element vertex <count>', found none")
 
@@ -132,7 +142,7 @@ def _read_properties(
     return fields, []
 
 
-def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> NDArray[np.void]:
+def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path, *, is_last: bool) -> NDArray[np.void]:
     """Parse the vertices of an ascii PLY, which `skipped` values of other elements precede."""
     count, dtype = vertices
     names, expected = dtype.names or (), skipped + vertices.values
@@ -140,7 +150,10 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path) -> ND
     values = []
     if 2 * expected <= len(body) + 1:
         require(_ASCII_VALUE * expected, f"{path}: {expected} values in ascii", "write a binary PLY")
-        values = body.split(maxsplit=expected)[skipped:expected]
+        values = body.split(maxsplit=expected)
+        if is_last and len(values) > expected:
+            raise _too_long(path, vertices)
+        values = values[skipped:expected]
     if len(values) < vertices.values:
         raise InputError(f"{path}: element vertex: expected {count} x {len(names)} values, the file is truncated")
     try:

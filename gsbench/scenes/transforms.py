@@ -221,7 +221,7 @@ def _read_split(
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
     if not isinstance(content, dict):
-        raise InputError(f"{source}: expected a JSON object with 'frames', got a {type(content).__name__}")
+        raise InputError(f"{source}: expected a JSON object with 'frames', got {_brief(content)}")
     frames = content.get("frames")
     if not isinstance(frames, list):
         raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")

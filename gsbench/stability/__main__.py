@@ -16,7 +16,7 @@ from gsbench.models.cameras import around
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.run.load import load_run, scene_of
-from gsbench.run.setup import evaluated_views
+from gsbench.run.setup import LEAST_GAUSSIANS, evaluated_views
 from gsbench.scenes.gaussian_ply import read_trained
 from gsbench.stability.float32_error import Shot, measure
 from gsbench.train.batches import generator
@@ -109,6 +109,8 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
 def _of_ply(path: Path, out: Path) -> Subject:
     """Load a PLY as a 3DGS model, with views of an orbit around the median of its means."""
     trained = read_trained(path)
+    if len(trained) < LEAST_GAUSSIANS:
+        raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")
     model = build("3dgs")
     model.start_from(trained, 1.0, generator(0))
     middle = trained.means.median(0).values

@@ -118,6 +118,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "json nested too deep": (write(JSON, b"[" * 100_000), JSON, "expected JSON"),
     "json integer too long": (write(JSON, b"9" * 5000), JSON, "expected JSON"),
     "json with a key twice": (write(JSON, b'{"frames": [], "frames": []}'), JSON, "'frames' appears twice"),
+    "json is null": (write(JSON, b"null"), JSON, "expected a JSON object with 'frames', got null"),
     "json is a pipe": (pipe(JSON), JSON, "found a pipe"),
     "json without an end": (link(JSON, "/dev/zero"), JSON, "found a device"),
     "json of 10 GB": (lambda root: os.truncate(root / JSON, 10**10), JSON, "at most"),

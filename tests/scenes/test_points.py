@@ -96,6 +96,8 @@ BAD_PLY = {
     "count beyond the file": (GOOD.replace(b"vertex 3", b"vertex 999999999999"), "truncated"),
     "count beyond the file, ascii": (GOOD_ASCII.replace(b"vertex 3", b"vertex 999999999999"), "truncated"),
     "truncated": (GOOD[:-1], "truncated"),
+    "count below the file": (GOOD.replace(b"vertex 3", b"vertex 2"), "end after the 2 rows"),
+    "count below the file, ascii": (GOOD_ASCII.replace(b"vertex 3", b"vertex 2"), "end after the 2 rows"),
     "list property": (GOOD.replace(b"property uchar red", b"property list uchar int red"), "scalar properties"),
     "unknown type": (GOOD.replace(b"uchar red", b"colour red"), "scalar properties"),
     "property twice": (GOOD.replace(b"float y", b"float x"), "scalar properties"),

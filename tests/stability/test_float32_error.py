@@ -77,16 +77,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(path.parent for path in root.rglob("checkpoint.pt"))
 
 
-def write_ply(path: Path, spread: float = 1.0) -> Path:
-    """A PLY of ten Gaussians around the origin."""
+def write_ply(path: Path, spread: float = 1.0, count: int = 10) -> Path:
+    """A PLY of Gaussians around the origin."""
     g = torch.Generator().manual_seed(0)
     fields = {
-        "means": spread * torch.randn(10, 3, generator=g),
-        "log_scales": torch.full((10, 3), -1.0),
-        "quats": torch.randn(10, 4, generator=g),
-        "logits": torch.zeros(10),
-        "dc": torch.randn(10, 3, generator=g),
-        "rest": torch.zeros(10, 15, 3),
+        "means": spread * torch.randn(count, 3, generator=g),
+        "log_scales": torch.full((count, 3), -1.0),
+        "quats": torch.randn(count, 4, generator=g),
+        "logits": torch.zeros(count),
+        "dc": torch.randn(count, 3, generator=g),
+        "rest": torch.zeros(count, 15, 3),
     }
     path.write_bytes(ply_of(TrainedGaussians(**fields)))
     return path
@@ -171,6 +171,7 @@ def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pyte
     for arguments, expected in (
         ([tmp_path], "expected the folder of a run"),
         ([tmp_path / "broken.ply"], "expected a PLY"),
+        ([write_ply(tmp_path / "few.ply", count=3)], f"{tmp_path / 'few.ply'}: expected at least 4 Gaussians, found 3"),
         ([tmp_path / "broken.ply", "--data-root", tmp_path], "--data-root: expected none with a PLY"),
         ([tmp_path, "--out", tmp_path], "--out: expected none with a run"),
         ([write_ply(tmp_path / "right.ply"), "--out", tmp_path / "broken.ply"], f"{tmp_path / 'broken.ply'}"),
