@@ -91,6 +91,8 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         parser.error("--against: expected no --latex beside it")
     if (options.live or options.publish) and (options.latex or options.json or options.figures or options.select):
         parser.error("--live, --publish: expected none of --latex, --json, --figures and --select beside them")
+    if options.train and (options.tables or options.publish or options.against):
+        parser.error("--train: expected none of --tables, --publish and --against beside it")
     if options.select and (options.tables or options.against):
         parser.error("--select: expected none of --tables and --against beside it")
     return options

@@ -211,6 +211,10 @@ def test_other_forms_take_a_merged_set(tmp_path, capsys):
     assert "alice" not in capsys.readouterr().out.partition("Protocol")[0]
     assert main(["nothing", "--merge", str(tmp_path / "nobody")]) == 2
     assert "nobody: expected a folder of results" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["nothing", "--publish", "x", "--merge", *folders])
+    for words in (
+        ["--publish", "x", "--merge", *folders],
+        *(["--train", each, "x"] for each in ("--publish", "--against")),
+    ):
+        with pytest.raises(SystemExit):
+            main(["nothing", *words])
     assert not Path("nothing").exists()
