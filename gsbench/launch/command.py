@@ -248,6 +248,8 @@ def explain(error: Exception) -> str:
         if message.startswith("Cannot convert 'dict'"):
             return f"config key '{cause.full_key}': expected a value, it has no keys"
         return f"config key '{cause.full_key}': {message}"
+    if "is not a subclass of LearningRate" in str(cause):
+        return f"{error}: expected the name of a rate of the model, or a new rate as +model.lr.NAME={{start: 1e-3}}"
     return " ".join(str(error).split())
 
 

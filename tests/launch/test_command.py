@@ -77,6 +77,7 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ("+exp=mini protocol.name=published", "protocol.name: expected protocol=NAME"),
         ("+exp=mini launch.at_once=2", r"launch.at_once: expected \+launch=parallel or \+launch=slurm"),
         ("+exp=mini +launch=parallel launch.cpus=2", r"launch.cpus: expected \+launch=slurm, which reads it"),
+        ("+exp=mini +model.lr.mean.start=1", "lr.mean.start=1: expected the name of a rate"),
         ("+exp=mini model=7", "model '7' is not known"),
         ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
