@@ -24,10 +24,14 @@ namespace gsb {
 
 // ---- gsbench/kernels/slices.py
 
+// On a GPU, a slice is computed for V views: `center` and `time` are [V, ..], and so are the outputs, [V, N, ..]. If
+// `raw_per_view`, each view has raw parameters of its own, [V, N, ..], except for the opacities. On the CPU, V is 1.
+
 // Gaussians of 6DGS and 7DGS: triangular factors over position p and direction d, time t or both, and the camera centre
 // and time at which they are sliced.
 struct TriangularArgs {
-    int64_t N, conditioned;  // Gaussians from `conditioned` on are static (no camera or time changes them)
+    int64_t N, V, conditioned;  // Gaussians from `conditioned` on are static (no camera or time changes them)
+    bool raw_per_view;
     bool conditioned_first;
     OffDiagonal form;
     bool subtracts;  // use the method that forms covariances, for comparison (CPU only)
@@ -38,8 +42,9 @@ struct TriangularArgs {
     const float *time, *log_lambda_d, *log_lambda_t;          // [] [] []
     int threads;
 };
-GSB_FIELDS(TriangularArgs, INPUTS, N, conditioned, conditioned_first, form, subtracts, half, means, directions, times,
-           log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d, log_lambda_t, threads)
+GSB_FIELDS(TriangularArgs, INPUTS, N, V, conditioned, raw_per_view, conditioned_first, form, subtracts, half, means,
+           directions, times, log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d,
+           log_lambda_t, threads)
 
 // Those of Gaussians are added to.
 struct TriangularGrads {
@@ -52,13 +57,14 @@ GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape
 // Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
 // sliced.
 struct RotatedArgs {
-    int64_t N, conditioned;  // Gaussians from `conditioned` on are static
+    int64_t N, V, conditioned;  // Gaussians from `conditioned` on are static
+    bool raw_per_view;
     const float *means, *times, *scales, *left_quats, *right_quats;  // [N, 3] [N, 1] [N, 4] [N, 4] [N, 4]
     const float *opacities, *clock, *time, *log_lambda_t;            // [N] logits, [] [] []
     int threads;
 };
-GSB_FIELDS(RotatedArgs, INPUTS, N, conditioned, means, times, scales, left_quats, right_quats, opacities, clock, time,
-           log_lambda_t, threads)
+GSB_FIELDS(RotatedArgs, INPUTS, N, V, conditioned, raw_per_view, means, times, scales, left_quats, right_quats,
+           opacities, clock, time, log_lambda_t, threads)
 
 // Those of Gaussians are added to.
 struct RotatedGrads {
@@ -81,14 +87,15 @@ GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
 // Gaussians of Universal Beta Splatting over position, direction and, unless `times` is null, time, with C = 3 or 4
 // variables besides position, and the camera centre and time at which they are sliced.
 struct UniversalArgs {
-    int64_t N;
+    int64_t N, V;
+    bool raw_per_view;
     const float *means, *directions, *times;        // [N, 3] [N, 3] [N, 1]
     const float *scales, *skew, *lower, *betas;     // [N, 3 + C] [N, 3] [N, 3 C + C (C - 1) / 2] [N, 1 + C]
     const float *opacities, *center, *time;         // [N] logits, [3] []
     int threads;
 };
-GSB_FIELDS(UniversalArgs, INPUTS, N, means, directions, times, scales, skew, lower, betas, opacities, center, time,
-           threads)
+GSB_FIELDS(UniversalArgs, INPUTS, N, V, raw_per_view, means, directions, times, scales, skew, lower, betas, opacities,
+           center, time, threads)
 
 struct UniversalGrads {
     float *means, *directions, *times, *scales, *skew, *lower, *betas, *opacities;  // added to
@@ -106,13 +113,14 @@ struct BetaSliceGrads {
 };
 GSB_FIELDS(BetaSliceGrads, GIVEN, means, factors, opacities, shapes)
 
-// Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time.
+// Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time. V is 1 unless
+// AGR has changed the raw parameters for each of several views.
 struct StaticArgs {
-    int64_t N;
-    const float *scales, *quats, *opacities;  // [N, 3] [N, 4] [N] logits
+    int64_t N, V;
+    const float *scales, *quats, *opacities;  // [V, N, 3] [V, N, 4] [N] logits
     int threads;
 };
-GSB_FIELDS(StaticArgs, INPUTS, N, scales, quats, opacities, threads)
+GSB_FIELDS(StaticArgs, INPUTS, N, V, scales, quats, opacities, threads)
 
 struct StaticSlice {
     float *factors, *opacities;  // [N, 3, 3] [N]
@@ -132,9 +140,10 @@ GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
 // ---- gsbench/kernels/colors.py
 
 // Inputs of colours: SH in the direction from `center` to the mean, times a Fourier series in time with `waves`
-// frequencies.
+// frequencies. On a GPU, `center` and `time` are those of V views, and colours are [V, N, 3]; on the CPU, V is 1.
 struct ColorArgs {
-    int64_t N;
+    int64_t N, V;
+    bool gaussian_per_view, time_per_view;  // means and opacities are [V, N, ..]; times are [V, N, 1]
     int degree, bases, waves;        // bases: the number of harmonics stored for each frequency
     const float *sh0, *shN;          // [N, 1, 3] [N, waves * bases - 1, 3]
     const float *means, *opacities;  // [N, 3] [N]; colours are not computed for opacities below 1/255
@@ -143,7 +152,8 @@ struct ColorArgs {
     const int32_t* orders;           // [N] each Gaussian's degree + 4 (waves - 1); null: all have the maximum
     int threads;
 };
-GSB_FIELDS(ColorArgs, INPUTS, N, degree, bases, waves, sh0, shN, means, opacities, times, center, time, orders, threads)
+GSB_FIELDS(ColorArgs, INPUTS, N, V, gaussian_per_view, time_per_view, degree, bases, waves, sh0, shN, means, opacities,
+           times, center, time, orders, threads)
 
 // A colour channel that is clamped to zero is stored as -0, so that the backward pass recognises it without reading the
 // coefficients again.

@@ -10,6 +10,7 @@ from torch import Tensor
 from gsbench import kernels
 from gsbench.errors import InputError, did_you_mean
 from gsbench.kernels import cuda
+from gsbench.kernels.library import library_of
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,10 @@ class Backend:
         """Return whether kernels process this tensor; otherwise torch does."""
         device = tensor.device.type
         return tensor.dtype == torch.float32 and device in self.devices and _built(device)
+
+    def takes_views(self, tensor: Tensor) -> bool:
+        """Return whether kernels process this tensor, and compute several views in one call."""
+        return self.serves(tensor) and library_of(tensor.device.type).takes_views
 
     def workers(self, tensor: Tensor) -> int:
         """Return how many Python threads should share independent work on tensors of this device.

@@ -23,6 +23,7 @@ class Library:
     """The compiled kernels for tensors on the CPU."""
 
     needs_scratch = False  # whether torch must provide scratch memory; the kernels of the CPU allocate their own
+    takes_views = False  # whether a call may slice and colour several views; on a CPU, a view at a time stays in caches
 
     def __init__(self, extension: ModuleType) -> None:
         """Store the compiled extension and read the argument names of its kernels.
@@ -71,6 +72,7 @@ class CudaLibrary(Library):
     """The compiled kernels for tensors on a GPU; they are enqueued on torch's current stream."""
 
     needs_scratch = True  # by torch's caching allocator
+    takes_views = True
 
     def _run(self, device: torch.device, name: str, *values: Any) -> None:
         if device.type != "cuda":  # tests run these kernels on the CPU

@@ -56,7 +56,8 @@ class Input:
 
     Args:
         shape: dimensions such as "N 3" or "C height width D". A dimension is a number or a name; equal names in one
-            operation mean equal sizes. A first dimension that may be missing starts with a question mark.
+            operation mean equal sizes. A first dimension that may be missing starts with a question mark; `?views` is
+            there only on a GPU, whose kernels compute several views at once.
         gradient: how the backward kernel returns the gradient.
         dtypes: the accepted types: float32, or int32 for indices.
         left_out_with: makes the input optional; inputs with the same value here are left out together.
@@ -72,7 +73,10 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A tensor that an operation returns: its shape as in `Input`, and whether it has a gradient."""
+    """A tensor that an operation returns: its shape as in `Input`, and whether it has a gradient.
+
+    A first dimension that may be missing is there if an input has it.
+    """
 
     shape: str
     gradient: bool = True
@@ -333,6 +337,8 @@ class Operation:
                 raise InputError(
                     f"{self.name}: expected {key} on {device}, as {next(iter(self.inputs))} is, got it on {x.device}"
                 )
+        if "views" in slots and not library_of(device.type).takes_views:
+            raise InputError(f"{self.name}: expected one view on {device}, got {slots['views']} in one call")
         return slots
 
     def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
@@ -390,7 +396,22 @@ class _Eager(torch.autograd.Function):
 
 def _filled(shape: Shape, slots: Slots) -> tuple[int, ...]:
     """Return a declared shape with the sizes of a call in the place of their names."""
+    first = shape[0] if shape else 0
+    if isinstance(first, str) and first.startswith("?"):
+        shape = (first[1:], *shape[1:]) if first[1:] in slots else shape[1:]
     return tuple([slots[x] if isinstance(x, str) else x for x in shape])
+
+
+def has_leading(name: str, tensors: dict[str, Tensor], dims: dict[str, int]) -> bool:
+    """Return whether tensors have a dimension of cameras (views) before their `dims` dimensions.
+
+    Raises:
+        InputError: some of those that are there have it, and others do not.
+    """
+    there = {key: tensors[key].dim() > count for key, count in dims.items() if key in tensors}
+    if len(set(there.values())) > 1:
+        raise InputError(f"{name}: expected {', '.join(there)} of each camera, or all for all cameras")
+    return any(there.values())
 
 
 def address(x: Tensor | None) -> int:

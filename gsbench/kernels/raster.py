@@ -20,6 +20,7 @@ from gsbench.kernels.operation import (
     Results,
     Tensors,
     address,
+    has_leading,
     in_rows,
 )
 from gsbench.process.memory import require
@@ -84,11 +85,8 @@ def count_tiles(width: int, height: int) -> int:
 
 def _sets_of_gaussians(tensors: dict[str, Tensor], _: dict[str, Any]) -> dict[str, int]:
     """Return whether each camera sees Gaussians of its own."""
-    dimensions = {"means": 2, "factors": 3, "opacities": 1, "shapes": 1}  # of one set
-    sets = {tensors[key].dim() - dims for key, dims in dimensions.items() if key in tensors}
-    if len(sets) > 1:
-        raise InputError(f"project: expected {', '.join(dimensions)} of each camera, or all for all cameras")
-    return {"gaussian_per_camera": int(sets == {1})}
+    dims = {"means": 2, "factors": 3, "opacities": 1, "shapes": 1}  # of one set
+    return {"gaussian_per_camera": int(has_leading("project", tensors, dims))}
 
 
 _project = Operation(

@@ -18,11 +18,12 @@ from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.operation import Operation
+from gsbench.kernels.tape import stack
 from gsbench.kernels.tensors import check_positive, check_whole
 from gsbench.models.appearance import ColorOrder, sh_colors
-from gsbench.models.camera_time import CameraTime, unit
+from gsbench.models.camera_time import CameraTime, together, unit
 from gsbench.models.effect_sets import NAMES, EffectSets
-from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry
+from gsbench.models.gaussian_batch import Conditioned, Gaussians3D, Geometry, stacked
 from gsbench.models.portable_math import exp, log, sqrt
 from gsbench.models.refinement import OCTAVES, Changes, DeepRefinement, Refinement
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -49,10 +50,16 @@ class GaussianModel(nn.Module, ABC):
     kernel: Operation | None = None  # the kernel that computes slices as `condition` does; None: torch does
     warm_up: float = 0.0  # share of a training in which `active.warms_up`; a model with a static first stage sets it
     shared: Sequence[Tensor] = ()  # in a training step: what `shared_by_views` has returned, without its `grad_fn`
+    # Whether the methods that take a query can be given the centres [V, 3] and times [V] of several views, if kernels
+    # compute slices and colours. A class that has its own kernel, or overrides one of these methods, says so itself.
+    takes_views: bool = False
 
     def __init_subclass__(cls, **more: Any) -> None:
         """Let torch slice a model that overrides `condition` and inherits the kernel of its base."""
         super().__init_subclass__(**more)
+        methods = ("slice", "refined", "slice_geometry", "kernel_arguments", "colored", "shade")
+        if not vars(cls).keys().isdisjoint(("kernel", *methods)):
+            cls.takes_views = vars(cls).get("takes_views", False)
         order = [next(base for base in cls.__mro__ if name in vars(base)) for name in ("condition", "kernel")]
         if cls.__mro__.index(order[0]) < cls.__mro__.index(order[1]):
             cls.kernel = None
@@ -309,6 +316,16 @@ class GaussianModel(nn.Module, ABC):
         raw = self.refined(query)
         return self.colored(self.slice_geometry(raw, query), raw, query)
 
+    def slices(self, queries: Sequence[CameraTime]) -> Gaussians3D:
+        """Slice the model for V views: the tensors are [V, N, ..], or [N, ..] if equal for all views or V is 1.
+
+        On a GPU, a kernel computes all views in one call if the model has one.
+        """
+        raw: Raw = dict(self.splats.items())
+        if len(queries) > 1 and self.takes_views and self.uses_kernel(raw) and self.backend.takes_views(raw["means"]):
+            return self.slice(together(queries))
+        return stacked([self.slice(query) for query in queries])
+
     def colored(self, geometry: Geometry, raw: Raw, query: CameraTime) -> Gaussians3D:
         """Compute the colours of 3D Gaussians, and return them together with means, factors and opacities."""
         means, factors, opacities, beta_exponents = geometry
@@ -367,7 +384,11 @@ class GaussianModel(nn.Module, ABC):
         by_kernel = self.backend.serves(raw["means"])
         intervals = None if self.effect_sets is None else self.effect_sets.intervals
         values = [raw[name] for name in names]
-        moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, intervals=intervals)
+        changes = partial(self.refinement, values, by_kernel=by_kernel, rows=rows, intervals=intervals)
+        if query.time.dim():
+            moved = stack(list(zip(*map(changes, query.time.unbind()), strict=True)))
+        else:
+            moved = changes(query.time)
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:

@@ -155,6 +155,7 @@ class UniversalBetaModel(BetaModel):
     centers: ClassVar[tuple[str, ...]] = ("means", "times", "directions")
     geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "lower", "betas")
     kernel = slice_universal
+    takes_views = True
 
     def __init__(
         self,

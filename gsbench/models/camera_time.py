@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -62,6 +63,12 @@ class CameraTime(NamedTuple):
             check_number(time, "query: time")
             time = center.new_full((), float(time))  # an int beyond 64 bits is a number too
         return cls(center, time)
+
+
+def together(queries: Sequence[CameraTime]) -> CameraTime:
+    """Return the queries of V views as one, with centres [V, 3] and times [V], for kernels that take several views."""
+    times = [query.time for query in queries if query.time is not None]
+    return CameraTime(torch.stack([query.center for query in queries]), torch.stack(times) if times else None)
 
 
 def unit(vectors: Tensor) -> Tensor:

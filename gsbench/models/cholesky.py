@@ -43,6 +43,7 @@ class CholeskyModel(JointModel):
     geometry: ClassVar[tuple[str, ...]] = ("log_diagonal", *KINDS)
     lengths = ("means", "motion")
     kernel = slice_triangular
+    takes_views = True
     directional_half = True  # whether f_dir has the 1/2 of 7DGS eq. 12
     unit_directions = False  # whether mean directions are normalised when a Gaussian is sliced
     bounded_times = False  # whether mean times are sigmoids of their parameters
@@ -126,7 +127,7 @@ class CholeskyModel(JointModel):
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
         named = super().kernel_arguments(raw, query) | {
-            "coupling": raw.get("coupling", raw["motion"].detach()[:, :0]),
+            "coupling": raw.get("coupling", raw["motion"].detach()[..., :0]),
             "half": 0.5 if self.directional_half else 1.0,
             "conditioned_first": self.factor_order == "conditioned_first",
             "form": OFF_DIAGONALS.index(self.layout.form),

@@ -37,6 +37,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
     lengths = ("means", "velocities")
     moving: ClassVar[tuple[str, ...]] = ("times", "durations", "velocities")
     kernel: Operation | None = slice_free_time
+    takes_views = True
 
     def __init__(
         self,

@@ -26,6 +26,7 @@ class Gaussians3DModel(GatedModel, gates=True):
 
     geometry: ClassVar[tuple[str, ...]] = ("scales", "quats")
     kernel: Operation | None = slice_static
+    takes_views = True
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres whose radii are the distances [N] of the points to their neighbours."""

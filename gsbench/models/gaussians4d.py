@@ -43,6 +43,7 @@ class Gaussians4DModel(JointModel, gates=True):
     centers = ("means", "times")
     geometry = ("scales", "left_quats", "right_quats")
     kernel = slice_rotated
+    takes_views = True
 
     def __init__(
         self,
@@ -57,6 +58,7 @@ class Gaussians4DModel(JointModel, gates=True):
             raise InputError(f"time_degree: expected 0, 1, .., {MAX_DEGREE}, got {time_degree}")
         check_scheme(scheme)
         self.time_degree = time_degree
+        self.takes_views = time_degree < MAX_WAVES  # torch shades view by view
         self.scheme = scheme
         self.add_lambda("time", lambda_t)
         self.register_buffer("clock", torch.ones(()))

@@ -112,6 +112,7 @@ class DirectModel(MovingGaussians3D, gates=True):
     geometry = ("scales", "quats", "precision", "coupling", "shares")
     moving = ("times", "directions", "precision", "coupling", "shares")
     kernel = slice_direct
+    takes_views = True
 
     def __init__(
         self,
@@ -223,6 +224,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
     geometry: ClassVar[tuple[str, ...]] = ("scales", "skew", "precision", "coupling", "betas")
     moving: ClassVar[tuple[str, ...]] = ("times", "directions", "precision", "coupling")
     kernel = slice_direct_beta
+    takes_views = True
 
     # The authors' initial diagonals of L over direction are those of dGS, but 1.0 for D-NeRF.
     def __init__(self, *, view_precision: float = 1.0, **options: Any) -> None:

@@ -13,7 +13,7 @@ from gsbench.kernels.backends import Backend, resolve
 from gsbench.kernels.raster import RasterInputs, Viewport, enqueue, room_for
 from gsbench.models.base import GaussianModel
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.gaussian_batch import Gaussians3D, stacked
+from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.raster import EPS2D, FAR, RasterOutput, rasterize
 from gsbench.scenes.scene import Camera
 
@@ -25,18 +25,18 @@ def rasterize_slice(
 
     The background [3] is that of the first three channels; behind further ones there is 0.
     """
-    return rasterize_slices([gaussians], [camera], background, backend, antialias)
+    return rasterize_slices(gaussians, [camera], background, backend, antialias)
 
 
 def rasterize_slices(
-    slices: Sequence[Gaussians3D],  # one a camera
+    gaussians: Gaussians3D,  # [N, ..] for all cameras, or [C, N, ..]
     cameras: Sequence[Camera],  # of equal size and near plane
     background: Tensor,
     backend: Backend,
     antialias: bool = False,
 ) -> RasterOutput:
     """Rasterize slices of a model in one call, each for its camera, otherwise as `rasterize_slice`."""
-    gaussians, camera = stacked(slices), cameras[0]
+    camera = cameras[0]
     return rasterize(
         *gaussians[:4],
         in_one([x.viewmat for x in cameras]),
@@ -66,18 +66,18 @@ def render_slice(
     model: GaussianModel, gaussians: Gaussians3D, camera: Camera, background: Tensor, antialias: bool = False
 ) -> RasterOutput:
     """Render a slice of a model for one camera: rasterize it, and let the model decode what was blended."""
-    return render_slices(model, [gaussians], [camera], background, antialias)
+    return render_slices(model, gaussians, [camera], background, antialias)
 
 
 def render_slices(
     model: GaussianModel,  # that does not decode, if there are several cameras
-    slices: Sequence[Gaussians3D],  # one a camera
+    gaussians: Gaussians3D,  # [N, ..] for all cameras, or [C, N, ..]
     cameras: Sequence[Camera],  # of equal size and near plane
     background: Tensor,
     antialias: bool = False,
 ) -> RasterOutput:
     """Render slices of a model in one call, each for its camera."""
-    output = rasterize_slices(slices, cameras, background, model.backend, antialias)
+    output = rasterize_slices(gaussians, cameras, background, model.backend, antialias)
     return replace(output, image=model.decode(output.image, cameras[0]))
 
 

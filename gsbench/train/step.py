@@ -241,12 +241,12 @@ class Step:
         with Tape() as tape:
             with stages("slice"):
                 queries = [CameraTime.of(*each) for each in zip(observed.cameras, observed.times, strict=True)]
-                slices = [self.model.slice(query) for query in queries]
+                gaussians = self.model.slices(queries)
             with stages("raster"):
                 try:
-                    output = render_slices(self.model, slices, observed.cameras, self.background, self.antialias)
+                    output = render_slices(self.model, gaussians, observed.cameras, self.background, self.antialias)
                 except InputError as error:  # the rasterizer checks its inputs, so it is the first to see NaN
-                    if all(x.isfinite().all() for gaussians in slices for x in gaussians if x is not None):
+                    if all(x.isfinite().all() for x in gaussians if x is not None):
                         raise
                     raise DivergedError(str(error)) from None
             with stages("loss"):

@@ -100,6 +100,56 @@ def test_orders_and_opacities_leave_colors_out(N: int, share: float, degree: int
     assert not torch.cat(got[:2], 1).cpu()[left_out].any()
 
 
+@pytest.mark.parametrize("waves", [1, 3])
+@pytest.mark.parametrize(("gaussian_per_view", "time_per_view"), [(False, False), (True, False), (True, True)])
+def test_several_views_in_one_call(gaussian_per_view: bool, time_per_view: bool, waves: int, cuda_device: str) -> None:
+    """Catches a view that reads the camera, time or Gaussians of another, and gradients that are not their sum."""
+    random, names = torch.Generator().manual_seed(2), ("sh0", "shN", "means", "times")
+    inputs = dict(zip(names, color_inputs(waves, torch.float32), strict=False))
+    per_view = {"means": gaussian_per_view, "opacities": gaussian_per_view, "times": time_per_view}
+    inputs["opacities"] = (torch.rand(21, generator=random) < 0.7).float()
+    of_views = {"center": CENTER + torch.rand(3, 3, generator=random)}
+    of_views |= {"time": torch.rand(3, generator=random)} if waves > 1 else {}
+    many = {key: torch.stack([x, x.roll(1, 0), 0.9 * x]) if per_view.get(key) else x for key, x in inputs.items()}
+    many = {key: x.detach().to(cuda_device).requires_grad_(key != "opacities") for key, x in many.items()}
+    of_views = {key: x.to(cuda_device) for key, x in of_views.items()}
+    orders, weight = torch.randint(0, 12, (21,), generator=random).int().to(cuda_device), torch.randn(3, 21, 3)
+
+    def shown(inputs: dict[str, Tensor], of_view: dict[str, Tensor], weight: Tensor) -> tuple[Tensor, list[Tensor]]:
+        (colors,) = show_colors(**inputs, **of_view, orders=orders, degree=3, waves=waves)
+        return colors, list(torch.autograd.grad(colors, [inputs[key] for key in inputs if key != "opacities"], weight))
+
+    colors, gradients = shown(many, of_views, weight.to(cuda_device))
+    single = []
+    for i in range(3):
+        of_view = {key: x[i] if per_view.get(key) else x for key, x in many.items()}
+        single.append(shown(of_view, {key: x[i] for key, x in of_views.items()}, weight[i].to(cuda_device)))
+    assert torch.equal(colors, torch.stack([x for x, _ in single]))
+    for key, gradient, *parts in zip(names, gradients, *[of_single for _, of_single in single], strict=False):
+        want = torch.stack(parts) if per_view.get(key) else parts[0] + parts[1] + parts[2]
+        assert torch.equal(gradient, want), key
+
+
+def test_views_that_do_not_fit_are_refused(place: Place) -> None:
+    """Catches centres and times that a kernel would read past their end, and views that the CPU's kernel would leave
+    out."""
+    sh0, shN, means, times = [place.move(x) for x in color_inputs(2, torch.float32)]
+    centers, time, opacities = place.move(torch.rand(4, 3)), place.move(torch.tensor(0.5)), place.move(torch.ones(21))
+    several = means.expand(4, 21, 3), opacities.expand(4, 21)
+    for gaussians, center, at in (
+        ((means, opacities), centers, time),
+        ((means, opacities), centers[0], time[None]),
+        ((several[0], opacities), centers, time.expand(4)),
+        (several, centers[0], time),
+        (several, centers[:3], time.expand(3)),
+    ):
+        with pytest.raises(InputError, match="show_colors: expected"):
+            show_colors(sh0, shN, *gaussians, times, center, at, degree=0, waves=2)
+    if place.name != "cuda":
+        with pytest.raises(InputError, match="show_colors: expected one view on cpu, got 4 in one call"):
+            show_colors(sh0, shN, *several, times, centers, time.expand(4), degree=0, waves=2)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 600), st.integers(0, 3), st.integers(1, 4), st.integers(0, 2**31))
 def test_orders_that_leave_nothing_out_change_no_bit(N: int, degree: int, waves: int, seed: int) -> None:

@@ -1,16 +1,19 @@
 """Slices by the kernels against the models written in torch, with all rows conditioned, with some, with none."""
 
+from itertools import product
 from typing import Any
 
 import pytest
 import torch
 from conftest import Place
-from sliced_models import CASES, TIME, assert_same, gradients, slice_of, sliced_model
+from sliced_models import CASES, CENTER, TIME, assert_same, gradients, slice_of, sliced_model, weights_of
 
 from gsbench.errors import InputError
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.slices import slice_free_time, slice_rotated, slice_static, slice_triangular
+from gsbench.models.camera_time import CameraTime, together
 from gsbench.models.effect_sets import EffectSets
+from gsbench.models.gaussian_batch import tensors_of
 
 SHARES = (0.0, 0.03, 0.5, 0.98, 1.0)  # of 45 rows 0, 1, 22, 44 and all
 WITHOUT_KERNEL: list[tuple[str, dict[str, Any]]] = [
@@ -19,6 +22,15 @@ WITHOUT_KERNEL: list[tuple[str, dict[str, Any]]] = [
     ("ubs", {"modulation": "raw"}),
     ("dgs", {"coupling": "none"}),
     ("dgs", {"coupling": "interpolated"}),
+]
+# Models whose kernels slice several views in one call, with the same parameters for all views and others for each; 3DGS
+# without the latter has one slice for all views.
+SEVERAL_VIEWS = [
+    (name, options, per_view)
+    for (name, options), per_view in product(CASES, (False, True))
+    if options.get("scheme") != "cholesky"
+    and name not in ("freetime_plus", "stg", "stg_full", "ex4dgs")
+    and (name != "3dgs" or per_view)
 ]
 CONDITIONED = [(name, options) for name, options in CASES if name not in ("3dgs", "ubs", "ubs_static")]
 
@@ -64,6 +76,36 @@ def test_static_rows(name: str, options: dict[str, Any], share: float, place: Pl
     assert_same(got, want)
     for x, y in zip(got[: len(raw)], want, strict=False):
         assert not x.cpu()[count:][y[count:] == 0].any(), "what a static row does not depend on has a gradient"
+
+
+@pytest.mark.parametrize(("name", "options", "per_view"), SEVERAL_VIEWS)
+def test_several_views_in_one_call(name: str, options: dict[str, Any], per_view: bool, cuda_device: str) -> None:
+    """Catches a view that reads the camera, time or parameters of another, and gradients that are not their sum."""
+    model, raw = sliced_model(name, options, torch.float32)
+    assert model.takes_views
+    model.to(cuda_device)
+    if (name, options) in CONDITIONED:
+        model.effect_sets = EffectSets(0, 22, None)  # the other rows are static
+    raw = {key: x.to(cuda_device) for key, x in raw.items()}
+    many = {key: torch.stack([x, 1.1 * x, 0.9 * x]) if per_view and key != "opacities" else x for key, x in raw.items()}
+    many = {key: x.detach().requires_grad_() for key, x in many.items()}
+    views = [CameraTime((CENTER + 0.3 * i).to(cuda_device), (TIME + 0.1 * i).to(cuda_device)) for i in range(3)]
+    outputs = tensors_of(model.slice_geometry(many, together(views)))
+    weights, expected = weights_of(outputs), {}
+    for i, view in enumerate(views):
+        single = {
+            key: (x[i] if per_view and key != "opacities" else x).detach().requires_grad_() for key, x in many.items()
+        }
+        of_single = tensors_of(model.slice_geometry(single, view))
+        for x, y in zip(outputs, of_single, strict=True):
+            assert torch.equal(x[i], y)
+        gradients = torch.autograd.grad(of_single, single.values(), [w[i] for w in weights])
+        for key, gradient in zip(single, gradients, strict=True):
+            expected.setdefault(key, []).append(gradient)
+    for (key, x), gradient in zip(many.items(), torch.autograd.grad(outputs, many.values(), weights), strict=True):
+        parts = expected[key]
+        want = torch.stack(parts) if x.shape != raw[key].shape else sum(parts[1:], parts[0])
+        assert torch.equal(gradient, want), key
 
 
 @pytest.mark.usefixtures("instruction_set")

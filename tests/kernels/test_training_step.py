@@ -73,10 +73,10 @@ def launched(fitted: Training) -> Training:
 @pytest.mark.parametrize(
     ("model", "options", "kernels", "operations"),
     [
-        ("4dgs", (), 23, 54),
-        ("4dgs", ("optim=sparse_adam",), 23, 56),
-        ("7dgs_noagr", (), 23, 40),
-        ("7dgs", (), 31, 111),
+        ("4dgs", (), 11, 34),
+        ("4dgs", ("optim=sparse_adam",), 11, 36),
+        ("7dgs_noagr", (), 11, 29),
+        ("7dgs", (), 19, 107),
     ],
 )
 def test_calls_of_a_step(

@@ -1,5 +1,5 @@
-// Colours of Gaussians and their gradients, one Gaussian per thread; math/harmonics.h has the formulas. Gaussians with
-// an opacity below 1/255 are skipped.
+// Colours of Gaussians and their gradients for all views, one Gaussian per thread; math/harmonics.h has the formulas.
+// Gaussians with an opacity below 1/255 are skipped.
 #include "../math/harmonics.h"
 
 #include "launch.h"
@@ -9,16 +9,30 @@ namespace {
 
 constexpr float TURN = 6.28318531f;
 
+// A Gaussian as one view sees it: the rows of its mean and opacity, of its mean time, and of its colour.
+struct Seen {
+    int64_t view, gaussian, time, color;
+
+    __device__ Seen(const ColorArgs& a, int64_t view, int64_t i)
+        : view(view),
+          gaussian(a.gaussian_per_view ? view * a.N + i : i),
+          time(a.time_per_view ? view * a.N + i : i),
+          color(view * a.N + i) {}
+};
+
 // Everything that a colour needs except its coefficients.
 struct Weights {
     Unit<float> unit;
     int used;  // harmonics
     float Y[MAX_BASIS], cosines[MAX_WAVES], sines[MAX_WAVES];
 
-    __device__ Weights(const ColorArgs& a, ColorOrder order, int64_t i)
-        : unit({a.means[i * 3] - a.center[0], a.means[i * 3 + 1] - a.center[1], a.means[i * 3 + 2] - a.center[2]}) {
+    __device__ Weights(const ColorArgs& a, ColorOrder order, const Seen& at)
+        : unit(offset(a.means + at.gaussian * 3, a.center + at.view * 3)) {
         used = harmonics(unit.direction, order.degree, Y);
-        waves_of(a.times ? *a.time - a.times[i] : 0.0f, order.waves, cosines, sines);
+        waves_of(a.times ? a.time[at.view] - a.times[at.time] : 0.0f, order.waves, cosines, sines);
+    }
+    __device__ static Vec3<float> offset(const float* mean, const float* center) {
+        return {mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]};
     }
 };
 
@@ -56,19 +70,22 @@ __device__ void sum_colors(const ColorArgs& a, ColorOrder order, const Weights& 
 __global__ void color_kernel(ColorArgs a, Colors out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    float color[3] = {};
     const ColorOrder order = order_of(a, i);
-    if (a.opacities[i] >= ALPHA_MIN) sum_colors(a, order, Weights(a, order, i), i, color);
-    for (int channel = 0; channel < 3; ++channel) {
-        out.colors[i * 3 + channel] = color[channel] >= 0.0f ? color[channel] : CLAMPED;
+    for (int64_t view = 0; view < a.V; ++view) {
+        const Seen at(a, view, i);
+        float color[3] = {};
+        if (a.opacities[at.gaussian] >= ALPHA_MIN) sum_colors(a, order, Weights(a, order, at), i, color);
+        for (int channel = 0; channel < 3; ++channel) {
+            out.colors[at.color * 3 + channel] = color[channel] >= 0.0f ? color[channel] : CLAMPED;
+        }
     }
 }
 
 // Adds to the gradients of Gaussian i's coefficients and of its mean time, and returns the gradient of its mean.
-__device__ Vec3<float> color_vjp(const ColorArgs& a, const float* color, const float (&given)[3], const ColorGrads& out,
-                                 int64_t i, float& g_time) {
+__device__ Vec3<float> color_vjp(const ColorArgs& a, const Seen& at, const float* color, const float (&given)[3],
+                                 const ColorGrads& out, int64_t i, float& g_time) {
     const ColorOrder order = order_of(a, i);
-    const Weights w(a, order, i);
+    const Weights w(a, order, at);
     float g[3], g_Y[MAX_BASIS] = {};
     for (int channel = 0; channel < 3; ++channel) {
         g[channel] = 1.0f / color[channel] > 0.0f ? given[channel] : 0.0f;  // 1 / -0 is -inf
@@ -92,16 +109,23 @@ __device__ Vec3<float> color_vjp(const ColorArgs& a, const float* color, const f
 __global__ void color_backward_kernel(ColorArgs a, ShownColors shown, GivenColors given, ColorGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const float g[3] = {given.colors[i * 3], given.colors[i * 3 + 1], given.colors[i * 3 + 2]};
-    Vec3<float> g_mean{};
+    Vec3<float> g_mean{};  // of what all views share the sum
     float g_time = 0.0f;
-    if (a.opacities[i] >= ALPHA_MIN && (g[0] != 0.0f || g[1] != 0.0f || g[2] != 0.0f)) {
-        g_mean = color_vjp(a, shown.colors + i * 3, g, out, i, g_time);
+    for (int64_t view = 0; view < a.V; ++view) {
+        const Seen at(a, view, i);
+        const float* from = given.colors + at.color * 3;
+        const float g[3] = {from[0], from[1], from[2]};
+        Vec3<float> g_mean_of_view{};
+        float g_time_of_view = 0.0f;
+        if (a.opacities[at.gaussian] >= ALPHA_MIN && (g[0] != 0.0f || g[1] != 0.0f || g[2] != 0.0f)) {
+            g_mean_of_view = color_vjp(a, at, shown.colors + at.color * 3, g, out, i, g_time_of_view);
+        }
+        g_mean = a.gaussian_per_view ? g_mean_of_view : g_mean + g_mean_of_view;
+        g_time = a.time_per_view ? g_time_of_view : g_time + g_time_of_view;
+        float* to = out.means + at.gaussian * 3;
+        to[0] = g_mean.x, to[1] = g_mean.y, to[2] = g_mean.z;
+        if (a.times) out.times[at.time] = g_time;
     }
-    out.means[i * 3] = g_mean.x;
-    out.means[i * 3 + 1] = g_mean.y;
-    out.means[i * 3 + 2] = g_mean.z;
-    if (a.times) out.times[i] = g_time;
 }
 
 }  // namespace

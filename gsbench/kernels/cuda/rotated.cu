@@ -10,22 +10,22 @@ namespace {
 
 // Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
 // unit.
-__device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t i) {
+__device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t row, int64_t i) {
     RotatedParameters<float> p{};
-    load_row(a.means, i, p.mean);
-    p.time = a.times[i] * *a.clock;
-    load_row(a.scales, i, p.scales);
-    load_row(a.left_quats, i, p.left);
-    load_row(a.right_quats, i, p.right);
+    load_row(a.means, row, p.mean);
+    p.time = a.times[row] * *a.clock;
+    load_row(a.scales, row, p.scales);
+    load_row(a.left_quats, row, p.left);
+    load_row(a.right_quats, row, p.right);
     p.opacity = a.opacities[i];
     return p;
 }
 
-__device__ StaticParameters<float> static_parameters(const RotatedArgs& a, int64_t i) {
+__device__ StaticParameters<float> static_parameters(const RotatedArgs& a, int64_t row, int64_t i) {
     StaticParameters<float> p{};
     float left[4];
-    GSB_UNROLL for (int k = 0; k < 3; ++k) p.scales[k] = a.scales[i * 4 + k];
-    load_row(a.left_quats, i, left);
+    GSB_UNROLL for (int k = 0; k < 3; ++k) p.scales[k] = a.scales[row * 4 + k];
+    load_row(a.left_quats, row, left);
     turn_of_space(left, p.quat);
     p.opacity = a.opacities[i];
     return p;
@@ -34,44 +34,59 @@ __device__ StaticParameters<float> static_parameters(const RotatedArgs& a, int64
 __global__ void observe_kernel(RotatedArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    if (i >= a.conditioned) {
-        const StaticParameters<float> raw = static_parameters(a, i);
-        store_static(StaticGaussian<float>(raw), a.means, out, i);
-        return;
+    for (int64_t view = 0; view < a.V; ++view) {
+        const int64_t row = raw_row(a, view, i), at = view * a.N + i;
+        if (i >= a.conditioned) {
+            const StaticParameters<float> raw = static_parameters(a, row, i);
+            store_static(StaticGaussian<float>(raw), a.means, row, out, at);
+            continue;
+        }
+        const RotatedParameters<float> raw = parameters(a, row, i);
+        store_observed(RotatedGaussian<float>(raw, expf(*a.log_lambda_t), a.time[view] * *a.clock).observe(), out, at);
     }
-    const RotatedParameters<float> raw = parameters(a, i);
-    store_observed(RotatedGaussian<float>(raw, expf(*a.log_lambda_t), *a.time * *a.clock).observe(), out, i);
+}
+
+// Adds to the gradients of raw parameters other than the opacity.
+__device__ void add(const RotatedParameters<float>& g, const RotatedGrads& out, int64_t row) {
+    add_row(g.mean, out.means, row);
+    out.times[row] += g.time;
+    add_row(g.scales, out.scales, row);
+    add_row(g.left, out.left_quats, row);
+    add_row(g.right, out.right_quats, row);
 }
 
 __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, RotatedGrads out) {
     const int64_t i = global_thread();
-    RotatedParameters<float> g{};  // of a static row mostly zero
-    if (i >= a.conditioned && i < a.N) {
-        const StaticParameters<float> raw = static_parameters(a, i);
-        StaticParameters<float> g_static{};
-        const Observed<float> given = load_observed(grads, i);
-        StaticGaussian<float>(raw).vjp(given.factor, given.opacity, g_static);
-        GSB_UNROLL for (int k = 0; k < 3; ++k) {
-            g.mean[k] = given.mean[k];
-            g.scales[k] = g_static.scales[k];
+    RotatedParameters<float> sum{};
+    for (int64_t view = 0; view < (i < a.N ? a.V : 0); ++view) {
+        const int64_t row = raw_row(a, view, i);
+        const Observed<float> given = load_observed(grads, view * a.N + i);
+        RotatedParameters<float> g{};  // of a static row mostly zero
+        if (i >= a.conditioned) {
+            const StaticParameters<float> raw = static_parameters(a, row, i);
+            StaticParameters<float> g_static{};
+            StaticGaussian<float>(raw).vjp(given.factor, given.opacity, g_static);
+            GSB_UNROLL for (int k = 0; k < 3; ++k) {
+                g.mean[k] = given.mean[k];
+                g.scales[k] = g_static.scales[k];
+            }
+            turn_of_space(g_static.quat, g.left);
+            g.opacity = g_static.opacity;
+        } else {
+            const RotatedParameters<float> raw = parameters(a, row, i);
+            RotatedGaussian<float> gaussian(raw, expf(*a.log_lambda_t), a.time[view] * *a.clock);
+            gaussian.observe();
+            gaussian.vjp(given, g);
+            g.time *= *a.clock;
         }
-        turn_of_space(g_static.quat, g.left);
-        g.opacity = g_static.opacity;
-    } else if (i < a.N) {
-        const RotatedParameters<float> raw = parameters(a, i);
-        RotatedGaussian<float> gaussian(raw, expf(*a.log_lambda_t), *a.time * *a.clock);
-        gaussian.observe();
-        gaussian.vjp(load_observed(grads, i), g);
+        accumulate(sum, g);
+        if (a.raw_per_view) add(g, out, row);
     }
     if (i < a.N) {
-        add_row(g.mean, out.means, i);
-        out.times[i] += g.time * *a.clock;
-        add_row(g.scales, out.scales, i);
-        add_row(g.left, out.left_quats, i);
-        add_row(g.right, out.right_quats, i);
-        out.opacities[i] += g.opacity;
+        if (!a.raw_per_view) add(sum, out, i);
+        out.opacities[i] += sum.opacity;
     }
-    const float lambda_t = warp_sum(g.lambda_t);
+    const float lambda_t = warp_sum(sum.lambda_t);
     if (threadIdx.x % WARP == 0) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
 }
 

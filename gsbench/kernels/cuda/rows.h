@@ -22,6 +22,19 @@ __device__ inline void add_row(const float (&row)[COUNT], float* rows, int64_t i
     GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] += row[k];
 }
 
+// Returns the row of the raw parameters of Gaussian i that a view sees.
+template <class Args>
+__device__ int64_t raw_row(const Args& a, int64_t view, int64_t i) {
+    return a.raw_per_view ? view * a.N + i : i;
+}
+
+// Adds the numbers of a structure that consists of floats.
+template <class Parameters>
+__device__ void accumulate(Parameters& sum, const Parameters& x) {
+    constexpr int COUNT = sizeof(Parameters) / sizeof(float);
+    add_row(reinterpret_cast<const float(&)[COUNT]>(x), reinterpret_cast<float*>(&sum), 0);
+}
+
 template <int ROWS, int COUNT>
 __device__ inline void load_matrix(const float* rows, int64_t i, float (&out)[ROWS][COUNT]) {
     GSB_UNROLL for (int row = 0; row < ROWS; ++row) load_row(rows, i * ROWS + row, out[row]);
@@ -38,11 +51,12 @@ __device__ inline void store_observed(const Observed<float>& seen, const Observa
     out.opacities[i] = seen.opacity;
 }
 
-// Stores a static Gaussian, whose mean is copied.
+// Stores a static Gaussian, whose mean is copied from row `row` of `means`.
 template <class Gaussian>
-__device__ void store_static(const Gaussian& gaussian, const float* means, const Observation& out, int64_t i) {
+__device__ void store_static(const Gaussian& gaussian, const float* means, int64_t row, const Observation& out,
+                             int64_t i) {
     float mean[3];
-    load_row(means, i, mean);
+    load_row(means, row, mean);
     store_row(mean, out.means, i);
     store_matrix(gaussian.factor, out.factors, i);
     out.opacities[i] = gaussian.opacity;

@@ -6,10 +6,10 @@
 namespace gsb::cuda {
 namespace {
 
-__device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t i) {
+__device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t row, int64_t i) {
     StaticParameters<float> p{};
-    load_row(a.scales, i, p.scales);
-    load_row(a.quats, i, p.quat);
+    load_row(a.scales, row, p.scales);
+    load_row(a.quats, row, p.quat);
     p.opacity = a.opacities[i];
     return p;
 }
@@ -17,23 +17,29 @@ __device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t i) {
 __global__ void static_kernel(StaticArgs a, StaticSlice out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const StaticParameters<float> raw = parameters(a, i);
-    const StaticGaussian<float> seen(raw);
-    store_matrix(seen.factor, out.factors, i);
-    out.opacities[i] = seen.opacity;
+    for (int64_t row = i; row < a.V * a.N; row += a.N) {
+        const StaticParameters<float> raw = parameters(a, row, i);
+        const StaticGaussian<float> seen(raw);
+        store_matrix(seen.factor, out.factors, row);
+        out.opacities[row] = seen.opacity;
+    }
 }
 
 __global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, StaticGrads out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    const StaticParameters<float> raw = parameters(a, i);
-    StaticParameters<float> g{};
-    float g_factor[3][3];
-    load_matrix(grads.factors, i, g_factor);
-    StaticGaussian<float>(raw).vjp(g_factor, grads.opacities[i], g);
-    add_row(g.scales, out.scales, i);
-    add_row(g.quat, out.quats, i);
-    out.opacities[i] += g.opacity;
+    float g_opacity = 0.0f;
+    for (int64_t row = i; row < a.V * a.N; row += a.N) {
+        const StaticParameters<float> raw = parameters(a, row, i);
+        StaticParameters<float> g{};
+        float g_factor[3][3];
+        load_matrix(grads.factors, row, g_factor);
+        StaticGaussian<float>(raw).vjp(g_factor, grads.opacities[row], g);
+        add_row(g.scales, out.scales, row);
+        add_row(g.quat, out.quats, row);
+        g_opacity += g.opacity;
+    }
+    out.opacities[i] += g_opacity;
 }
 
 }  // namespace

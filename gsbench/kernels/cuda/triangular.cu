@@ -13,22 +13,23 @@ namespace {
 // CONDITIONED (whether the rows of the factor are in the default order) is a template parameter, so that no reflections
 // are compiled for the default order, which needs none.
 template <Query Q, bool CONDITIONED>
-__device__ TriangularModel model_of(const TriangularArgs& a) {
+__device__ TriangularModel model_of(const TriangularArgs& a, int64_t view) {
     using P = TriangularParameters<float, Q>;
+    const float* center = a.center + view * 3;
     return {CONDITIONED, a.form, a.half, P::DIRECTION ? expf(*a.log_lambda_d) : 0.0f,
-            P::TIME ? expf(*a.log_lambda_t) : 0.0f, {a.center[0], a.center[1], a.center[2]}, P::TIME ? *a.time : 0.0f};
+            P::TIME ? expf(*a.log_lambda_t) : 0.0f, {center[0], center[1], center[2]}, P::TIME ? a.time[view] : 0.0f};
 }
 
 template <Query Q>
-__device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, int64_t i) {
+__device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, int64_t row, int64_t i) {
     TriangularParameters<float, Q> p{};
-    load_row(a.means, i, p.mean);
-    if constexpr (p.DIRECTION) load_row(a.directions, i, p.direction);
-    if constexpr (p.TIME) p.time = a.times[i];
-    load_row(a.log_diagonal, i, p.log_diagonal);
-    load_row(a.shape, i, p.shape);
-    load_row(a.motion, i, p.motion);
-    if constexpr (p.COUPLED) load_row(a.coupling, i, p.coupling);
+    load_row(a.means, row, p.mean);
+    if constexpr (p.DIRECTION) load_row(a.directions, row, p.direction);
+    if constexpr (p.TIME) p.time = a.times[row];
+    load_row(a.log_diagonal, row, p.log_diagonal);
+    load_row(a.shape, row, p.shape);
+    load_row(a.motion, row, p.motion);
+    if constexpr (p.COUPLED) load_row(a.coupling, row, p.coupling);
     p.opacity = a.opacities[i];
     return p;
 }
@@ -38,11 +39,11 @@ template <Query Q, bool CONDITIONED>
 constexpr int SPACE = CONDITIONED ? TriangularParameters<float, Q>::K : 0;
 
 template <Query Q, bool CONDITIONED>
-__device__ StaticTriangularParameters<float> static_parameters(const TriangularArgs& a, int64_t i) {
+__device__ StaticTriangularParameters<float> static_parameters(const TriangularArgs& a, int64_t row, int64_t i) {
     StaticTriangularParameters<float> p{};
-    const float* log_diagonal = a.log_diagonal + i * TriangularParameters<float, Q>::N + SPACE<Q, CONDITIONED>;
+    const float* log_diagonal = a.log_diagonal + row * TriangularParameters<float, Q>::N + SPACE<Q, CONDITIONED>;
     GSB_UNROLL for (int k = 0; k < 3; ++k) p.log_diagonal[k] = log_diagonal[k];
-    load_row(a.shape, i, p.shape);
+    load_row(a.shape, row, p.shape);
     p.opacity = a.opacities[i];
     return p;
 }
@@ -51,54 +52,69 @@ template <Query Q, bool CONDITIONED>
 __global__ void observe_kernel(TriangularArgs a, Observation out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
-    if (i >= a.conditioned) {
-        const auto raw = static_parameters<Q, CONDITIONED>(a, i);
-        const StaticTriangularGaussian<float> gaussian(raw, a.form);
-        store_static(gaussian, a.means, out, i);
-        return;
+    for (int64_t view = 0; view < a.V; ++view) {
+        const int64_t row = raw_row(a, view, i), at = view * a.N + i;
+        if (i >= a.conditioned) {
+            const auto raw = static_parameters<Q, CONDITIONED>(a, row, i);
+            const StaticTriangularGaussian<float> gaussian(raw, a.form);
+            store_static(gaussian, a.means, row, out, at);
+            continue;
+        }
+        const TriangularModel model = model_of<Q, CONDITIONED>(a, view);
+        const auto raw = parameters<Q>(a, row, i);
+        const Observed<float> seen = TriangularGaussian<float, Q>(model, raw).observe();
+        store_observed(seen, out, at);
     }
-    const TriangularModel model = model_of<Q, CONDITIONED>(a);
-    const auto raw = parameters<Q>(a, i);
-    const Observed<float> seen = TriangularGaussian<float, Q>(model, raw).observe();
-    store_observed(seen, out, i);
+}
+
+// Adds to the gradients of raw parameters other than the opacity.
+template <Query Q>
+__device__ void add(const TriangularParameters<float, Q>& g, const TriangularGrads& out, int64_t row) {
+    add_row(g.mean, out.means, row);
+    if constexpr (g.DIRECTION) add_row(g.direction, out.directions, row);
+    if constexpr (g.TIME) out.times[row] += g.time;
+    add_row(g.log_diagonal, out.log_diagonal, row);
+    add_row(g.shape, out.shape, row);
+    add_row(g.motion, out.motion, row);
+    if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, row);
 }
 
 template <Query Q, bool CONDITIONED>
 __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
-    TriangularParameters<float, Q> g{};  // of a static row mostly zero
-    if (i >= a.conditioned && i < a.N) {
-        const auto raw = static_parameters<Q, CONDITIONED>(a, i);
-        StaticTriangularParameters<float> g_static{};
-        const Observed<float> given = load_observed(grads, i);
-        StaticTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_static);
-        GSB_UNROLL for (int k = 0; k < 3; ++k) {
-            g.mean[k] = given.mean[k];
-            g.log_diagonal[SPACE<Q, CONDITIONED> + k] = g_static.log_diagonal[k];
-            g.shape[k] = g_static.shape[k];
+    TriangularParameters<float, Q> sum{};
+    for (int64_t view = 0; view < (i < a.N ? a.V : 0); ++view) {
+        const int64_t row = raw_row(a, view, i);
+        const Observed<float> given = load_observed(grads, view * a.N + i);
+        TriangularParameters<float, Q> g{};  // of a static row mostly zero
+        if (i >= a.conditioned) {
+            const auto raw = static_parameters<Q, CONDITIONED>(a, row, i);
+            StaticTriangularParameters<float> g_static{};
+            StaticTriangularGaussian<float>(raw, a.form).vjp(given.factor, given.opacity, g_static);
+            GSB_UNROLL for (int k = 0; k < 3; ++k) {
+                g.mean[k] = given.mean[k];
+                g.log_diagonal[SPACE<Q, CONDITIONED> + k] = g_static.log_diagonal[k];
+                g.shape[k] = g_static.shape[k];
+            }
+            g.opacity = g_static.opacity;
+        } else {
+            const TriangularModel model = model_of<Q, CONDITIONED>(a, view);
+            const auto raw = parameters<Q>(a, row, i);
+            TriangularGaussian<float, Q> gaussian(model, raw);
+            gaussian.observe();
+            gaussian.vjp(given, g);
         }
-        g.opacity = g_static.opacity;
-    } else if (i < a.N) {
-        const TriangularModel model = model_of<Q, CONDITIONED>(a);
-        const auto raw = parameters<Q>(a, i);
-        TriangularGaussian<float, Q> gaussian(model, raw);
-        gaussian.observe();
-        gaussian.vjp(load_observed(grads, i), g);
+        accumulate(sum, g);
+        if (a.raw_per_view) add(g, out, row);
     }
     if (i < a.N) {
-        add_row(g.mean, out.means, i);
-        if constexpr (g.DIRECTION) add_row(g.direction, out.directions, i);
-        if constexpr (g.TIME) out.times[i] += g.time;
-        add_row(g.log_diagonal, out.log_diagonal, i);
-        add_row(g.shape, out.shape, i);
-        add_row(g.motion, out.motion, i);
-        if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, i);
-        out.opacities[i] += g.opacity;
+        if (!a.raw_per_view) add(sum, out, i);
+        out.opacities[i] += sum.opacity;
     }
-    const float lambda_d = warp_sum(g.lambda_d), lambda_t = warp_sum(g.lambda_t);
+    const float lambda_d = warp_sum(sum.lambda_d), lambda_t = warp_sum(sum.lambda_t);
     if (threadIdx.x % WARP == 0) {
-        if constexpr (g.DIRECTION) atomicAdd(out.log_lambda_d, lambda_d * expf(*a.log_lambda_d));
-        if constexpr (g.TIME) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
+        if constexpr (sum.DIRECTION) atomicAdd(out.log_lambda_d, lambda_d * expf(*a.log_lambda_d));
+        if constexpr (sum.TIME) atomicAdd(out.log_lambda_t, lambda_t * expf(*a.log_lambda_t));
     }
 }
 
