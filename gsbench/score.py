@@ -26,7 +26,7 @@ from gsbench.measure import record as records
 from gsbench.measure.flicker import films_of, grey_of, tof
 from gsbench.measure.images import write_png
 from gsbench.measure.provenance import provenance
-from gsbench.measure.quality import SSIM_LEAST_SIDE, psnr
+from gsbench.measure.quality import SSIM_LEAST_SIDE, capped_psnr
 from gsbench.measure.record import Cost, Record
 from gsbench.measure.renders import HOW_TO, CheckedRenders, check_renders
 from gsbench.models.registry import is_registered
@@ -236,7 +236,7 @@ def of_other_papers(render: Tensor, truth: Tensor) -> dict[str, float]:  # [H, W
         "ssim_uniform_range2": uniform[1],
         "dssim1": (1 - padded) / 2,
         "dssim2": (1 - uniform[1]) / 2,
-        "psnr_color_corrected": psnr(_color_corrected(a, b), b),
+        "psnr_color_corrected": capped_psnr(_color_corrected(a, b), b),
     } | ({"ms_ssim": multiscale_ssim(*arrays)} if min(arrays[0].shape[:2]) >= MS_SSIM_LEAST_SIDE else {})
 
 

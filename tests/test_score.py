@@ -10,11 +10,13 @@ import torch
 from tiny_run import overrides, run_here
 
 from gsbench.measure import record as files
+from gsbench.measure.exact_views import MOST_PSNR
+from gsbench.measure.quality import psnr
 from gsbench.measure.record import Record
 from gsbench.models.render import render
 from gsbench.run.load import load_run, scene_of
 from gsbench.scenes import Camera, View
-from gsbench.score import _matching, main, of_other_papers, other_metrics
+from gsbench.score import _color_corrected, _matching, main, of_other_papers, other_metrics
 
 VIEWS = ("r_0", "r_1")  # of the split test
 SIZE = 16
@@ -196,8 +198,10 @@ def test_flow_is_that_of_whole_films():
 
 
 def test_colours_are_corrected_by_the_best_affine_map():
-    """Catches a gain without offset or without mixed channels: such a change of the truth is undone."""
+    """Catches a gain without offset or without mixed channels: such a change of the truth is undone; and an infinite
+    PSNR of exact images, which no record can hold."""
     truth = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.4 + 0.3
     mixed = truth @ torch.tensor([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]], dtype=torch.float64) + 0.05
-    assert of_other_papers(mixed, truth)["psnr_color_corrected"] > 200
+    assert psnr(_color_corrected(mixed, truth), truth) > 200
+    assert of_other_papers(mixed, truth)["psnr_color_corrected"] == MOST_PSNR
     assert of_other_papers(torch.zeros_like(truth), truth)["psnr_color_corrected"] < 30
