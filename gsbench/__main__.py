@@ -67,10 +67,10 @@ def _run(parsed: command.Command) -> int:
     with command.hydra_with(parsed.config_dir):
         runs, is_sweep = command.runs_of(parsed)
         configs = [command.compose_run(overrides) for overrides in runs]
+        command.check_runs(configs)
         if not is_sweep:
             ended = processes.do(configs[0])
             return 0 if ended.reason is None else BAD_INPUT if ended.is_refused else FAILED
-        command.check_distinct(configs)
         outcome = sweep.launch(configs, parsed.config_dir)
     if outcome.broken:
         print(

@@ -87,15 +87,16 @@ def recorded(plain: Plain) -> Plain:
 
 def repeating(overrides: Sequence[str]) -> list[str]:
     """Return the sorted overrides of a command line that are needed to repeat a run; equal runs have equal lists."""
-    return sorted(override for override in overrides if facts(_key(override)).role != "launching")
+    return sorted(override for override in overrides if facts(key_of(override)).role != "launching")
 
 
 def launches(override: str) -> bool:
     """Return whether an override only sets how a run is launched, for instance on Slurm."""
-    return _key(override).partition(".")[0] == "launch"
+    return key_of(override).partition(".")[0] == "launch"
 
 
-def _key(override: str) -> str:
+def key_of(override: str) -> str:
+    """Return the dotted key of an override of a command line, such as "seed" of "+seed=3"."""
     return override.partition("=")[0].lstrip("+~")
 
 

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, PATHS, register_schema
-from gsbench.config_roles import config_hash, facts, names_variant, training_hash
+from gsbench.config_roles import config_hash, facts, key_of, names_variant, training_hash
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
@@ -177,7 +177,21 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
     return RunConfig(list(overrides), config, choices)
 
 
-def check_distinct(runs: Sequence[RunConfig]) -> None:
+def check_runs(runs: Sequence[RunConfig]) -> None:
+    """Raise InputError if an override does nothing in any of the runs, or if two of them are one run."""
+    _check_needs(runs)
+    _check_distinct(runs)
+
+
+def _check_needs(runs: Sequence[RunConfig]) -> None:
+    """Raise InputError if an override does nothing in any of the runs, for lack of another key that it needs."""
+    for key in sorted({key_of(word) for run in runs for word in run.overrides}):
+        needed = facts(key).needs
+        if needed and all(OmegaConf.select(run.config, needed) in (None, facts(needed).absent) for run in runs):
+            raise InputError(f"{key}: expected {needed} too, without which it does nothing: set it, or leave {key} out")
+
+
+def _check_distinct(runs: Sequence[RunConfig]) -> None:
     """Raise InputError if two runs of a sweep are one run, in one folder, although their command lines differ.
 
     This happens if an override such as scene.name=X takes away what a sweep varies, or if a sweep varies a key that has

@@ -16,6 +16,7 @@ from gsbench.errors import InputError, did_you_mean
 from gsbench.train.hooks import hook_types
 
 AUTO = "auto"
+CANDIDATES = ("moving", "static")  # with and without time, of which model=auto trains one
 HOW_TO = "effects.md#comparing-models-on-val"
 
 
@@ -23,14 +24,26 @@ def check_settings(config: Config) -> None:
     """Raise InputError if a setting of a run is invalid on every machine; of model=auto each candidate is checked."""
     check_values(config)
     check_compare(config)
+    check_choices(config)
     if not is_auto(config):
         return
-    alone = {name: with_candidate(config, name) for name in ("moving", "static")}
+    alone = {name: with_candidate(config, name) for name in CANDIDATES}
     for name, candidate in (candidates(config) if config.effects.compare else alone).items():
         try:
             check_values(candidate)
         except InputError as error:
             raise InputError(f"model={AUTO}, candidate {name}: {error}") from None
+
+
+def check_choices(config: Config) -> None:
+    """Raise InputError if the settings have candidates that nothing reads."""
+    model = config.model
+    if not is_auto(config) and (model.candidates or model.compared):
+        name = "candidates" if model.candidates else "compared"
+        raise InputError(f"model.{name}: expected model=auto, which chooses, got model={model.name}: leave it out")
+    for name in model.candidates:
+        if name not in CANDIDATES:
+            raise InputError(f"model.candidates.{name:.80}: {did_you_mean(name, CANDIDATES)}")
 
 
 def check_compare(config: Config) -> None:

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from gsbench.config import CONF
 from gsbench.config_roles import flat
 from gsbench.errors import InputError
-from gsbench.launch.command import check_distinct, compose_run, hydra_with, parse, runs_of
+from gsbench.launch.command import check_runs, compose_run, hydra_with, parse, runs_of
 from gsbench.launch.plan import identity
 
 JOB = "+exp=mini scene=suzanne +launch=slurm"
@@ -78,6 +78,7 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ("+exp=mini launch.at_once=2", r"launch.at_once: expected \+launch=parallel or \+launch=slurm"),
         ("+exp=mini +launch=parallel launch.cpus=2", r"launch.cpus: expected \+launch=slurm, which reads it"),
         ("+exp=mini +model.lr.mean.start=1", "lr.mean.start=1: expected the name of a rate"),
+        ("+exp=mini model=7dgs effects.budget_db=1", "effects.budget_db: expected effects.gate too"),
         ("+exp=mini model=7", "model '7' is not known"),
         ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
@@ -101,16 +102,18 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
 )
 def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
     """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
-    silence, a scene that is no scene, one folder that several runs share, and a job that is submitted and fails, or is
-    never requeued, for a number out of its range."""
+    silence, a key without the one that it needs, a scene that is no scene, one folder that several runs share, and a
+    job that is submitted and fails, or is never requeued, for a number out of its range."""
     with pytest.raises(InputError, match=message):
-        check_distinct([compose_run(run) for run in runs_of(parse(words.split()))[0]])
+        check_runs([compose_run(run) for run in runs_of(parse(words.split()))[0]])
 
 
-def test_runs_of_different_folders_are_distinct() -> None:
-    """Catches a sweep over protocols or folders of results, which trains the same, that is refused as one run."""
-    for words in ("protocol=gsbench,published", "results=a,b"):
-        check_distinct([compose_run(run) for run in runs_of(parse(["+exp=mini", "-m", "scene=dust", words]))[0]])
+def test_a_sweep_of_different_runs_is_allowed() -> None:
+    """Catches a sweep over protocols or folders of results, which trains the same, that is refused as one run, and a
+    key that one of its runs does not read."""
+    for words in ("protocol=gsbench,published", "results=a,b", "effects.budget_db=1 effects.gate=end,off"):
+        runs = runs_of(parse(["+exp=mini", "-m", "scene=dust", *words.split()]))[0]
+        check_runs([compose_run(run) for run in runs])
 
 
 def test_a_question_is_left_to_hydra() -> None:

@@ -32,6 +32,9 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("3dgs", "train.lengths=1", "train.lengths: expected 2 to 8, got 1"),
         ("3dgs", "train.lengths=4", None),  # of 15 iterations
         ("7dgs", COMPARE, "expected model=auto"),
+        ("7dgs", "+model.candidates.moving={}", "model.candidates: expected model=auto"),
+        ("7dgs", "+model.compared.x.name=3dgs", "model.compared: expected model=auto"),
+        ("auto", "+model.candidates.movin={}", "model.candidates.movin: Did you mean 'moving'"),
         ("auto", f"{COMPARE} scene.eval_split=val", "got scene.eval_split=val"),
         ("auto", f"{COMPARE} scene.name=no_val", "scene.val_every=8 takes"),
         ("auto", f"{COMPARE} model.compared.moving_4dgs.lr.means.start=-1", "4dgs: model.lr.means.start: expected"),
