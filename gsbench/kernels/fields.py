@@ -59,9 +59,9 @@ sample_planes = Operation(
 )
 
 # The network of a field at one time. It reads the features, which are `products` times the samples in planes with t. A
-# layer of H units with ReLU is followed by heads of one more such layer and one without ReLU each. Their outputs y lie
-# side by side: head h has those from ends[h - 1] to ends[h]. Features and hidden layers are not stored; rows are left
-# out as in `linear`.
+# layer of H units with ReLU is followed by heads of one more such layer and one without ReLU each. In the memory of y,
+# head h has N rows of ends[h] - ends[h - 1] numbers, which follow those of the head before. Features and hidden layers
+# are not stored; rows are left out as in `linear`.
 field = Operation(
     "field",
     inputs={

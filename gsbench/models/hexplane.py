@@ -89,18 +89,21 @@ class HexPlaneModel(Gaussians3DModel):
         if self.active.warms_up:
             return raw
         assert query.time is not None
-        changes = self.changes(raw["means"], query.time).split(list(self.outputs.values()), -1)
+        of_heads = zip(self.changes(raw["means"], query.time), self.heads, strict=True)
+        changes = [x for y, names in of_heads for x in y.split([self.outputs[name] for name in names], -1)]
         by_name = zip(self.outputs, changes, strict=True)
         changed = collect_gradients(*(raw[name] + change.view_as(raw[name]) for name, change in by_name))
         return raw | dict(zip(self.outputs, changed, strict=True))
 
-    def changes(self, means: Tensor, time: Tensor) -> Tensor:  # [N, 3] [] -> [N, sum of outputs]
-        """Return what the field adds to the raw parameters of Gaussians at these means, side by side."""
+    def changes(self, means: Tensor, time: Tensor) -> list[Tensor]:  # [N, 3] [] -> [heads] of [N, outputs]
+        """Return what the field adds to the raw parameters of Gaussians at these means, as each head says."""
+        widths = self.network.outputs
         if not CPU.serves(means):
-            return self.network(self.planes(means, time))
+            return list(self.network(self.planes(means, time)).split(widths, -1))
         planes, (products, *weights) = self.planes, self.shared or self._timeless(means)
         arguments = products, means, planes.high, planes.low, time, planes.of_time, *weights, self.network.ends
-        return field(*arguments, *planes.size)[0]
+        y = field(*arguments, *planes.size)[0].flatten().split([len(means) * width for width in widths])
+        return [part.view(len(means), width) for part, width in zip(y, widths, strict=True)]
 
     def shared_by_views(self) -> list[Tensor]:
         means = self.splats["means"]
@@ -232,6 +235,7 @@ class Network(nn.Module):
         self.heads = nn.ModuleList(
             nn.Sequential(layer(width, width, relu=True), layer(width, last)) for last in outputs
         )
+        self.outputs = list(outputs)
         ends = torch.tensor(list(accumulate(outputs)), dtype=torch.int32)
         self.register_buffer("ends", ends, persistent=False)
 

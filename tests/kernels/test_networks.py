@@ -65,7 +65,7 @@ def field_of(channels: int, levels: int, width: int, outputs: list[int]) -> HexP
 def gradients(model: HexPlaneModel, positions: Tensor, time: float, upstream: Tensor) -> list[Tensor]:
     """The outputs of a field, and the gradients of the positions and of all nodes and weights."""
     positions = positions.clone().requires_grad_()
-    y = model.changes(positions, positions.new_tensor(time))
+    y = torch.cat(model.changes(positions, positions.new_tensor(time)), -1)
     return [y.detach(), *torch.autograd.grad(y, [positions, *model.parameters()], upstream)]
 
 
@@ -112,4 +112,4 @@ def test_nan_stays() -> None:
     assert linear(x, weight, bias, True)[0].isnan().all(1).nonzero().tolist() == [[3]]
     model = field_of(4, 2, 6, [3, 2])
     model.network.first.bias.data[1] = math.nan
-    assert model.changes(torch.zeros(2, 3), torch.tensor(0.5)).isnan().all()
+    assert torch.cat(model.changes(torch.zeros(2, 3), torch.tensor(0.5)), -1).isnan().all()

@@ -174,14 +174,19 @@ void field(const FieldArgs& a, const Layer& out) {
         hidden_layers(a, w, x.as_it_is(), rows, layers);
         for_each_head(a, [&](int head, int first, int width) {
             product(layers.hidden.as_it_is(head * a.H), rows, w.last_T, first, a.H, width,
-                    at_bias(a.last_bias + first, width), write_to(out.y + begin * a.K + first, a.K, width));
+                    at_bias(a.last_bias + first, width), write_to(out.y + first * a.N + begin * width, width, width));
         });
     }
 }
 
 void field_backward(const FieldArgs& a, const LayerGrads& grads, const FieldGrads& out) {
     Buffer<int32_t> kept(static_cast<size_t>(a.N));
-    const int64_t total = rows_with_gradient(grads.y, a.N, a.K, a.threads, kept.data());
+    const auto has_gradient = [&](int64_t i) {
+        bool has = false;
+        for_each_head(a, [&](int, int first, int width) { has = has || !all_zero(grads.y + first * a.N, width, i, 1); });
+        return has;
+    };
+    const int64_t total = rows_where(has_gradient, a.N, a.threads, kept.data());
     const Weights w(a);
     Lines lines(a);
     Buffer<float> g_lines(static_cast<size_t>(lines.size));
@@ -200,8 +205,10 @@ void field_backward(const FieldArgs& a, const LayerGrads& grads, const FieldGrad
         const WeightGrads g_weights(a, lines, memory);
         for (int64_t i = 0; i < count; ++i) {
             lines.features(a, rows[i], x.start + i * x.row);
-            __builtin_memcpy(g_y.start + i * g_y.row, grads.y + int64_t{rows[i]} * a.K,
-                             sizeof(float) * static_cast<size_t>(a.K));
+            for_each_head(a, [&](int, int first, int width) {
+                __builtin_memcpy(g_y.start + i * g_y.row + first, grads.y + first * a.N + int64_t{rows[i]} * width,
+                                 sizeof(float) * static_cast<size_t>(width));
+            });
         }
         hidden_layers(a, w, x.as_it_is(), count, layers);
         for_each_head(a, [&](int head, int first, int width) {

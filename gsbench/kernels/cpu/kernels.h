@@ -142,7 +142,7 @@ GSB_FIELDS(PlaneGrads, GRADS, positions, of_space)
 
 // Products of samples in space, planes over one of the axes x, y, z and time, and a network that reads F = levels C
 // features: a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each. Head h has the
-// outputs from ends[h - 1] to ends[h] of all K.
+// outputs from ends[h - 1] to ends[h] of all K, in N rows of their own.
 struct FieldArgs {
     int64_t N;
     int C, levels, x, y, z, t, F, H, heads, K;

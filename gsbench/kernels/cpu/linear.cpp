@@ -69,7 +69,8 @@ void linear(const LinearArgs& a, const Layer& out) {
 
 void linear_backward(const LinearArgs& a, const LayerState& state, const LayerGrads& grads, const LinearGrads& out) {
     Buffer<int32_t> rows(static_cast<size_t>(a.N));
-    const int64_t total = rows_with_gradient(grads.y, a.N, a.K, a.threads, rows.data());
+    const auto has_gradient = [&](int64_t i) { return !all_zero(grads.y, a.K, i, 1); };
+    const int64_t total = rows_where(has_gradient, a.N, a.threads, rows.data());
     const int64_t weights = int64_t{a.K} * a.C, panel_rows = a.K > CHUNK ? a.K : CHUNK;
     // Of each thread: gradients of a chunk before the ReLU, a panel, and gradients of the weights and biases.
     const int64_t scratch_size = (CHUNK + 1) * a.K + panel_rows * PANEL + weights;

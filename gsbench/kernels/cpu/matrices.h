@@ -84,15 +84,16 @@ inline auto at_bias(const float* bias, int columns) {
 }
 constexpr auto at_zero = [](int) { return Vec(0.0f); };
 
-// Writes the indices of rows of g [N, K] that are not zero, such as those of Gaussians in front of others, and returns
-// their number.
-inline int64_t rows_with_gradient(const float* g, int64_t N, int K, int threads, int32_t* rows) {
-    Buffer<bool> has(static_cast<size_t>(N));
+// Writes the indices i below N for which has(i) is true, such as those of Gaussians in front of others, which have a
+// gradient, and returns their number.
+template <class Has>
+int64_t rows_where(Has has, int64_t N, int threads, int32_t* rows) {
+    Buffer<bool> is(static_cast<size_t>(N));
 #pragma omp parallel for num_threads(threads) schedule(static) if (N > 256)
-    for (int64_t i = 0; i < N; ++i) has[static_cast<size_t>(i)] = !all_zero(g, K, i, 1);
+    for (int64_t i = 0; i < N; ++i) is[static_cast<size_t>(i)] = has(i);
     int64_t count = 0;
     for (int64_t i = 0; i < N; ++i) {
-        if (has[static_cast<size_t>(i)]) rows[count++] = static_cast<int32_t>(i);
+        if (is[static_cast<size_t>(i)]) rows[count++] = static_cast<int32_t>(i);
     }
     return count;
 }

@@ -24,12 +24,12 @@ struct Cells {
 GSB_HD inline void find_cells(const PlaneArgs& a, const Level& level, int64_t i, int channel, int channels, Cells& cells,
                               const float* also) {
     find_places(a, level, i, cells.at);
-    for (int k = 0; k < PLANES; ++k) {
+    GSB_UNROLL for (int k = 0; k < PLANES; ++k) {
         const int64_t width = level.nodes[COLUMN[k]];
         const int64_t first = (level.in_space[k] + cells.at[ROW[k]].node * width + cells.at[COLUMN[k]].node) * a.C;
         cells.in_space[k] = first;
         cells.row[k] = width * a.C;
-        for (int corner = 0; corner < 4; ++corner) {
+        GSB_UNROLL for (int corner = 0; corner < 4; ++corner) {
             const int64_t node = first + channel + (corner % 2 + corner / 2 * width) * a.C;
             for (int c = 0; c < channels; c += LANES) {
                 __builtin_prefetch(a.of_space + node + c);
@@ -48,7 +48,7 @@ GSB_HD inline Sample sample(const float* p, int64_t next, int64_t row, const Pla
 
 // Writes the samples of all planes of a level at a point, of the n channels from `channel` on.
 GSB_HD inline void sample_all(const PlaneArgs& a, const Cells& cells, int channel, int n, Sample (&planes)[PLANES]) {
-    for (int k = 0; k < PLANES; ++k) {
+    GSB_UNROLL for (int k = 0; k < PLANES; ++k) {
         planes[k] = sample(a.of_space + cells.in_space[k] + channel, a.C, cells.row[k], cells.at[COLUMN[k]],
                            cells.at[ROW[k]], n);
     }
@@ -154,13 +154,13 @@ void sample_planes_backward(const PlaneArgs& a, const ProductGrads& grads, const
                 sample_all(a, cells, c, n, planes);
                 Vec by_planes[PLANES], by[AXES] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
                 by_factors(g, planes, by_planes);
-                for (int k = 0; k < PLANES; ++k) {
+                GSB_UNROLL for (int k = 0; k < PLANES; ++k) {
                     add_cell(by_planes[k], out.of_space + cells.in_space[k] + c, a.C, cells.row[k], cells.at[COLUMN[k]],
                              cells.at[ROW[k]], n);
                     by[COLUMN[k]] += by_planes[k] * planes[k].along;
                     by[ROW[k]] += by_planes[k] * planes[k].across;
                 }
-                for (int axis = 0; axis < AXES; ++axis) by[axis] = by[axis] * Vec(cells.at[axis].slope);
+                GSB_UNROLL for (int axis = 0; axis < AXES; ++axis) by[axis] = by[axis] * Vec(cells.at[axis].slope);
                 sum4(by[0], by[1], by[2], Vec(0.0f), by_axis + (first + i) * 4);
             }
         }
