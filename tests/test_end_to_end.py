@@ -52,7 +52,7 @@ def test_the_table_has_every_run_and_the_papers_row(results):
     folder = results / "mini"
     runs = load(folder)
     assert not runs.faults
-    shown = output.tables(runs)
+    shown = output.shown_sections(runs)
     output.write(runs, folder, shown)
     text = terminal(shown)
     for word in ("moving-matte", "suzanne", "3dgs", "7dgs", "28.26"):

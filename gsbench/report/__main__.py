@@ -100,10 +100,10 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 def _report(results: Results, columns: Sequence[str], options: argparse.Namespace) -> None:
     """Print the result tables, and write them with the page unless only a part or another form was asked for."""
-    shown = output.tables(results, columns, latex=options.latex)
+    shown = output.shown_sections(results, columns, latex=options.latex)
     if options.latex:
         print(text.latex(shown))
-    elif not _is_json(options, lambda: _numbers(results)):
+    elif not _answered_in_json(options, lambda: _numbers(results)):
         print(text.terminal(shown))
         if not options.select:
             print(f"Written: {', '.join(map(str, output.write(results, options.results, shown)))}")
@@ -111,7 +111,8 @@ def _report(results: Results, columns: Sequence[str], options: argparse.Namespac
 
 def _numbers(results: Results) -> dict[str, object]:
     """Return all sections of a report and the facts of every run as plain values."""
-    sections = [of for chapter in results.chapters() for of in built(chapter) if of.key not in ("gallery", "runs")]
+    left_out = ("gallery", "runs")  # images, and a table that `runs` below replaces
+    sections = [of for chapter in results.chapters() for of in built(chapter) if of.key not in left_out]
     runs = results.runs.drop(columns=["path", "record"]).to_dict("records")
     return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
 
@@ -121,7 +122,7 @@ def _paper_tables(results: Results, options: argparse.Namespace) -> None:
     shown = [section for of in paper_tables.sections(results).values() for section in of]
     if options.latex:
         print(text.latex(shown))
-    elif not _is_json(
+    elif not _answered_in_json(
         options, lambda: {name: of.to_dict("records") for name, of in paper_tables.numbers(results).items()}
     ):
         paper_tables.write(results, options.results)
@@ -134,15 +135,15 @@ def _against(results: Results, options: argparse.Namespace) -> bool:
     reference = load(options.against)
     _print_faults(reference)
     compared = reproduction.compare(results, reference)
-    if not _is_json(options, lambda: reproduction.content(compared, results, reference)):
-        sections, shown = reproduction.sections(compared, str(options.against)), output.tables(results)
-        *_, written = output.write(results, options.results, shown, more=sections)
+    if not _answered_in_json(options, lambda: reproduction.content(compared, results, reference)):
+        sections, shown = reproduction.sections(compared, str(options.against)), output.shown_sections(results)
+        paths = output.write(results, options.results, shown, more=sections)
         print(text.terminal([*shown, *sections]))
-        print(f"Report: {printable(written)}")
+        print(f"Report: {printable(paths[-1])}")  # the page
     return compared.verdict == reproduction.DIFFERS
 
 
-def _is_json(options: argparse.Namespace, content: Callable[[], object]) -> bool:
+def _answered_in_json(options: argparse.Namespace, content: Callable[[], object]) -> bool:
     """Write JSON to the FILE of --json, or print it, and return whether that is all that was asked for."""
     if options.json == PRINTED:
         print(as_json(content()))

@@ -72,21 +72,21 @@ QUANTITIES = [*(name for name in OF_TREX if not name.endswith("min")), "train_s"
 
 @cache
 def study(folder: Path) -> dict[str, Results]:
-    """Return the finished runs of a published study by data set."""
+    """Return the finished runs of a published study, which has one experiment, by data set."""
     results = load(folder)
     assert not results.faults, results.faults
     return {chapter.runs.dataset.iloc[0]: chapter.finished for chapter in results.chapters()}
 
 
 def only(published: Path, name: str) -> Results:
-    """Return the runs of a study of one data set."""
+    """Return the finished runs of a study that has only one data set."""
     (chapter,) = study(published / name).values()
     return chapter
 
 
 def means(results: Results, *quantities: str) -> pd.DataFrame:
-    """Return means and intervals over seeds by model and variant; times are not of one machine."""
-    runs = results.runs.assign(timed_on=results.runs.machine)
+    """Return means and intervals over seeds by model and variant; times of all machines count."""
+    runs = results.runs.assign(timed_on=results.runs.machine)  # `stats.means` drops times of other machines
     return stats.means(runs, ["model", "variant"], quantities).set_index(["model", "variant"])
 
 
@@ -109,15 +109,14 @@ def reached(psnr: pd.DataFrame, seconds: pd.DataFrame) -> str:
 def changes(tests: pd.DataFrame) -> pd.DataFrame:
     """Return tested differences: mean (bold if significant) ± half the interval."""
     table = pd.DataFrame({"mean": tests["mean"], "mean ±": tests.high - tests["mean"]})
-    table["mean rank"] = tests.significant.astype(int)
+    table["mean rank"] = tests.significant.astype(int)  # rank 1 is shown bold
     return table
 
 
-def gain_text(scenes: list[Values]) -> str:
+def gain_text(scenes: list[Values]) -> str:  # for each scene the differences [seeds, views]
     """Return a difference ± half its interval over scenes, bold if significant, and on how many scenes it is positive.
 
-    Args:
-        scenes: for each scene the differences [seeds, views]; without scenes, the text is a dash.
+    Without scenes, the text is a dash.
     """
     if not scenes:
         return EMPTY
@@ -140,9 +139,9 @@ def table1(published: Path) -> str:
 def cost(published: Path) -> str:
     """Return PSNR and seconds of models after two lengths of training."""
     lengths, models = {"1,000": "", "4,000": "iterations=4000"}, ["3dgs", "4dgs", "7dgs_noagr", "7dgs", "auto"]
-    of = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
-    of = of.loc[list(lengths.values())].set_axis(pd.Index(lengths, name="iterations"))
-    return reached(of.psnr_db[models], of.train_s[models])
+    table = means(only(published, "frontier"), "psnr_db", "train_s").unstack("model")
+    table = table.loc[list(lengths.values())].set_axis(pd.Index(lengths, name="iterations"))
+    return reached(table.psnr_db[models], table.train_s[models])
 
 
 def ablation(published: Path) -> str:
@@ -152,7 +151,7 @@ def ablation(published: Path) -> str:
     full, *ablated = [keys[f"ablation={name}"] for name in ABLATIONS]
     arrays = stats.grids(chapter)
     tests = [
-        stats.differences(arrays, [{full: 1.0}]).assign(significant=False),
+        stats.differences(arrays, [{full: 1.0}]).assign(significant=False),  # no difference, but PSNR itself
         stats.differences(arrays, [{part: 1.0, full: -1.0} for part in ablated]),
     ]
     table = changes(pd.concat(tests, ignore_index=True))
@@ -224,8 +223,8 @@ def _of_dnerf(chapter: Results) -> Results:
 
 
 def _lost(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return PSNR of choices (columns) minus that of the best model without choices, for each scene (rows)."""
-    unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()
+    """Return PSNR of CHOICES (columns) minus that of the model with the best PSNR on test, for each scene (rows)."""
+    unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()  # no val
     runs = runs[~runs.scene.map(unusable)]
     psnr = runs.pivot(index=["scene", "seed"], columns="name", values="psnr_db")
     fixed = [name for name in psnr if not name.startswith("auto")]
@@ -239,18 +238,19 @@ def _lost(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _val_on_the_way(chapter: Results) -> pd.DataFrame:
-    """Return runs with their name and with PSNR on val after each of PARTS of the training."""
-    curves = chapter.curves.assign(place=chapter.curves.groupby("run").cumcount() + 1)
-    size = curves.groupby("run").run.transform("size")
+    """Return runs with their name, and PSNR on val after each of PARTS of the curve, whose points are evenly spaced."""
+    curves = chapter.curves.assign(number=chapter.curves.groupby("run").cumcount() + 1)
+    count = curves.groupby("run").run.transform("size")
     runs = chapter.runs.assign(name=names_of(chapter.runs))
     for part in PARTS:
-        at = curves[curves.place == (part * size).round()].set_index("run").psnr_val_db
+        at = curves[curves.number == (part * count).round()].set_index("run").psnr_val_db
         runs[f"val {part}"] = at.reindex(runs.index)
     return runs[runs.name.isin([*MODELS, *CHOICES])]
 
 
 def lengths(published: Path) -> str:
-    """Return PSNR of 7DGS after four lengths, and after the one that `train.lengths=4` keeps."""
+    """Return PSNR of 7DGS after 1,000 (variant ""), 2,000, 4,000 and 8,000 iterations, and after the one val keeps."""
+    # `lengths` has the long trainings, of seed 0 only, and `suite` the others: `by_length` keeps this seed.
     runs = pd.concat([of.runs for name in ("lengths", "suite") for of in study(published / name).values()])
     runs = runs[runs.variant.isin(["", "iterations=2000", "iterations=4000", "iterations=8000"])]
     table = by_length(runs[runs.model == "7dgs"]).dropna().droplevel(["model", "seed"])
@@ -260,7 +260,7 @@ def lengths(published: Path) -> str:
 # ---- D-NeRF and recipes
 
 
-# By the end of their titles. Of the paper there is only the best on test.
+# By the end of a column's title, the column psnr_* of `paper_tables.table1`; the paper has only the best on test.
 LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
 
 
@@ -330,13 +330,13 @@ def _minutes(of: pd.Series, device: str) -> pd.Series:
 
 def trex400(published: Path) -> str:
     """Return trex as the paper trains it, with both initial lambda_t, and by other recipes."""
-    results = load(published / "dnerf").finished  # a chapter has times of one machine
+    results = load(published / "dnerf").finished  # no chapters, which drop times of other machines
     averages = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
     rows: dict[str, pd.Series] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
-        for words, device in {"device=cuda,": "GPU", "": "CPU"}.items():
+        for of_device, device in {"device=cuda,": "GPU", "": "CPU"}.items():
             for start in ("", f"{LAMBDA_T},"):
-                if (model, variant := f"{words}{start}{POINTS},{AT_PAPER}") in averages.index:
+                if (model, variant := f"{of_device}{start}{POINTS},{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
                     rows[title] = _minutes(averages.loc[(model, variant)], device)
     others = [
@@ -373,11 +373,12 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
     runs = chapter.runs[chapter.runs.model == model]
     averages = runs.groupby(["variant", "scene"])[names].mean()
     gated = runs.groupby("variant").on_demand.any()
-    rows = [pd.DataFrame(columns=names)]
-    for less in gated.index[gated]:
-        words = set(less.split(","))
+    rows = [pd.DataFrame(columns=names)]  # also if no effect was removed
+    for with_gate in gated.index[gated]:
+        words = set(with_gate.split(","))
+        # The variant without a gate that has the most settings in common.
         full = max(gated.index[~gated], key=lambda variant: len(words & set(variant.split(","))))
-        new, old = averages.loc[less], averages.loc[full].reindex(averages.loc[less].index)
+        new, old = averages.loc[with_gate], averages.loc[full].reindex(averages.loc[with_gate].index)
         rows.append((100 * (new / old - 1)).assign(psnr_db=new.psnr_db - old.psnr_db))
     return pd.concat(rows).astype(float)
 

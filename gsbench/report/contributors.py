@@ -87,14 +87,14 @@ def _conflicts(repeats: pd.DataFrame) -> list[Section]:
 def _trainings(results: Results) -> list[Section]:
     """Return the settings in which two contributors' trainings of one model and variant differ."""
     runs = results.runs[~results.runs.rendered_elsewhere]
-    runs = runs.assign(variant=[without(variant, "from") for variant in runs.variant])
+    runs = runs.assign(variant=[without(variant, "from") for variant in runs.variant])  # `merge.told_apart` adds it
     rows: dict[tuple[str, ...], dict[str, str]] = {}
-    for _, same in runs.drop_duplicates([*RUN[:-1], "contributor"]).groupby(RUN[:-1]):
+    for _, same in runs.drop_duplicates([*RUN[:-1], "contributor"]).groupby(RUN[:-1]):  # all but the seed
         first, *others = same.itertuples()
         for other in others:
             if differing := listed(other_settings(first.config, other.config)):
                 named = {"model": names_of(same).iloc[0], "contributors": f"{first.contributor}, {other.contributor}"}
                 row_of_pair = named | {"settings of the second": printable(differing)}
-                rows[*row_of_pair.values(),] = {"experiment": first.experiment} | row_of_pair
+                rows[tuple(row_of_pair.values())] = {"experiment": first.experiment} | row_of_pair
     text = "Trainings that go by one name although their settings differ, but for the seed."
     return [Section("trainings", "Equal names, other settings", text, pd.DataFrame(rows.values()))] if rows else []

@@ -14,7 +14,7 @@ import pandas as pd
 
 from gsbench.config_roles import facts
 from gsbench.errors import InputError, printable
-from gsbench.measure import record as files
+from gsbench.measure import record as record_files
 from gsbench.measure.record import Record
 from gsbench.report import study
 from gsbench.report.columns import CURVES, RUNS, VIEWS
@@ -70,15 +70,15 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
     """Return all records under `root` with the paths of their files, and why wrong ones are left out.
 
     Raises:
-        InputError: the folder is missing or has no record.
+        InputError: the folder is missing or has no record, not even a damaged one.
     """
     if not root.is_dir():
         raise InputError(f"{root}: expected a folder of results, found none")
     read: Records = []
     faults = []
-    for path in files.find(root):
+    for path in record_files.find(root):
         try:
-            read.append((path, files.read(path)))
+            read.append((path, record_files.read(path)))
         except InputError as error:
             faults.append(printable(error))
     for folder in study.find(root):
@@ -89,7 +89,8 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
         except InputError as error:
             faults.append(printable(error))
     if not read and not faults:
-        raise InputError(f"{root}: expected results, found no {files.FILE_NAME} or {study.RUNS_FILE} in it or below")
+        names = f"{record_files.FILE_NAME} or {study.RUNS_FILE}"
+        raise InputError(f"{root}: expected results, found no {names} in it or below")
     records = []
     for path, record in read:
         if why := implausible(record):
@@ -105,7 +106,7 @@ def tables(records: Records, faults: list[str]) -> Results:
 
 
 def unique(records: Records, faults: list[str]) -> tuple[Records, list[str]]:
-    """Return records sorted by RUN without those of a run that another describes, and the faults with theirs."""
+    """Return the first record of each run, sorted by RUN, and the faults with a line for each further record."""
     once: dict[tuple[Any, ...], tuple[Path, Record]] = {}
     for path, record in records:
         if (run := run_name(record)) in once:
@@ -173,8 +174,8 @@ def psnr_val(r: Record) -> float:
     """
     if r.protocol.get("eval_split") == "val":
         return _number((r.metrics or {}).get("psnr"))
-    gates = r.on_demand.gates if r.on_demand else []
-    lost = sum(gate.measured_db for gate in gates if gate.step is None and gate.checked_on == "val")
+    at_end = [gate for gate in r.on_demand.gates if gate.step is None] if r.on_demand else []
+    lost = sum(gate.measured_db for gate in at_end if gate.checked_on == "val")
     points = [point for point in r.curve if r.stop is None or point.iteration == r.stop.kept]
     return _number(points[-1].psnr_val) - lost if points else math.nan
 
@@ -212,9 +213,9 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     figure. `label`: the row of a table.
     """
     counted = runs[(runs.status == "ok") & ~runs.rendered_elsewhere]
-    shared = counted[["model", "variant"]].drop_duplicates().variant.value_counts()
-    main = min(shared.index, key=lambda variant: (-shared[variant], is_ablated(variant), variant), default="")
-    gated = (runs.gate != "") & (runs.gate.nunique() > 1)
+    models = counted[["model", "variant"]].drop_duplicates().variant.value_counts()  # their number by variant
+    main = min(models.index, key=lambda variant: (-models[variant], is_ablated(variant), variant), default="")
+    gated = (runs.gate != "") & (runs.gate.nunique() > 1)  # has a curve beside that of the model without gate
     series = runs.model.where(~gated, runs.model + ", " + runs.gate)
     label = names_of(runs) if runs.variant.nunique() > 1 else runs.model
     compared = (runs.variant.map(common) == common(main)) | runs.rendered_elsewhere
@@ -233,7 +234,7 @@ def title_of(runs: pd.DataFrame) -> str:
 
 
 def covered(runs: pd.DataFrame, by: str = "label") -> list[str]:
-    """Return the scenes that every model of finished `runs` has finished: averages are over these."""
+    """Return the scenes that every model that has finished one has finished: averages are over these."""
     ok = runs[runs.status == "ok"]
     finished = pd.crosstab(ok.scene, ok[by]) > 0
     return list(finished.index[finished.all(axis=1)])

@@ -100,7 +100,7 @@ class Estimate:
         low, high = math.log(LEAST_P), 0.0  # bisection of log p; importing scipy.optimize would take a second
         for _ in range(60):
             middle = (low + high) / 2
-            if self._half(-math.expm1(middle)) > abs(self.mean):
+            if self._half(-math.expm1(middle)) > abs(self.mean):  # at the level 1 - p: zero is in the interval
                 low = middle
             else:
                 high = middle
@@ -137,12 +137,8 @@ def estimate(scenes: list[Values], *, generalise: bool = True) -> Estimate:
     return Estimate(mean, count, seeds, "seeds and views", (without_rest, of_views), of_seeds, each)
 
 
-def over_seeds(values: Sequence[float]) -> Estimate:
-    """Estimate the mean of a model's runs on one scene; the interval is over seeds, for this scene and its views.
-
-    Args:
-        values: one value for each seed.
-    """
+def over_seeds(values: Sequence[float]) -> Estimate:  # one value for each seed
+    """Estimate the mean of a model's runs on one scene; the interval is over seeds, for this scene and its views."""
     return estimate([np.array(values, dtype=np.float64)[:, None]], generalise=False)
 
 

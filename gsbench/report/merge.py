@@ -78,7 +78,7 @@ def contributors(folders: Sequence[Path]) -> dict[str, Path]:
         if sum(path.is_relative_to(other) for other in whole) > 1:
             raise InputError(f"--merge {folder}: expected folders apart from each other, got it in another or twice")
     lengths = range(1, max(len(path.parts) for path in whole) + 1)
-    named = (["/".join(path.parts[-n:]) for path in whole] for n in lengths)
+    named = (["/".join(path.parts[-n:]) for path in whole] for n in lengths)  # by one part, by two, ..
     names = next(names for names in named if len(set(names)) == len(names))
     for name, folder in zip(names, folders, strict=True):
         if not re.fullmatch(r"[\w.+/-]{1,100}", name):
@@ -107,10 +107,11 @@ def _identity(record: Record, numbers: Any) -> bytes:
 
 def protocol_of(record: Record) -> str:
     """Return how a run was measured as text, such as "protocol gsbench, eval_split test, background black"."""
-    values = {name: record.protocol.get(name) for name in PROTOCOL}
-    name, *others = ((name, SILENT.get(name, "none") if value is None else value) for name, value in values.items())
-    shown = [f"{setting} {value}" for setting, value in others if value is not False and value != SILENT.get(setting)]
-    return printable(", ".join([f"protocol {name[1]}", *shown]))
+    recorded = {name: record.protocol.get(name) for name in PROTOCOL}
+    values = {name: SILENT.get(name, "none") if value is None else value for name, value in recorded.items()}
+    name = values.pop("name")
+    shown = [f"{key} {value}" for key, value in values.items() if value is not False and value != SILENT.get(key)]
+    return printable(", ".join([f"protocol {name}", *shown]))
 
 
 def told_apart(runs: pd.DataFrame) -> pd.DataFrame:
@@ -122,7 +123,7 @@ def told_apart(runs: pd.DataFrame) -> pd.DataFrame:
         scene=runs.scene.where(~has_others, runs.scene + " (data " + runs.data_hash.str[:8].map(printable) + ")")
     )
     size = runs.groupby([*place, "contributor"]).seed.transform("size")
-    ordered = runs.assign(size=-size).sort_values(["size", "contributor"], kind="stable")
+    ordered = runs.assign(size=-size).sort_values(["size", "contributor"], kind="stable")  # who has the most is first
     first = ordered.groupby([*place, "model", "variant"]).contributor.transform("first").reindex(runs.index)
     named = (runs.variant + ",from=" + runs.contributor).str.lstrip(",")
     return runs.assign(variant=runs.variant.where(runs.contributor == first, named))

@@ -19,7 +19,7 @@ EVERY = 5.0  # seconds after which the folder is read again and an open page rel
 NOT_IN_FILE = ["config", "missing", "path", "record"]  # columns of `runs` that are no values
 
 
-def tables(results: Results, columns: Sequence[str] = (), *, latex: bool = False) -> list[Section]:
+def shown_sections(results: Results, columns: Sequence[str] = (), *, latex: bool = False) -> list[Section]:
     """Return the sections that the terminal and ``table.md`` show, or those of --latex, for each experiment.
 
     Args:
@@ -27,7 +27,7 @@ def tables(results: Results, columns: Sequence[str] = (), *, latex: bool = False
         columns: the columns of the result table; empty for those that the runs have.
         latex: whether they are for --latex.
     """
-    shown = [
+    shown = [  # `built` cannot ask for columns, so its table of results is replaced
         table(chapter, columns) if section.key == "experiment" else section
         for chapter in results.chapters()
         for section in built(chapter, attrgetter("in_latex" if latex else "in_terminal"))
@@ -43,14 +43,14 @@ def write(
     Args:
         results: the tables of the runs.
         folder: the folder of the files.
-        shown: the sections of ``table.md``: `tables`.
+        shown: the sections of ``table.md``: `shown_sections`.
         reload: seconds after which an open page reloads itself; 0 for never.
         more: sections of the page that are not of one experiment.
     """
     write_atomically(folder / "table.md", text.markdown(shown).encode())
     write_atomically(folder / "table.csv", text.csv(results.runs.drop(columns=NOT_IN_FILE)).encode())
     if merge.is_merged(results):
-        pages = site.write(results, folder)[:1]
+        pages = site.write(results, folder)[:1]  # index.html
     else:
         pages = [page.write(results, folder, reload=reload, more=more)]
     return [folder / "table.md", folder / "table.csv", *pages]
@@ -99,7 +99,7 @@ def _rewrite(folder: Path, columns: Sequence[str], reload: int) -> str:
         results = load(folder)
         if results.runs.empty:
             return f"no record can be read: {results.faults[0]}"
-        *_, page = write(results, folder, tables(results, columns), reload=reload)
+        written = write(results, folder, shown_sections(results, columns), reload=reload)
     except (InputError, OSError) as error:
         return one_line(error)
     counts = {
@@ -107,7 +107,7 @@ def _rewrite(folder: Path, columns: Sequence[str], reload: int) -> str:
         "not ok": int((results.runs.status != "ok").sum()),
         "left out": len(results.faults),
     }
-    return f"{', '.join(f'{n} {what}' for what, n in counts.items() if n)}: {page}"
+    return f"{', '.join(f'{n} {what}' for what, n in counts.items() if n)}: {written[-1]}"
 
 
 def publish(folder: Path, to: Path) -> str:
@@ -134,5 +134,5 @@ def publish(folder: Path, to: Path) -> str:
     runs = {run_name(record): record for part in (earlier, results) if part for record in part.runs.record}
     records = [runs[key] for key in sorted(runs)]
     study.write(records, to)
-    write_atomically(to / "table.md", text.markdown(tables(load(to))).encode())
+    write_atomically(to / "table.md", text.markdown(shown_sections(load(to))).encode())
     return f"Published: {len(results.runs)} runs in {to}, which has {len(records)}; {to / study.RUNS_FILE}"

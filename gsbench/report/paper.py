@@ -82,7 +82,7 @@ def average(dataset: str, scenes: list[str], model: str) -> pd.Series:
     keys = [(dataset, scene.lower(), model) for scene in scenes]  # Technicolor's folders are named Birthday, ..
     if not keys or not all(key in table1().index for key in keys):
         return pd.Series(dtype=float)
-    return table1().loc[keys].mean(skipna=False).rename({"lpips": "lpips_alex"})
+    return table1().loc[keys].mean(skipna=False).rename({"lpips": "lpips_alex"})  # shown there, as it names no network
 
 
 def read_table(name: str) -> pd.DataFrame:

@@ -109,12 +109,13 @@ def of_the_paper(results: Results, models: Sequence[str] = MODELS) -> pd.DataFra
             r.experiment,
             paper.relative_size(r),
             str(r.protocol.get("resize")),
-            int(iterations(r)) if iterations(r) > 0 else 0,
+            int(iterations(r)) if iterations(r) > 0 else 0,  # NaN: not recorded
         )
         for r in runs.record
     ]
     recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
     sizes = [printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record]
+    # protocol=published belongs to no recipe: it only measures the best PSNR on test too.
     return runs.assign(
         order=runs.model.map(models.index),
         departs=runs.record.map(departure),
@@ -149,7 +150,7 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     pools = [pool for _, pool in runs[runs.departs != ""].groupby("pool")]
     for pool in sorted(pools, key=lambda pool: -_effort(pool)):  # equal ones stay in order of their names
         if (pool.status == "ok").any():
-            nearest.setdefault(pool.pool.iloc[0][:2], pool)
+            nearest.setdefault(pool.pool.iloc[0][:2], pool)  # by (data of the paper, data)
     for kind in ("other protocol", "other data"):
         for (paper_dataset, dataset), pool in nearest.items():
             if (kind == "other protocol") == (paper_dataset == dataset):
@@ -175,12 +176,12 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
     """
     ok = _once(of_one_machine(runs))
     scenes = list(paper.PROTOCOLS[dataset].scenes) if kind == "paper" else sorted(set(runs.scene))
-    averaged = {scene: [scene] for scene in scenes}
+    averaged = {scene: [scene] for scene in scenes}  # the scenes of each row
     groups = [(scene, ok[ok.scene == scene]) for scene in scenes]
     rows = ok.drop_duplicates(["scene", *RECIPE])
     main = rows.groupby("recipe").size().idxmax() if len(rows) else ""
     averaged_runs = ok[ok.recipe == main]
-    models = rows[rows.recipe == main].groupby("scene").size()
+    models = rows[rows.recipe == main].groupby("scene").size()  # their number on each scene
     covered = [scene for scene in scenes if models.get(scene) == len(averaged_runs[RECIPE].drop_duplicates())]
     if runs.scene.nunique() > 1 and covered:
         averaged[paper.AVERAGE] = covered
@@ -191,15 +192,16 @@ def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:
         paper.average(dataset if kind == "paper" else "", averaged[scene], model)
         for scene, model in zip(table.scene, table.model, strict=True)
     ]
-    of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float).assign(psnr_best_on_test_db=lambda x: x.psnr_db)
-    difference = (table[TABLE_1] - of_paper).drop(columns=TIMES, errors="ignore")
+    of_paper = pd.DataFrame(numbers, columns=TABLE_1, dtype=float)
+    of_paper["psnr_best_on_test_db"] = of_paper.psnr_db  # the paper's PSNR is the best on test
+    difference = (table[TABLE_1] - of_paper).drop(columns=TIMES, errors="ignore")  # its times are of a V100
     return table.join(of_paper.add_suffix(" paper")).join(difference.add_suffix(" difference"))
 
 
 def _once(runs: pd.DataFrame, by: Sequence[str] = RECIPE) -> pd.DataFrame:
     """Return one finished run for each seed of a row: the one that also has the best PSNR on test, if there is one."""
     ok = runs[runs.status == "ok"]
-    ok = ok.loc[ok.psnr_best_on_test_db.notna().sort_values(kind="stable").index]
+    ok = ok.loc[ok.psnr_best_on_test_db.notna().sort_values(kind="stable").index]  # those that have it are last
     return ok.drop_duplicates(["scene", *by, "seed"], keep="last")
 
 
@@ -314,8 +316,10 @@ def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict
     table = published(dataset)
     every = SUCCESSOR_SCENES[dataset]
     for of in table[table.scene == scene].to_dict("records"):
-        note = "; the number of scenes of this mean is not stated" if pd.isna(of["scenes"]) else ""
-        if scene == paper.AVERAGE and of["scenes"] != len(scenes) and not (note and len(scenes) == len(every)):
+        is_unknown = pd.isna(of["scenes"])  # then it is shown as the mean over all
+        note = "; the number of scenes of this mean is not stated" if is_unknown else ""
+        is_of_scenes = of["scenes"] == len(scenes) or (is_unknown and len(scenes) == len(every))
+        if scene == paper.AVERAGE and not is_of_scenes:
             if of["scenes"] != len(every):
                 continue
             rows = table[(table.method == of["method"]) & (table.source == of["source"]) & table.scene.isin(scenes)]
@@ -371,7 +375,7 @@ def _sections1(runs: pd.DataFrame) -> Iterator[Section]:
 def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of Table 1 as lines: measured, and the paper's line and the difference below it, where they are."""
     several = rows.experiment.nunique() > 1
-    label = [" ".join(filter(None, (r.model, r.recipe, r.experiment * several))) for r in rows.itertuples()]
+    label = [" ".join(filter(None, (r.model, r.recipe, r.experiment if several else ""))) for r in rows.itertuples()]
     averages = "average over " + rows.scenes.astype(str) + " scenes"
     rows = rows.assign(scene=rows.scene.where(rows.scenes == 1, averages))
     has_paper = rows["psnr_db paper"].notna()
@@ -381,7 +385,7 @@ def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
         lines = rows.loc[has_paper, [f"{name} {end}" for name in TABLE_1]].set_axis(TABLE_1, axis=1)
         tables.append(lines.assign(scene=rows.scene[has_paper], model=end))
     order = [name for column in TABLE_1 for name in (column, f"{column} ±")]
-    table = pd.concat(tables).sort_index(kind="stable").reset_index(drop=True)
+    table = pd.concat(tables).sort_index(kind="stable").reset_index(drop=True)  # lines of one row have its index
     return table[["scene", "model", *order, "seeds"]].astype(dict.fromkeys([*order, "seeds"], float))
 
 
@@ -405,7 +409,7 @@ def pools(runs: pd.DataFrame) -> Section:
                 "data": dataset,
                 "experiment": experiment,
                 "size": ", ".join(sorted(set(pooled["size"]))),
-                "filter": resize.removesuffix("None"),
+                "filter": "" if resize == "None" else resize,
                 "iterations": steps,
                 "runs": len(pooled),
                 "failed": int((pooled.status != "ok").sum()),

@@ -102,21 +102,23 @@ def compare(new: Results, reference: Results) -> Reproduction:
     """Compare new runs with reference runs for each model and scene that both have."""
     runs = pd.concat([_with_bits(new).assign(side="new"), _with_bits(reference).assign(side="reference")])
     rows: list[dict[str, Any]] = []
-    seeds = [_shared_seeds(runs[:0], runs[:0]).astype({"bit_equal": bool})]
+    seeds = [_shared_seeds(runs[:0], runs[:0]).astype({"bit_equal": bool})]  # columns, if no row follows
     unmatched: list[dict[str, Any]] = []
     for key, matching in runs.groupby(ROW):
         row = dict(zip(ROW, key, strict=True))
         if matching.side.nunique() == 1:
             unmatched.append(row | {"reason": _why_unmatched(matching, runs)})
             continue
-        left, right = (matching[(matching.side == side) & (matching.status == "ok")] for side in SIDES)
-        reason = _incomparable(left, right)
-        late = reason or _other_machine(left, right)
-        shared = _shared_seeds(left, right)[: 0 if reason else None]
-        seeds.append(shared)
+        new_runs, reference_runs = (matching[(matching.side == side) & (matching.status == "ok")] for side in SIDES)
+        reason = _incomparable(new_runs, reference_runs)
+        times_reason = reason or _other_machine(new_runs, reference_runs)
+        why = dict.fromkeys(LIMITS.index, reason) | dict.fromkeys(TIMES, times_reason)
+        shared = _shared_seeds(new_runs, reference_runs)
+        if not reason:
+            seeds.append(shared)
         repeats = len(shared) > 0 and bool(shared.bit_equal.all())
-        rows += [row | _samples(left, right, name, late if name in TIMES else reason, repeats) for name in LIMITS.index]
-    table = pd.DataFrame(rows, columns=[*ROW, *_samples(runs[:0], runs[:0], "psnr_db", "", False)])
+        rows += [row | _samples(new_runs, reference_runs, name, why[name], repeats) for name in LIMITS.index]
+    table = pd.DataFrame(rows, columns=[*ROW, *_samples(runs[:0], runs[:0], "psnr_db", "", False)])  # if no row too
     table = table.astype({"bit_equal": bool} | dict.fromkeys([*SIDES, "squares", "freedom", *SIZES], float))
     missing = pd.DataFrame(unmatched, columns=[*ROW, "reason"])
     return Reproduction(_judged(_differences(table)), pd.concat(seeds, ignore_index=True), missing)
@@ -133,18 +135,18 @@ def _with_bits(results: Results) -> pd.DataFrame:
     return results.runs.assign(bits=pd.Series(ends, results.runs.index, dtype=object))
 
 
-def _shared_seeds(left: pd.DataFrame, right: pd.DataFrame) -> pd.DataFrame:
+def _shared_seeds(new: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each seed that both sets of finished runs have, with the column "bit_equal"."""
     names = [*ROW, "seed"]
-    shared = left[[*names, "bits"]].merge(right[[*names, "bits"]], on=names, validate="one_to_one")
+    shared = new[[*names, "bits"]].merge(reference[[*names, "bits"]], on=names, validate="one_to_one")
     return shared[names].assign(bit_equal=shared.bits_x == shared.bits_y)
 
 
 def _why_unmatched(unmatched: pd.DataFrame, runs: pd.DataFrame) -> str:
     """Return why runs of a model on a scene have no counterpart, by the nearest training that the other folder has."""
     first = unmatched.iloc[0]
-    others = runs[(runs[ROW[:4]] == first[ROW[:4]]).all(axis=1) & (runs.side != first.side)]
-    if first.side == "reference" or others.empty:
+    others = runs[(runs[ROW[:-1]] == first[ROW[:-1]]).all(axis=1) & (runs.side != first.side)]  # of any variant
+    if first.side == "reference" or others.empty:  # what differs stands beside the new runs
         return f"only the {first.side} folder has it"
     smallest = min((other_settings(config, first.config) for config in others.config), key=len)
     return f"another training: {printable(listed(smallest)) or 'another variant'}"
@@ -188,14 +190,14 @@ def _other_machine(new: pd.DataFrame, reference: pd.DataFrame) -> str:
 
 
 def _samples(new: pd.DataFrame, reference: pd.DataFrame, quantity: str, reason: str, repeats: bool) -> dict[str, Any]:
-    """Return the two samples of a quantity as their means, sizes, squares and degrees of freedom.
+    """Return the two samples of a quantity: means, sizes, squared deviations ("squares") and degrees of freedom.
 
     Args:
         new: the finished new runs of a model on a scene.
         reference: the finished reference runs.
         quantity: a key of LIMITS.
         reason: why they cannot be compared; "" if they can.
-        repeats: whether all runs with one seed are bit-equal. They count once.
+        repeats: whether the runs of each seed of both are bit-equal. They count once.
     """
     samples = [runs[quantity].dropna() for runs in (new, reference)]
     if not reason and not all(map(len, samples)):
@@ -222,20 +224,20 @@ def _differences(table: pd.DataFrame) -> pd.DataFrame:
     by degrees of freedom; the pooled one has at most `POOLED_RUNS`, as models and scenes differ in spread.
     """
     table = table.join(LIMITS.astype({"equal": float, "widest": float, "relative": bool}), on="quantity")
-    table["unit"] = table.reference.abs().where(table.relative & (table.reference != 0), 1.0)
+    table["unit"] = table.reference.abs().where(table.relative & (table.reference != 0), 1.0)  # of LIMITS
     is_compared = table.reason == ""
     squares = (table.squares / table.unit**2).where(is_compared, 0.0)
     freedom = table.freedom.where(is_compared, 0)
     pool = [table[name] for name in ("experiment", "dataset", "quantity")]
     pooled, pooled_freedom = squares.groupby(pool).transform("sum"), freedom.groupby(pool).transform("sum")
-    shared = pooled_freedom.clip(upper=POOLED_RUNS)
-    moderated = (shared * pooled / pooled_freedom.where(pooled_freedom > 0) + squares) / (shared + freedom)
+    weight = pooled_freedom.clip(upper=POOLED_RUNS)  # of the pooled variance, in degrees of freedom
+    moderated = (weight * pooled / pooled_freedom.where(pooled_freedom > 0) + squares) / (weight + freedom)
     error = np.sqrt(moderated * (1 / table.runs_new + 1 / table.runs_reference)) * table.unit
     table["difference"] = (table.new - table.reference).where(is_compared).where(~table.bit_equal, 0.0)
     error = error.where(is_compared & ~table.bit_equal)
-    half = stdtrit((shared + freedom).astype(float), (1 + LEVEL) / 2) * error
-    p = 2 * stdtr((shared + freedom).astype(float), -(table.difference.abs() / error.where(error > 0)))
-    p = p.where(error != 0, (table.difference == 0).astype(float))
+    half = stdtrit((weight + freedom).astype(float), (1 + LEVEL) / 2) * error
+    p = 2 * stdtr((weight + freedom).astype(float), -(table.difference.abs() / error.where(error > 0)))
+    p = p.where(error != 0, (table.difference == 0).astype(float))  # all seeds alike: 1 or 0
     table["low"], table["high"] = table.difference - half, table.difference + half
     table["p_holm"] = p.groupby(table.quantity).transform(lambda values: holm(values.tolist()))
     return table
@@ -327,9 +329,9 @@ def sections(result: Reproduction, reference: str) -> list[Section]:
 def content(result: Reproduction, new: Results, reference: Results) -> dict[str, Any]:
     """Return a comparison, and the runs of both folders that it compares, as plain values for JSON."""
     columns = [*ROW, "seed", "status", *LIMITS.index, "machine"]
-    both = result.table[ROW].drop_duplicates()
+    compared = result.table[ROW].drop_duplicates()
     sides = zip(SIDES, (new.runs, reference.runs), strict=True)
-    runs = {side: runs[columns].merge(both, validate="many_to_one") for side, runs in sides}
+    runs = {side: runs[columns].merge(compared, validate="many_to_one") for side, runs in sides}
     tables = {"summary": summary(result), "rows": result.table, "seeds": result.seeds, "unmatched": result.unmatched}
     return {
         "verdict": result.verdict,

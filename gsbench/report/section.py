@@ -126,15 +126,16 @@ class Section:
 
     def _texts(self, name: str, mark: Callable[[str, int], str]) -> list[str]:
         halves = self.table.get(f"{name} ±", [math.nan] * len(self.table))
-        show = self._number if self.is_number(name) else lambda _, value, __: text(value)
-        cells = [show(name, value, half) for value, half in zip(self.table[name], halves, strict=True)]
+        is_number = self.is_number(name)
+        values = zip(self.table[name], halves, strict=True)
+        cells = [self._number(name, value, half) if is_number else text(value) for value, half in values]
         return [mark(cell, rank) if rank else cell for cell, rank in zip(cells, self.rank(name), strict=True)]
 
     def _number(self, name: str, value: float, half: float) -> str:
         if math.isnan(value):
             return EMPTY
         column = self.column(name)
-        is_whole = name not in self.columns and name not in COLUMNS and float(value).is_integer()
+        is_whole = name not in self.columns and name not in COLUMNS and float(value).is_integer()  # such as a count
         digits = 0 if is_whole else column.digits_of(value)
         return number(value, digits, signed=column.signed) + ("" if math.isnan(half) else f" ± {number(half, digits)}")
 

@@ -35,13 +35,14 @@ def means(runs: pd.DataFrame, by: list[str], quantities: Sequence[str]) -> pd.Da
     is_elsewhere = np.outer(runs.machine != runs.timed_on, [name in TIMES for name in names])
     lacks = (runs[names].isna() & ~is_elsewhere).groupby([runs[key] for key in [*by, "scene"]]).any()
     mean = mean.mask(lacks | (n == 0))
-    variance = (variance / n).mask(mean.isna() | (n < 2))
+    variance = (variance / n).mask(mean.isna() | (n < 2))  # of the mean of a scene
     total = variance.groupby(by).sum()
     freedom = total**2 / (variance**2 / (n - 1)).groupby(by).sum()  # Satterthwaite (1946)
     freedom = freedom.fillna((n - 1).groupby(by).sum())
     scenes = runs.groupby(by).scene.nunique()
     half = pd.DataFrame(stdtrit(freedom, (1 + LEVEL) / 2), freedom.index, names) * total**0.5
-    half = half.div(scenes, axis=0).where(variance.notna().groupby(by).all())
+    half = half.div(scenes, axis=0)  # from the sum over scenes to the mean
+    half = half.where(variance.notna().groupby(by).all())
     average = mean.groupby(by).mean().where(mean.notna().groupby(by).all())
     seeds = groups.seed.nunique().groupby(by).min()
     return average.join(half.add_suffix(" ±")).assign(seeds=seeds, scenes=scenes).reset_index()
@@ -82,8 +83,8 @@ def contrast_by_scene(arrays: Grids, weights: Weights) -> dict[str, Values]:
     for scene in sorted(arrays):
         if all(key in arrays[scene] for key in weights):
             total = np.sum([weight * arrays[scene][key] for key, weight in weights.items()], axis=0)
-            total = total[~np.isnan(total).all(axis=1)]
-            total = total[:, ~np.isnan(total).any(axis=0)]
+            total = total[~np.isnan(total).all(axis=1)]  # seeds
+            total = total[:, ~np.isnan(total).any(axis=0)]  # views
             if total.size:
                 sums[scene] = total
     return sums
@@ -95,7 +96,7 @@ def differences(arrays: Grids, asked: Sequence[Weights]) -> pd.DataFrame:
     A difference that is asked twice, or with the opposite sign, counts as one comparison.
     """
     table = pd.DataFrame([row_of(estimate(contrast(arrays, w))) for w in asked], columns=list(row_of(NOTHING)))
-    keys = [min(_terms(weights, sign) for sign in (1, -1)) for weights in asked]
+    keys = [min(_terms(weights, sign) for sign in (1, -1)) for weights in asked]  # equal for a - b and b - a
     distinct = table.p[~pd.Series(keys, table.index, dtype=object).duplicated()]
     adjusted = dict(zip([keys[i] for i in distinct.index], holm(distinct.tolist()), strict=True))
     table["p_holm"] = pd.Series([adjusted[key] for key in keys], table.index, dtype=float)
@@ -126,8 +127,9 @@ def improvement(arrays: Grids, a: Key, b: Key) -> float:
     for scene in arrays.values():
         if a in scene and b in scene:
             first, second = (values[~np.isnan(values).all(axis=1)] for values in (scene[a], scene[b]))
-            ahead = np.sign(first[:, None] - second[None]).mean(axis=(0, 1)) / 2 + 0.5
-            shares += [np.nanmean(ahead)] if np.isfinite(ahead).any() else []
+            ahead = np.sign(first[:, None] - second[None]).mean(axis=(0, 1)) / 2 + 0.5  # [views]
+            if np.isfinite(ahead).any():
+                shares.append(np.nanmean(ahead))
     return float(np.mean(shares)) if shares else np.nan
 
 
@@ -141,7 +143,7 @@ def is_on_frontier(points: pd.DataFrame, cost: str, quality: str = "psnr_db") ->
 def is_dominated(points: pd.DataFrame, cost: str, quality: str = "psnr_db") -> pd.Series:
     """Tell of each point whether another one is no worse in quality and in cost, and better in one of them."""
     q, c = points[quality].to_numpy(), points[cost].to_numpy()
-    as_good = (q[None] >= q[:, None]) & (c[None] <= c[:, None])
+    as_good = (q[None] >= q[:, None]) & (c[None] <= c[:, None])  # [points, others]
     better = (q[None] > q[:, None]) | (c[None] < c[:, None])
     return pd.Series((as_good & better).any(axis=1), points.index)
 
@@ -194,8 +196,8 @@ def factorial(cells: dict[tuple[bool, ...], Key], factors: Sequence[str]) -> lis
     two such gains. Single effects come before interactions.
 
     Args:
-        cells: the model that has a combination of the factors.
-        factors: the names of the factors.
+        cells: the model of each combination of the factors, whether it has each of them.
+        factors: their names.
     """
     sums = []
     for size in range(1, len(factors) + 1):
@@ -208,15 +210,15 @@ def factorial(cells: dict[tuple[bool, ...], Key], factors: Sequence[str]) -> lis
             for title, averaged in asked:
                 weights = {}
                 for others, on in itertools.product(averaged, itertools.product((False, True), repeat=size)):
-                    state = dict(zip((*varied, *held), (*on, *others), strict=True))
-                    cell = tuple(state[i] for i in range(len(factors)))
-                    weights[cell] = (-1.0) ** (size - sum(on)) / len(averaged)
+                    has = dict(zip((*varied, *held), (*on, *others), strict=True))  # by the number of the factor
+                    cell = tuple(has[i] for i in range(len(factors)))
+                    weights[cell] = (-1.0) ** (size - sum(on)) / len(averaged)  # each varied factor that is off: -1
                 if weights.keys() <= cells.keys():
                     sums.append((title, {cells[cell]: weight for cell, weight in weights.items()}))
     return sums
 
 
 def _beside(factors: Sequence[str], held: list[int], state: tuple[bool, ...]) -> str:
-    """Name the other effects that both compared models have, as in ", with time"."""
+    """Name the other effects that both compared models have: ", with time"; " alone" of one effect without others."""
     on = [factors[i] for i, has in zip(held, state, strict=True) if has]
     return f", with {' and '.join(on)}" if on else " alone" if len(held) == len(factors) - 1 else ""

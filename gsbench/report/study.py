@@ -50,7 +50,7 @@ def write(records: Iterable[Record], folder: Path) -> None:
         runs.append(key | {name: cell(value) for name, value in _flat(plain)})
         for view in scores:
             views.append(key | {"view": cell(view["name"])} | {name: _number(view[of]) for name, of in VIEWS.items()})
-        curves += [key | dict(zip(CURVES, map(_number, point), strict=True)) for point in points]
+        curves += [key | dict(zip(CURVES, map(_number, point), strict=True)) for point in points]  # named tuples
     for old, new in zip(records, _records(runs, views, curves, str(folder / RUNS_FILE)), strict=True):
         if new != old:
             raise InputError(f"{folder}: {old.path}: expected a record that tables can hold, got {new}"[:500])
@@ -77,23 +77,26 @@ def read(folder: Path) -> tuple[list[Record], list[str]]:
     curves = _rows(_unpacked(folder / CURVES_FILE), folder / CURVES_FILE)
     records, faults = [], []
     for result in _records(runs, views, curves, str(folder / RUNS_FILE)):
-        records += [result] if isinstance(result, Record) else []
-        faults += [] if isinstance(result, Record) else [printable(result)]
+        if isinstance(result, Record):
+            records.append(result)
+        else:
+            faults.append(printable(result))
     return records, faults
 
 
 def _records(runs: list[Row], views: list[Row], curves: list[Row], where: str) -> Iterator[Record | InputError]:
     """Yield the record of each run, or what is wrong with it."""
-    by_run: dict[str, tuple[list[Any], list[Any]]] = {run.get("run", ""): ([], []) for run in runs}
+    by_run: dict[str, tuple[list[Any], list[Any]]] = {run.get("run", ""): ([], []) for run in runs}  # views, curve
     if len(by_run) < len(runs):
         raise InputError(f"{where}: run: expected another number in each row")
-    for kind, (rows, columns) in enumerate(((views, VIEWS), (curves, CURVES))):
-        for row in rows:
-            if row.get("run") not in by_run:
-                raise InputError(f"{where}: expected the run {row.get('run')!r:.80}, which the other tables name")
-            numbers = [_value(row.get(name, "")) for name in columns]
-            view = {"name": _value(row.get("view", ""))} | dict(zip(VIEWS.values(), numbers, strict=False))
-            by_run[row["run"]][kind].append(numbers if columns is CURVES else view)
+    for row in (*views, *curves):
+        if row.get("run") not in by_run:
+            raise InputError(f"{where}: expected the run {row.get('run')!r:.80}, which the other tables name")
+    for row in views:
+        scores = {field: _value(row.get(name, "")) for name, field in VIEWS.items()}
+        by_run[row["run"]][0].append({"name": _value(row.get("view", ""))} | scores)
+    for row in curves:
+        by_run[row["run"]][1].append([_value(row.get(name, "")) for name in CURVES])
     for run in runs:
         place = f"{where}: run {run['run']}"
         try:
@@ -124,7 +127,7 @@ def _nested(cells: Row, where: str) -> dict[str, Any]:
         column = _BY_NAME.get(name)
         if column and column.unit != 1 and isinstance(value, int | float):
             value = round(value * column.unit)
-        place = column.place if column else _swapped(name, ((column, part) for part, column in PARTS))
+        place = column.place if column else _swapped(name, ((new, old) for old, new in PARTS))
         *parents, key = place.split(".")
         at = plain
         for parent in parents:
@@ -148,7 +151,7 @@ def cell(value: Any) -> str:
     A text that a spreadsheet would compute, or a terminal obey, is in quotes, with its control characters escaped.
     """
     is_clear = isinstance(value, str) and value.isprintable() and not value.startswith(FORMULA)
-    is_clear = is_clear and _value(value) == value
+    is_clear = is_clear and _value(value) == value  # it is read as the same text
     return value if is_clear else json.dumps(value, allow_nan=False)
 
 

@@ -276,7 +276,7 @@ def test_text_from_a_record_cannot_break_a_form(tmp_path):
     of = results(
         make(dataset=nasty, metrics=make().metrics | {"psnr": -1.5000000001}), lost(make(seed=1, dataset=nasty), nasty)
     )
-    shown = output.tables(of)
+    shown = output.shown_sections(of)
     markdown = text.markdown(shown)
     assert "<script" not in markdown
     assert r"a \| b\\nc &lt;script>" in markdown
@@ -293,7 +293,7 @@ def test_text_from_a_record_cannot_break_a_form(tmp_path):
 
 def test_latex_is_balanced_and_every_row_has_every_column():
     """Catches a table that LaTeX refuses: an open brace or environment, a row with a cell too many or too few."""
-    written = text.latex(output.tables(results(*every_row()), latex=True))
+    written = text.latex(output.shown_sections(results(*every_row()), latex=True))
     bare = re.sub(r"\\[{}]", "", "\n".join(line for line in written.splitlines() if not line.startswith("%")))
     assert bare.count("{") == bare.count("}")
     columns = len(re.search(r"tabular}{([lr]+)}", bare)[1])
@@ -311,7 +311,7 @@ def test_the_terminal_form_fits(width):
     runs = [*every_row(), make(seed=3, metrics=metrics, missing={})]
     names = [f"a_model_with_a_name_of_more_than_{n}_letters_____" for n in ("forty", "fifty")]
     runs += [make(name, seed=seed) for name in names for seed in (0, 1)]
-    sections = output.tables(results(*runs))
+    sections = output.shown_sections(results(*runs))
     lines = text.terminal(sections, width).splitlines()
     assert max(map(len, lines)) <= width
     assert any("for lack of width" in line for line in lines)
@@ -327,7 +327,7 @@ def test_each_section_stands_where_its_flags_say(monkeypatch):
     def memory(chapter, _):
         return Section("memory", "Memory", "", chapter.runs[["model", "peak_mb"]])
 
-    keys = lambda **form: [of.key for of in output.tables(results(*every_row()), **form)]  # noqa: E731
+    keys = lambda **form: [of.key for of in output.shown_sections(results(*every_row()), **form)]  # noqa: E731
     before, before_latex = keys(), keys(latex=True)
     assert (before[0], before[-1], before_latex[0]) == ("experiment", "protocol", "experiment")
     monkeypatch.setitem(SECTIONS, "memory", Registered(memory, None, in_terminal=True, in_latex=True))

@@ -84,7 +84,8 @@ def write(figure: Figure, look: Look, stem: Path) -> list[Path]:
     for scene in scenes:
         plain = json.dumps(spec(figure, look, scene=scene, width=WIDTH, legend=True))
         light = re.sub(r"var\(--([\w-]+)\)", lambda match: THEMES[match[1]][0], plain)
-        path = stem.with_name("-".join(re.findall("[a-z0-9]+", f"{stem.name} {scene}".lower()))[:LONGEST_NAME])
+        name = "-".join(re.findall("[a-z0-9]+", f"{stem.name} {scene}".lower()))
+        path = stem.with_name(name[:LONGEST_NAME])
         write_atomically(path.with_suffix(".svg"), vl_convert.vegalite_to_svg(light).encode())
         write_atomically(path.with_suffix(".pdf"), vl_convert.vegalite_to_pdf(light))
         paths += [path.with_suffix(".pdf"), path.with_suffix(".svg")]

@@ -131,7 +131,7 @@ def article(key: str, chapter: Results, sections: Sequence[Section] | None = Non
     """Return an article about one experiment, with all its sections or with some; its key begins the ids of these."""
     runs = chapter.runs
     counts = {"run": len(runs)} | {name: runs[name].nunique() for name in ("model", "scene", "seed")}
-    words = [f"{n:,} {what}{'s' * (n != 1)}" for what, n in counts.items()]
+    words = [f"{n:,} {what}{'' if n == 1 else 's'}" for what, n in counts.items()]
     summary = " · ".join([*words, printable(runs.timed_on.iloc[0])[:100]])
     mean = runs.groupby("model").psnr_db.mean()
     best = "" if mean.isna().all() else str(mean.idxmax())
@@ -197,7 +197,7 @@ def library() -> str:
     import vl_convert  # takes a moment
 
     script: str = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")
-    return script.replace("</script", "<\\/script")
+    return script.replace("</script", "<\\/script")  # in a text, which would end the element of the page
 
 
 def _asset(name: str) -> str:

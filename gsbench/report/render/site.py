@@ -45,8 +45,8 @@ def _tables(results: Results) -> list[page.Article]:
     articles = []
     for chapter in results.chapters():
         key, of = _key(chapter), table(chapter, [])
-        models = of.table.model.str.partition(" ")[0]
-        is_pair = of.table.scene.isin(set(chapter.runs.scene))
+        models = of.table.model.str.partition(" ")[0]  # without variant
+        is_pair = of.table.scene.isin(set(chapter.runs.scene))  # not an average
         addresses = [
             quote(_file(key, scene, model).as_posix()) if has_page else ""
             for scene, model, has_page in zip(of.table.scene, models, is_pair, strict=True)
@@ -62,8 +62,8 @@ def _of_chapter(results: Results, chapter: Results) -> Iterator[tuple[Path, str]
     key, title = _key(chapter), title_of(chapter.runs)
     whole = page.article("all", chapter)
     links = [("All tables", f"../{INDEX}")]
-    name = chapter.runs.record.iloc[0].experiment
-    yield Path(key, INDEX), page.rendered(name, [whole], links=links, scripts_at=f"../{SCRIPTS}")
+    experiment = chapter.runs.record.iloc[0].experiment
+    yield Path(key, INDEX), page.rendered(experiment, [whole], links=links, scripts_at=f"../{SCRIPTS}")
     for (scene, model), runs in chapter.runs.groupby(["scene", "model"]):
         (pair,) = results.of(results.runs.index.isin(runs.index)).chapters()
         shown = [table(pair, []), _views(pair), *(SECTIONS[name].build(pair, pd.DataFrame()) for name in OF_PAIR)]

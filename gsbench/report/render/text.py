@@ -41,7 +41,7 @@ def _terminal(section: Section, width: int) -> Iterator[str]:
     table = section.shown(lambda text, rank: f"{text}*" if rank == 1 else text).map(_narrow)
     has_scenes = "scene" in table.columns[:1]
     scenes = list(dict.fromkeys(table.scene)) if has_scenes else [""]
-    names = list(table)[has_scenes:]
+    names = list(table)[1:] if has_scenes else list(table)
     widths = {name: max(map(len, [name, *table[name]])) for name in names}
     fitting = [n for n in range(1, len(names) + 1) if sum(widths[name] + 2 for name in names[:n]) <= width]
     shown = names[: max(fitting, default=1)]
@@ -55,7 +55,8 @@ def _terminal(section: Section, width: int) -> Iterator[str]:
     yield from (*_wrapped(section.title, width), "", line(shown))
     for scene in scenes:
         rows = table[table.scene == scene] if has_scenes else table
-        yield from [scene[:width]] if scene else []
+        if scene:
+            yield scene[:width]
         yield from map(line, rows[shown].to_numpy().tolist())
     words = [section.text, *(f"- {note}" for note in section.notes)]
     words += [f"- for lack of width: {', '.join(names[len(shown) :])}"] if len(shown) < len(names) else []
@@ -163,7 +164,7 @@ def csv(of: pd.DataFrame) -> str:
 
 
 def _safe(value: Any) -> Any:
-    if value is None or isinstance(value, bool | int | float) or hasattr(value, "item"):
+    if value is None or isinstance(value, bool | int | float) or hasattr(value, "item"):  # item: a number of numpy
         return value
     line = printable(value)
     return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line

@@ -42,15 +42,15 @@ def tested(chapter: Results) -> pd.DataFrame:
     """
     rows = [(key, *row) for key, section in SECTIONS.items() if section.asks for row in section.asks(chapter)]
     asked = pd.DataFrame(rows, columns=["section", "quantity", "name", "weights"])
-    tests = [asked.iloc[:0].join(stats.differences({}, []))]  # without rows, for an experiment without differences
+    tests = []
     for quantity, group in asked.groupby("quantity", sort=False):
         group = group.reset_index(drop=True)
         tests.append(group.join(stats.differences(stats.grids(chapter, str(quantity)), list(group.weights))))
-    return pd.concat(tests[1:] or tests, ignore_index=True)
+    return pd.concat(tests or [asked.join(stats.differences({}, []))], ignore_index=True)  # if none: columns alone
 
 
 def built(chapter: Results, chosen: Callable[[Registered], bool] = lambda _: True) -> list[Section]:
-    """Make the chosen sections of one experiment, in their order."""
+    """Make the chosen sections of one experiment in ORDER; those that it lacks come before its last two."""
     keys = [key for key, of in SECTIONS.items() if chosen(of)]
     ordered = sorted(keys, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER) - 2.5)
     tests = tested(chapter) if any(SECTIONS[key].asks for key in keys) else pd.DataFrame(columns=["section"])

@@ -32,7 +32,7 @@ def basis(chapter: Results) -> list[str]:
     """Return the scenes of averages: those that all models finished with the main settings, else the one of most."""
     ok = chapter.finished.runs
     counts = ok.drop_duplicates(["scene", "model", "variant"]).scene.value_counts().sort_index()
-    return covered(ok[ok.main], "model") or ([counts.idxmax()] if len(counts) else [])
+    return covered(ok[ok.main], "model") or ([counts.idxmax()] if len(counts) else [])  # of most configurations
 
 
 def contests(chapter: Results) -> dict[str, pd.DataFrame]:
@@ -58,7 +58,7 @@ def asked(chapter: Results) -> Asked:
 
 @section(asked)
 def budgets(chapter: Results, tests: pd.DataFrame) -> Section:
-    """Make the table of the best model within each budget."""
+    """Make the table of the best model within each budget; a budget without a model has an empty row."""
     counts = (
         pd.DataFrame(
             {

@@ -115,8 +115,8 @@ def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
         return pd.DataFrame()
     fastest = solved.min(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = solved.div(fastest, axis=0).mask(solved.eq(fastest, axis=0), 1.0)
-    end = max(2.0, 1.15 * ratios.where(np.isfinite(ratios)).max(axis=None))
+        ratios = solved.div(fastest, axis=0).mask(solved.eq(fastest, axis=0), 1.0)  # also where both are 0 s
+    end = max(2.0, 1.15 * ratios.where(np.isfinite(ratios)).max(axis=None))  # of the axis of factors
     rows = []
     for name, column in ratios.items():
         factors = [1.0, *sorted(column[np.isfinite(column)]), end]
@@ -176,7 +176,7 @@ def _steps(record: Record) -> list[tuple[int, str]]:
     if record.length_choice:
         train = replace(train, iterations=record.length_choice.kept)
     agr = record.effects is not None and record.effects.refinement
-    schedule = Schedule(train, sh_degree=0, agr=agr)
+    schedule = Schedule(train, sh_degree=0, agr=agr)  # its steps do not depend on the degree
     steps = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
     if agr:
         steps.append((schedule.scaled(train.refine_from), "A"))

@@ -43,7 +43,7 @@ def models(chapter: Results) -> tuple[dict[tuple[bool, ...], stats.Key], dict[tu
     first = first.sort_values("model", key=lambda names: names.map(rank).fillna(len(rank)), kind="stable")
     keys = list(zip(first.model, first.variant, strict=True))
     has = [tuple(map(bool, row)) for row in first[HAS].to_numpy()]
-    cells = dict(reversed(list(zip(has, keys, strict=True))))
+    cells = dict(reversed(list(zip(has, keys, strict=True))))  # reversed: of several models, the first remains
     return cells, cells | {cell: key for cell, key in zip(has, keys, strict=True) if key[0] in NESTED}
 
 
@@ -97,12 +97,12 @@ def _absent(chapter: Results) -> list[str]:
     others = sorted(set(runs.model[runs.main]) - {model for model, _ in (*cells.values(), *nested.values())})
     notes = [f"{8 - len(cells)} of 8 combinations of effects were not run."] if len(cells) < 8 else []
     reason = "Left out, as another model has these effects or each Gaussian keeps what it needs"
-    return notes + [f"{reason}: {', '.join(others)}."] * bool(others)
+    return [*notes, f"{reason}: {', '.join(others)}."] if others else notes
 
 
 def _words(weights: stats.Weights) -> str:
     """Write a weighted sum of models, such as "7dgs − 7dgs_noagr"."""
     terms = sorted(weights.items(), key=lambda term: (-term[1], term[0][0]))
     words = " ".join(f"{'+' if weight > 0 else '−'} {model}" for (model, _), weight in terms).removeprefix("+ ")
-    share = abs(terms[0][1])
+    share = abs(terms[0][1])  # of all terms
     return words if share == 1 else f"{share:g} ({words})"

@@ -63,17 +63,17 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
     """
     runs, ok = (_by_row(of) for of in (chapter.runs, chapter.finished.runs))
     origin = [name for name in ORIGIN if "contributor" in runs]
-    is_all = set(asked) in (set(), set(WITH_TRAIN))
+    is_all = set(asked) in (set(), set(WITH_TRAIN))  # no --select column=..
     names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
     by_scene = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
     failed = runs[runs.status != "ok"]
     labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
     by_scene.append(pd.DataFrame({"scene": failed.scene, "label": labels}))
-    whole = ok[ok.groupby("row").scene.transform("nunique") == runs.scene.nunique()] if origin else ok
-    scenes = covered(whole if origin else runs)
+    averaged = ok[ok.groupby("row").scene.transform("nunique") == runs.scene.nunique()] if origin else ok
+    scenes = covered(averaged if origin else runs)
     if runs.scene.nunique() > 1 and scenes:
         where = f"average over {len(scenes)} of {runs.scene.nunique()} scenes"
-        by_scene.append(_means(whole[whole.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
+        by_scene.append(_means(averaged[averaged.scene.isin(scenes)], names).drop(columns="seeds").assign(scene=where))
     rows = pd.concat(by_scene, ignore_index=True)
     if not origin:
         rows = pd.concat([rows, *_paper_rows(rows, runs, scenes)]).sort_index(kind="stable")
@@ -86,7 +86,7 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
 
 
 def _by_row(runs: pd.DataFrame) -> pd.DataFrame:
-    """Add what names a row of the table: the label; in a merged set also the origin, whose times then count."""
+    """Add what names a row: the label; in a merged set also the origin, and times that `Results.chapters` removed."""
     if "contributor" not in runs:
         return runs.assign(row=runs.label)
     times = pd.DataFrame([row(record) for record in runs.record], runs.index, TIMES, dtype=float)

@@ -145,7 +145,7 @@ def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quali
     names = [printable(view.name)[:60] for view in _spaced(record, shared)]
     shown = []
     for i in range(min(shared, most)):
-        render, error = (
+        render, error = (  # columns 0 and 2 of a Strip
             {model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()} for kind in (0, 2)
         )
         scores = {model: _score(record_of_model, len(rows), i) for model, (record_of_model, rows) in models.items()}

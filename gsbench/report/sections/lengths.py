@@ -15,7 +15,7 @@ def lengths(chapter: Results, tests: pd.DataFrame) -> Section | None:
     runs = chapter.finished.runs
     runs = runs[(runs.variant.map(lambda variant: without(variant, "iterations")) == "") & runs.iterations.notna()]
     table = by_length(runs)
-    if len(table.columns) < FEWEST + 2 or table.empty:
+    if len(table.columns) < FEWEST + 2 or table.empty:  # 2: "kept" and "tried"
         return None
     text = (
         "Each length is a training of its own. “kept”: the lengths are tried from the shortest until PSNR on val no "
@@ -41,5 +41,5 @@ def by_length(runs: pd.DataFrame) -> pd.DataFrame:
     # How many times PSNR on val rises from one length to the next, from the shortest on: the place of the kept length.
     rises = (val.diff(axis=1).iloc[:, 1:] > 0).cumprod(axis=1).sum(axis=1).astype(int)
     chosen_psnr = [psnr.iloc[i, rise] for i, rise in enumerate(rises)]
-    tried = [sum(psnr.columns[: rise + 2]) for rise in rises]
+    tried = [sum(psnr.columns[: rise + 2]) for rise in rises]  # with the length after the kept one
     return psnr.rename(columns="{:,.0f}".format).rename_axis(columns=None).assign(kept=chosen_psnr, tried=tried)

@@ -78,15 +78,15 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
     """
     rows = [_numbers(run.record, is_timed=run.machine == run.timed_on) for run in runs.itertuples()]
     names = [*SHOWN, "evaluated", "checked"]
-    numbers = pd.DataFrame(rows, runs.index).reindex(columns=["ends", *TEXTS, *names])
+    numbers = pd.DataFrame(rows, runs.index).reindex(columns=["gated_at_end", *TEXTS, *names])
     numbers = numbers.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))
     numbers[["free", "asleep"]] *= 100
-    numbers[LOSSES] *= -1
+    numbers[LOSSES] *= -1  # as changes
     numbers["ms"] -= numbers.ms_before
     key = [runs[name] for name in ("scene", "model", "variant")]
-    is_evaluated = (numbers.evaluated.notna() | ~numbers.ends).groupby(key).transform("all")
+    is_evaluated = (numbers.evaluated.notna() | ~numbers.gated_at_end).groupby(key).transform("all")
     numbers["dB"] = numbers.evaluated.where(is_evaluated, numbers.checked)
-    numbers["measured on"] = numbers.split.where(is_evaluated, numbers.checked_on).where(numbers.ends)
+    numbers["measured on"] = numbers.split.where(is_evaluated, numbers.checked_on).where(numbers.gated_at_end)
     groups = numbers.groupby(key)
     table = pd.DataFrame(
         {
@@ -113,18 +113,18 @@ def _numbers(r: Record, *, is_timed: bool) -> dict[str, Any]:
     """Return numbers and texts of a run as its record has them; times of another machine are left out."""
     assert r.on_demand is not None
     gates, screen = r.on_demand.gates, r.on_demand.screen
-    row: dict[str, Any] = {"ends": bool(gates) and gates[-1].step is None}
+    row: dict[str, Any] = {"gated_at_end": bool(gates) and gates[-1].step is None}
     if screen:
         row |= {"decision": screen.decision, "why": screen.reason, "p": screen.p, "free": screen.free}
         row |= {"screen_s": screen.seconds} if is_timed else {}
     if gates:
         last = gates[-1]
-        row |= {name: max(0, last.rows.get(name, 0)) for name in SETS}
+        row |= {name: max(0, last.rows.get(name, 0)) for name in SETS}  # a record may have any numbers
         row |= {REMOVED: sum(max(0, gate.rows.get(REMOVED, 0)) for gate in gates)}
         row |= {"before": sum(row[name] for name in (*SETS, REMOVED))}
         row |= {name: _of_degree(last, name) for name in DEGREES}
         row |= {"mb_before": gates[0].bytes_before / 1e6, "mb": last.bytes / 1e6}
-    if row["ends"]:
+    if row["gated_at_end"]:
         row |= {"evaluated": last.eval_loss_db, "checked": last.measured_db, "predicted": last.predicted_db}
         row |= {"asleep": last.asleep or 0.0, "split": r.protocol.get("eval_split"), "checked_on": last.checked_on}
         if is_timed and last.frame_ms is not None:

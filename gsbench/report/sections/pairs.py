@@ -28,7 +28,7 @@ def pairs(chapter: Results, tests: pd.DataFrame) -> Section | None:
     main, arrays = set(chapter.runs.variant[chapter.runs.main]), stats.grids(chapter)
     rows = []
     for test in tests.to_dict("records"):
-        better, other = test["weights"] if test["mean"] >= 0 else reversed(test["weights"])
+        better, other = test["weights"] if test["mean"] >= 0 else reversed(test["weights"])  # its keys, two models
         low, high = sorted((test["low"], test["high"])) if test["mean"] >= 0 else sorted((-test["low"], -test["high"]))
         name = " − ".join(f"{m}" if v in main else f"{m} ({v or 'default'})" for m, v in (better, other))
         ahead = 100 * stats.improvement(arrays, better, other)

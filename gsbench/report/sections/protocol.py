@@ -68,7 +68,7 @@ def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> It
     """Yield a row for each value of a setting, with its scenes and its number of runs, and whether it is a warning."""
     silent = SILENT.get(setting, "none" if runs[column].isna().all() else "not recorded")
     values = runs[column].map(lambda value: silent if value is None or value != value else _short(setting, value))
-    compared = runs.variant.map(lambda variant: without(variant, setting) == variant)
+    compared = runs.variant.map(lambda variant: without(variant, setting) == variant)  # unless it names the setting
     if setting not in SILENT:
         is_trained = runs[column].notna() | ~runs.rendered_elsewhere
         values, compared = values.where(is_trained, ELSEWHERE), compared & is_trained
@@ -80,12 +80,14 @@ def _setting(runs: pd.DataFrame, setting: str, column: str, *, warn: bool) -> It
 
 
 def _short(setting: str, value: object) -> str:
-    """Return a value as text: a number of iterations without decimals, and the first digits of a hash."""
+    """Return a value as text: iterations without decimals, the first digits of a hash, and "-dirty" of a commit."""
     text = printable(f"{value:g}" if isinstance(value, float) and value < 1e15 else value)
     if setting == "iterations":
         text = number(float(text), 0)
-    digits, *dirty = text.partition("-") if setting == "commit" else (text, "")
-    return digits[:12] + "".join(dirty) if setting in ("commit", "data") and " " not in text else text
+    if setting not in ("commit", "data") or " " in text:  # words such as "not recorded"
+        return text
+    digits, dash, dirty = text.partition("-") if setting == "commit" else (text, "", "")
+    return f"{digits[:12]}{dash}{dirty}"
 
 
 def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
