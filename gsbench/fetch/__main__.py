@@ -38,15 +38,15 @@ def main(arguments: list[str] | None = None) -> int:
         ]
         print(as_json(listed))
         return 0
-    failed = 0
+    status = 0
     for name in list(known) if options.list else options.names:
         try:
             source = find(name, known)
             print(line_of(source) if options.list else plan_of(source) if options.dry_run else fetch(source))
         except (InputError, OSError) as error:
             print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
-            failed = 2
-    return failed
+            status = 2
+    return status
 
 
 def folder_of(path: Path) -> Path:

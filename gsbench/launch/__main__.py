@@ -89,10 +89,10 @@ def lines(experiment: Experiment, runs: Sequence[RunStatus]) -> list[str]:
         text.append(time_left)
     common = set.intersection(*(set(run.overrides) for run in runs)) if len(runs) > 1 else set()
     named = [(run, " ".join(word for word in run.overrides if word not in common)) for run in runs]
-    width = max((len(name) for run, name in named if run.state != "done"), default=0)
-    wide = max([8, *(len(run.state) for run in runs)])
-    for state in STATES[1:]:
-        text += [f"  {state:{wide}} {name:{width}}  {_details(run)}" for run, name in named if run.state == state]
+    name_width = max((len(name) for run, name in named if run.state != "done"), default=0)
+    width = max([8, *(len(run.state) for run in runs)])
+    for state in STATES[1:]:  # not of runs that are done
+        text += [f"  {state:{width}} {name:{name_width}}  {_details(run)}" for run, name in named if run.state == state]
     return list(map(printable, text))
 
 

@@ -112,7 +112,8 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
     """
     for word in command.overrides:
         check_override(word)
-        _check_group(*word.lstrip("+").partition("=")[::2])
+        name, _, choices = word.lstrip("+").partition("=")
+        _check_group(name, choices)
     parser = OverridesParser.create(GlobalHydra.instance().config_loader())
     pairs = list(map(_values, parser.parse_overrides(command.overrides)))
     values = dict(pairs)
@@ -122,23 +123,23 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
     _check_once([name for name, _ in pairs])
     if "protocol.name" in keys:
         raise InputError("protocol.name: expected protocol=NAME, which sets what is measured too, not its name alone")
-    all_scenes = keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys
+    all_scenes = keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys  # all is the default
     base = _compose([words[0] for name, words in values.items() if name != "scene"])
     _check_launcher(list(keys), base.launch)
     axes = [f"{name}={text}" for name, text in (base.hydra.sweeper.params or {}).items()]
     if not (command.multirun or all_scenes or axes or base.launch.by != "local"):
         _check_single(values)
         return [command.overrides], False
-    axes_first = dict(map(_values, parser.parse_overrides(axes))) | values
+    words_by_key = dict(map(_values, parser.parse_overrides(axes))) | values
     if all_scenes:
         if not base.data.scenes:
             raise InputError(
                 "data.scenes: expected the names of scenes, got an empty list: set them, or "
                 "scene=custom scene.name=FOLDER"
             )
-        axes_first.pop("scene", None)
-        axes_first["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
-    return [list(run) for run in itertools.product(*axes_first.values())], True
+        words_by_key.pop("scene", None)  # to be the last
+        words_by_key["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
+    return [list(run) for run in itertools.product(*words_by_key.values())], True
 
 
 def _check_once(names: Sequence[str]) -> None:
@@ -152,8 +153,8 @@ def _check_launcher(keys: Sequence[str], launch: DictConfig) -> None:
     """Raise InputError if a key belongs to a launcher that was not chosen, and so would do nothing."""
     for name in keys:
         readers = ["parallel", "slurm"] if name == "launch.at_once" else ["slurm"]
-        does_nothing = launch.by not in readers and (name, launch.at_once) != ("launch.at_once", 1)
-        if name.startswith("launch.") and name != "launch.by" and does_nothing:
+        is_default = name == "launch.at_once" and launch.at_once == 1  # as without a launcher
+        if name.startswith("launch.") and name != "launch.by" and launch.by not in readers and not is_default:
             choices = " or ".join(f"+launch={reader}" for reader in readers)
             raise InputError(f"{name}: expected {choices}, which reads it: add it, or leave {name} out")
 
@@ -215,7 +216,7 @@ def _check_distinct(runs: Sequence[RunConfig]) -> None:
 
 
 def _with_paths(config: DictConfig) -> DictConfig:
-    """Return a config of a Slurm job with a text for each path that names a variable of its node, such as TMPDIR."""
+    """Return a config with texts for paths that only the node of a Slurm job can resolve, as they name its TMPDIR."""
     config = copy.deepcopy(config)
     for key in PATHS if config.launch.by == "slurm" else ():
         try:
@@ -305,8 +306,9 @@ def _check_group(name: str, choices: str) -> None:
 
 
 def _register_scene(overrides: Sequence[str]) -> None:
-    """Make the scene of a run a choice of the config group `scene`, if it is one of `data.scenes` without a file."""
-    (*_, scene) = ["all", *(word.partition("=")[2].strip("'\"") for word in overrides if word.startswith("scene="))]
+    """Let Hydra accept a scene of `data.scenes`: it takes only choices that have a file or a stored node."""
+    scenes = [word.partition("=")[2].strip("'\"") for word in overrides if word.startswith("scene=")]
+    scene = scenes[-1] if scenes else "all"  # as Hydra chooses: the last one, or the default, conf/scene/all.yaml
     folders = [CONF, *([UserConfigs.folder] if UserConfigs.folder else [])]
     if any((folder / "scene" / f"{scene}.yaml").exists() for folder in folders):
         return

@@ -77,8 +77,8 @@ def _done(config: RunConfig, began: float, results: Path) -> Ended:
     except UnrecordedError as error:
         return Ended(reason=str(error))
     problem = None if record is None or record.status == "ok" else f"{record.status}: {record.reason}"
-    if not path.exists():  # another process does the run
-        return Ended(reason=problem or "it ended without a record" if record else None)
+    if not path.exists():  # without `record`: another process does the run
+        return Ended(reason=problem or "it ended without a record") if record else Ended()
     seconds = time.time() - began if path.stat().st_mtime >= began else None  # an older record was kept
     return Ended(os.path.relpath(path, results), problem, seconds=seconds)
 

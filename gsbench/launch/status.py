@@ -151,7 +151,7 @@ def _judge(experiment: Experiment, run: Identity) -> RunStatus:
         in_queue = experiment.queue.states[planned.job]
         waits = in_queue.partition(" ")[2] if in_queue.startswith("PENDING") else None
         return replace(state, state="running" if waits is None else "queued", reason=waits or "starts", job=planned.job)
-    last = max(record.written if record else 0, *(file.updated for file in (report, stopped) if file), 0)
+    last = max([record.written if record else 0.0, *(file.updated for file in (report, stopped) if file)])
     is_new = planned is not None and planned.ended is None and planned.plan.started > last
     if planned and is_new and _can_start(planned, experiment.queue):
         return replace(state, state="planned", job=planned.job)
@@ -239,7 +239,7 @@ def cause_in(log: Path) -> str:
     errors = [match[0] for line in telling if (match := ERROR.search(line))]
     causes = [line for line in errors if CAUSE.search(line)]
     if not errors and len(telling) < len(lines):
-        lines = [*telling[:1], *lines][:1]
+        lines = (telling or lines)[:1]
     return (causes or errors or lines or ["(empty)"])[-1][:200]
 
 

@@ -89,7 +89,7 @@ def retry(experiment: Experiment, more: Sequence[str]) -> int:
         if not launches(override):
             raise InputError(f"retry: expected overrides of launch, such as launch.memory=16G, got '{override}'")
     with hydra_with(None):
-        compose_run(["+exp=mini", "scene=suzanne", *more])
+        compose_run(["+exp=mini", "scene=suzanne", *more])  # any run, to check `more`
     states = {identity(run.overrides): run.state for run in status(experiment)}
     groups: dict[tuple[str | None, ...], list[PlannedRun]] = defaultdict(list)
     for key, run in experiment.planned.items():

@@ -120,7 +120,7 @@ def _folders(root: Path) -> Iterator[tuple[str, Path]]:
     """Yield the version and the folder of each control group that can limit this process: its own and those above."""
     groups = {}  # the path of this process' group, by the version of control groups
     for line in _lines(root / "proc/self/cgroup"):
-        number, controllers, path = (*line.split(":", 2), "", "")[:3]
+        number, controllers, path = (*line.split(":", 2), "", "")[:3]  # also of a damaged line
         if number == "0" and not controllers:
             groups["cgroup2"] = path
         elif "memory" in controllers.split(","):
@@ -131,8 +131,8 @@ def _folders(root: Path) -> Iterator[tuple[str, Path]]:
         fields = [re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), x) for x in mount.split(" ")]
         if kind not in groups or len(fields) < 5 or (kind == "cgroup" and "memory" not in re.split("[ ,]", options)):
             continue
-        top = root / fields[4].lstrip("/")
-        group = PurePosixPath(groups[kind])
+        top = root / fields[4].lstrip("/")  # the mount point
+        group = PurePosixPath(groups[kind])  # fields[3]: the group that is mounted there
         inside = group.relative_to(fields[3]) if group.is_relative_to(fields[3]) else PurePosixPath()
         for folder in (inside, *inside.parents):
             yield kind, top / folder

@@ -64,7 +64,7 @@ def sleep_when_idle() -> None:
 def _crowd(runtime: ctypes.CDLL, started: threading.Event) -> None:
     """Start more OpenMP threads than there are processors; this thread never ends, because they would end with it."""
     nothing = ctypes.CDLL(None).sched_yield  # each thread calls this once; it has no arguments
-    runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)
+    runtime.GOMP_parallel(nothing, None, runtime.omp_get_num_procs() + 1, 0)  # function, its data, threads, flags
     started.set()
     threading.Event().wait()
 

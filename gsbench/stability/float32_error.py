@@ -146,6 +146,7 @@ def compare(shot: Shot, image: Tensor, exact: ExactImage) -> ViewExactness:
     psnr = capped_psnr(image, shot.photograph)
     away = (exact.image.clamp(0, 1) - shot.photograph.double()).abs()
     bound = exact.bound[..., None]
+    # The squared error of a channel, away^2, changes by at most 2 away bound + bound^2. A fall changes PSNR most.
     share = float((2 * away * bound + bound.square()).mean() / away.square().mean().clamp(min=1e-300))
     most = -10 * math.log10(1 - share) if share < 1 else math.inf
     return replace(plain, psnr=psnr, psnr_change=psnr - capped_psnr(exact.image, shot.photograph), psnr_bound=most)
@@ -166,7 +167,7 @@ def psnr_float32(
     try:
         double = float64_model(model)
         changes = []
-        for shot in map(Shot.of, evenly(views, VIEWS)):
+        for shot in map(Shot.of, evenly(views, VIEWS)):  # with photographs, so `psnr_change` is a number
             both = render_twice(model, double, shot.camera, shot.time, background, antialias)
             changes.append(abs(compare(shot, both.image, both.exact).psnr_change or 0.0))
     except Exception as error:  # a user's model may compute in float32 alone, and fail in any way

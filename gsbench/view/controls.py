@@ -153,17 +153,17 @@ class Controls:
         second = watch(
             gui.add_dropdown("second model", names, initial_value=names[1 if several else 0], visible=several)
         )
-        others = watch(
+        second_colours = watch(
             gui.add_dropdown("second colours", COLOURS, initial_value=IMAGE if several else CLASS, visible=several)
         )
         self.wipe = watch(gui.add_slider("wipe at", 0.0, 1.0, 0.01, 0.5, visible=False))
         self.background = watch(gui.add_rgb("background", self._trained_background, hint="of the colours 'image'"))
         self.legend = gui.add_html("")
-        self._choices = (first, colours), (second, others)
+        self._choices = (first, colours), (second, second_colours)
 
         def show_choices() -> None:
             second.visible = several and self.mode.value != ONE
-            others.visible, self.wipe.visible = self.mode.value != ONE, self.mode.value == WIPE
+            second_colours.visible, self.wipe.visible = self.mode.value != ONE, self.mode.value == WIPE
 
         watch(self.mode, show_choices)
 

@@ -110,7 +110,7 @@ class StageWatch(Tape):
         return outputs
 
     def end(self, part: str) -> None:
-        """End SLICE or RASTER: the time since its last stage belongs to that stage; without stages it is one."""
+        """End SLICE or RASTER; the time since its last kernel belongs to its last stage, or to it if there is none."""
         last = STAGES[part][-1]
         self._laps.end(last if self._laps.has(last) else part)
 

@@ -32,10 +32,10 @@ def short_names(runs: Sequence[LoadedRun]) -> list[str]:
     """
     names = [[label_of(run.config)] for run in runs]
     for folders in zip_longest(*(_folders_by_weight(run.folder) for run in runs), fillvalue=""):
-        words = [part.split(",") for part in folders]
-        shared = set.intersection(*map(set, words))
-        for name, its in zip(names, words, strict=True):
-            name += [word for word in its if word and word not in (*shared, name[0])]
+        words_of_runs = [folder.split(",") for folder in folders]
+        shared = set.intersection(*map(set, words_of_runs))
+        for name, words in zip(names, words_of_runs, strict=True):
+            name += [word for word in words if word and word not in (*shared, name[0])]  # name[0]: the model
         if len(set(map(tuple, names))) == len(runs):
             return list(map(" ".join, names))
     return [str(run.folder) for run in runs]
@@ -43,7 +43,7 @@ def short_names(runs: Sequence[LoadedRun]) -> list[str]:
 
 def _folders_by_weight(folder: Path) -> list[str]:
     """Return the names in EXPERIMENT/SCENE/MODEL,VARIANT/seedK, those first that a user knows runs by."""
-    *outer, model, seed = ("", *Path(os.path.abspath(folder)).parts)
+    *outer, model, seed = ("", *Path(os.path.abspath(folder)).parts)  # "": the path may be "/" alone
     return [model, seed, *reversed(outer)]
 
 

@@ -43,7 +43,7 @@ def nearest_view(scene: Scene, camera: Camera, time: float | None) -> Nearest:
     distances = (torch.stack([other.center for other in placed]) - camera.center).norm(dim=-1)
     forwards = torch.stack([other.viewmat[2, :3] for other in placed])
     angles = torch.arccos((forwards @ camera.viewmat[2, :3]).clamp(-1, 1))
-    far = distances / max(scene.extent, 1e-12) + angles
+    far = distances / max(scene.extent, 1e-12) + angles  # in extents plus radians
     away = (torch.tensor([view.time or 0.0 for view in scene.train]) - (time or 0.0)).abs()
     best = int(torch.where(far <= far.min() + SAME, away, math.inf).argmin())
     return Nearest(scene.train[best], float(distances[best]) * scene.placement.unit, math.degrees(angles[best]))
