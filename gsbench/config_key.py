@@ -162,6 +162,6 @@ def extended(group: str) -> Callable[[type[_T]], type[_T]]:
     def extend(kind: type[_T]) -> type[_T]:
         joining = sorted(_joining.get(group, []), key=lambda joined: joined.__module__, reverse=True)
         names = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__doc__": kind.__doc__}
-        return dataclass(type(kind.__name__, (*joining, kind), names))
+        return dataclass(type(kind.__name__, (*joining, kind), names))  # the fields of the last base come first
 
     return extend

@@ -106,7 +106,7 @@ def _decided(keys: Plain) -> Plain:
 
 
 def _differences(before: Plain, after: Plain) -> list[str]:
-    # Hashes are compared, not values: 1, 1.0 and True are equal to Python, but they are other settings.
+    # Hashes are compared, not values: 1, 1.0 and True are equal to Python, but they are other settings. []: not set.
     before, after = _decided(before), _decided(after)
     return [
         f"{key} {_shown(after, key)} instead of {_shown(before, key)}"

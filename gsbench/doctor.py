@@ -68,7 +68,7 @@ def _looked(look: Callable[[], Iterator[Check]]) -> list[Check]:
 
 def _gsbench() -> Iterator[Check]:
     commit = git_commit()
-    whence = f"commit {commit[:12]}{commit[40:]}" if commit else "from a wheel"
+    whence = f"commit {commit[:12]}{commit[40:]}" if commit else "from a wheel"  # 40 digits, perhaps with "-dirty"
     yield Check("gsbench", OK, f"{__version__}, {whence}, in {Path(__file__).parent}")
     yield Check("python", OK, f"{platform.python_version()}, {sys.prefix}")
 

@@ -112,7 +112,7 @@ def prepare(options: argparse.Namespace) -> Export:
             f"{options.fps} x {options.seconds}"
         )
     sides = [options.supersample * side for side in (1, options.width, options.height) if side is not None]
-    if not all(0 < side <= MOST_SIDE for side in (options.supersample, *sides)):
+    if not all(0 < side <= MOST_SIDE for side in sides):
         raise InputError(
             f"--width, --height, --supersample: expected at least 1 and at most {MOST_SIDE} rendered "
             f"pixels a side, got {options.width}, {options.height}, {options.supersample}"
@@ -294,7 +294,7 @@ def sized(camera: Camera, width: int | None, height: int | None, least: int | No
     elif height is not None:
         scale = height / camera.height
     else:
-        scale = max(1.0, (least or 0) / min(camera.width, camera.height))
+        scale = max(1.0, (least or 0) / min(camera.width, camera.height))  # `least` is no None here
     even = [2 * max(1, round(scale * side / 2)) for side in (camera.width, camera.height)]
     return video.resized(camera, width or even[0], height or even[1])
 

@@ -209,7 +209,7 @@ def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, f
             values.append(of_other_papers(image, truth))
         if view.name in is_filmed:
             frames[view.name] = grey_of(image), grey_of(truth)
-    names = [name for name in (values or [{}])[0] if all(name in of_view for of_view in values)]
+    names = [name for name in values[0] if all(name in of_view for of_view in values)] if values else []
     means = {name: fmean(of_view[name] for of_view in values) for name in names}
     flows = [tof(*zip(*(frames[name] for name in film), strict=True)) for film in films]
     known = [flow for flow in flows if flow is not None]
@@ -251,7 +251,7 @@ def multiscale_ssim(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:  #
     for scale, weight in enumerate(MS_SSIM_WEIGHTS):
         if scale:
             a, b = _halved(a), _halved(b)
-        mean_a, mean_b, aa, bb, ab = map(_windowed, (a, b, a * a, b * b, a * b))
+        mean_a, mean_b, aa, bb, ab = map(_windowed, (a, b, a * a, b * b, a * b))  # aa: the mean of squares
         similarity = (2 * (ab - mean_a * mean_b) + C2) / (aa - mean_a**2 + bb - mean_b**2 + C2)
         if scale == len(MS_SSIM_WEIGHTS) - 1:
             similarity *= (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)

@@ -29,7 +29,7 @@ NETWORKS = {  # the variant of its runs, and the end of the label of each model
 
 
 def draw_frontier() -> None:
-    """Draw PSNR on test against seconds of training, means over scenes, without the threshold of densification."""
+    """Draw PSNR on test against seconds of training, means over scenes, of the runs that differ only in length."""
     section = frontier(only(PUBLISHED, "frontier"), pd.DataFrame())
     assert section is not None
     figure = section.figures[0]

@@ -116,8 +116,9 @@ def tables() -> str:
     rows = ["| licence | of users | of developers only |", "| --- | --- | --- |"]
     for licence in sorted(set(packages.values())):
         names = [name for name in sorted(packages) if packages[name] == licence]
-        users, others = (", ".join(n for n in names if (n in developers) is only) for only in (False, True))
-        rows.append(f"| {f'**{licence}**' if 'GPL' in licence else licence} | {users} | {others} |")
+        users, others = [n for n in names if n not in developers], [n for n in names if n in developers]
+        title = f"**{licence}**" if "GPL" in licence else licence
+        rows.append(f"| {title} | {', '.join(users)} | {', '.join(others)} |")
     return "\n".join([*rows, "", *(f"- {name}: {note}." for name, note in NOTES.items())])
 
 

@@ -63,7 +63,7 @@ def config() -> str:
         group = name.partition(".")[0] if "." in name else ""
         rows = groups.setdefault(group, {})
         cells = cells_of(facts)
-        alike = next((key for key in rows if rows[key] == cells and is_alike(key, name)), name)
+        alike = next((key for key in rows if rows[key] == cells and is_alike(key, name)), name)  # they share a row
         rows[merged(alike, name)] = rows.pop(alike, cells)
     return "\n\n".join(
         "\n".join([*heading(group), CONFIG_HEAD, *(f"`{name}{cells[0]}` | {cells[1]}" for name, cells in rows.items())])
@@ -108,12 +108,7 @@ TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
 
 
 def filled(page: str, published: Path = PUBLISHED) -> str:
-    """Return a page with its blocks as they should be.
-
-    Args:
-        page: its path in the project.
-        published: the folder of reference records.
-    """
+    """Return a page, named by its path in the project, with its blocks as the records in a folder make them."""
     text = (ROOT / page).read_text()
     for name, write in TABLES[page].items():
         first, last = MARKS[0].format(name), MARKS[1]
