@@ -134,7 +134,7 @@ def sbom() -> dict[str, Any]:
         "specVersion": "1.6",
         "version": 1,
         "metadata": {"component": component("application", PROJECT["name"], __version__, PROJECT["license"])},
-        "components": [component("library", name, of.version, licence_of(of)) for name, of in of_users().items()],
+        "components": [component("library", name, dist.version, licence_of(dist)) for name, dist in of_users().items()],
     }
 
 

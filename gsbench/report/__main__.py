@@ -112,18 +112,18 @@ def _report(results: Results, columns: Sequence[str], options: argparse.Namespac
 def _numbers(results: Results) -> dict[str, object]:
     """Return all sections of a report and the facts of every run as plain values."""
     left_out = ("gallery", "runs")  # images, and a table that `runs` below replaces
-    sections = [of for chapter in results.chapters() for of in built(chapter) if of.key not in left_out]
+    sections = [section for chapter in results.chapters() for section in built(chapter) if section.key not in left_out]
     runs = results.runs.drop(columns=["path", "record"]).to_dict("records")
     return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
 
 
 def _paper_tables(results: Results, options: argparse.Namespace) -> None:
     """Print the tables of papers, and write them unless another form was asked for."""
-    shown = [section for of in paper_tables.sections(results).values() for section in of]
+    shown = [section for table in paper_tables.sections(results).values() for section in table]
     if options.latex:
         print(text.latex(shown))
     elif not _answered_in_json(
-        options, lambda: {name: of.to_dict("records") for name, of in paper_tables.numbers(results).items()}
+        options, lambda: {name: table.to_dict("records") for name, table in paper_tables.numbers(results).items()}
     ):
         paper_tables.write(results, options.results)
         print(text.terminal(shown))

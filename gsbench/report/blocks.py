@@ -206,7 +206,7 @@ def choices(published: Path) -> str:
         "suite": [_val_on_the_way(study(published / "suite")[kind]) for kind in MOVING],
         DNERF: [_val_on_the_way(_of_dnerf(only(published, name))) for name in ("dnerf100", "compare100")],
     }
-    lost = {title: _lost(pd.concat(of)) for title, of in runs.items()}
+    lost = {title: _lost(pd.concat(tables)) for title, tables in runs.items()}
     table = pd.DataFrame(index=lost[DNERF].columns.rename("choice"))
     for title, gap in lost.items():
         near = (gap >= -NEAR).sum()
@@ -251,7 +251,7 @@ def _val_on_the_way(chapter: Results) -> pd.DataFrame:
 def lengths(published: Path) -> str:
     """Return PSNR of 7DGS after 1,000 (variant ""), 2,000, 4,000 and 8,000 iterations, and after the one val keeps."""
     # `lengths` has the long trainings, of seed 0 only, and `suite` the others: `by_length` keeps this seed.
-    runs = pd.concat([of.runs for name in ("lengths", "suite") for of in study(published / name).values()])
+    runs = pd.concat([chapter.runs for name in ("lengths", "suite") for chapter in study(published / name).values()])
     runs = runs[runs.variant.isin(["", "iterations=2000", "iterations=4000", "iterations=8000"])]
     table = by_length(runs[runs.model == "7dgs"]).dropna().droplevel(["model", "seed"])
     return block(stats.ranked_rows(table.drop(columns=["kept", "tried"])).assign(kept=table.kept))
@@ -322,10 +322,10 @@ def dnerf100_signs(published: Path) -> str:
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
 
-def _minutes(of: pd.Series, device: str) -> pd.Series:
-    """Return means with the minutes of the processor: CPU-minutes of all threads, or those of the GPU."""
-    seconds = of.train_s if device == "GPU" else of.train_cpu_s
-    return pd.concat([of, pd.Series({f"{device} min": seconds / 60})])
+def _minutes(averages: pd.Series, device: str) -> pd.Series:
+    """Return averages with the minutes of the processor: CPU-minutes of all threads, or those of the GPU."""
+    seconds = averages.train_s if device == "GPU" else averages.train_cpu_s
+    return pd.concat([averages, pd.Series({f"{device} min": seconds / 60})])
 
 
 def trex400(published: Path) -> str:

@@ -239,7 +239,7 @@ def _beside(quoted: pd.DataFrame, measured: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of both; a measured row follows the quoted ones of its method."""
     rows = pd.concat([quoted, measured], ignore_index=True)
     methods = [*dict.fromkeys(rows.method)]
-    return rows.sort_values("method", key=lambda of: of.map(methods.index), kind="stable", ignore_index=True)
+    return rows.sort_values("method", key=lambda names: names.map(methods.index), kind="stable", ignore_index=True)
 
 
 def _quoted(dataset: str) -> pd.DataFrame:
@@ -315,23 +315,23 @@ def _published(dataset: str, scene: str, scenes: Sequence[str]) -> Iterator[dict
     """
     table = published(dataset)
     every = SUCCESSOR_SCENES[dataset]
-    for of in table[table.scene == scene].to_dict("records"):
-        is_unknown = pd.isna(of["scenes"])  # then it is shown as the mean over all
+    for row in table[table.scene == scene].to_dict("records"):
+        is_unknown = pd.isna(row["scenes"])  # then it is shown as the mean over all
         note = "; the number of scenes of this mean is not stated" if is_unknown else ""
-        is_of_scenes = of["scenes"] == len(scenes) or (is_unknown and len(scenes) == len(every))
+        is_of_scenes = row["scenes"] == len(scenes) or (is_unknown and len(scenes) == len(every))
         if scene == paper.AVERAGE and not is_of_scenes:
-            if of["scenes"] != len(every):
+            if row["scenes"] != len(every):
                 continue
-            rows = table[(table.method == of["method"]) & (table.source == of["source"]) & table.scene.isin(scenes)]
-            of |= {
+            rows = table[(table.method == row["method"]) & (table.source == row["source"]) & table.scene.isin(scenes)]
+            row |= {
                 "psnr_db": rows.psnr_db.mean(),
                 "gaussians": rows.gaussians.mean(skipna=False),
                 "scenes": len(scenes),
             }
             note = f"; {COMPUTED}"
-        row = {"row": "published", "method": of["method"], "recipe": "", "experiment": "", "scenes": of["scenes"]}
-        key = "psnr_db" if of["source"] in AT_THE_END else "psnr_best_on_test_db"
-        yield row | {"protocol": SOURCES[of["source"]] + note, key: of["psnr_db"], "gaussians": of["gaussians"]}
+        names = {"row": "published", "method": row["method"], "recipe": "", "experiment": "", "scenes": row["scenes"]}
+        key = "psnr_db" if row["source"] in AT_THE_END else "psnr_best_on_test_db"
+        yield names | {"protocol": SOURCES[row["source"]] + note, key: row["psnr_db"], "gaussians": row["gaussians"]}
 
 
 def _protocol(record: Record) -> str:
@@ -432,10 +432,10 @@ def _heading(runs: pd.DataFrame) -> str:
 def _sections2(results: Results) -> Iterator[Section]:
     rows = table2(results)
     for dataset, protocol in paper.PROTOCOLS.items():
-        of = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
-        notes = tuple(f"{name}: {text}" for name, text in SOURCES_2.items() if f"paper, {name}" in set(of.source))
+        lines = rows[rows.dataset == dataset].drop(columns="dataset").reset_index(drop=True)
+        notes = tuple(f"{name}: {text}" for name, text in SOURCES_2.items() if f"paper, {name}" in set(lines.source))
         title = f"Table 2, {dataset}, average over {len(protocol.scenes)} scenes, at the paper's protocol"
-        yield Section(f"table2-{dataset}", title, TEXT_2, of, notes=notes)
+        yield Section(f"table2-{dataset}", title, TEXT_2, lines, notes=notes)
 
 
 def _sections_of_successors(results: Results) -> Iterator[Section]:
@@ -457,7 +457,7 @@ def numbers(results: Results) -> dict[str, pd.DataFrame]:
 
 def write(results: Results, folder: Path) -> None:
     """Write the three tables as Markdown and CSV to a folder."""
-    for name, of in sections(results).items():
-        write_atomically(folder / f"{name}.md", text.markdown(of).encode())
+    for name, shown in sections(results).items():
+        write_atomically(folder / f"{name}.md", text.markdown(shown).encode())
     for name, table in numbers(results).items():
         write_atomically(folder / f"{name}.csv", text.csv(table).encode())

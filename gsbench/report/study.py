@@ -49,7 +49,8 @@ def write(records: Iterable[Record], folder: Path) -> None:
         key = {"run": str(i)}
         runs.append(key | {name: cell(value) for name, value in _flat(plain)})
         for view in scores:
-            views.append(key | {"view": cell(view["name"])} | {name: _number(view[of]) for name, of in VIEWS.items()})
+            numbers = {name: _number(view[field]) for name, field in VIEWS.items()}
+            views.append(key | {"view": cell(view["name"])} | numbers)
         curves += [key | dict(zip(CURVES, map(_number, point), strict=True)) for point in points]  # named tuples
     for old, new in zip(records, _records(runs, views, curves, str(folder / RUNS_FILE)), strict=True):
         if new != old:

@@ -136,7 +136,7 @@ def article(key: str, chapter: Results, sections: Sequence[Section] | None = Non
     mean = runs.groupby("model").psnr_db.mean()
     best = "" if mean.isna().all() else str(mean.idxmax())
     shown = built(chapter) if sections is None else sections
-    shown = [replace(of, title="Results") if of.key == "experiment" else of for of in shown]  # named by the article
+    shown = [replace(s, title="Results") if s.key == "experiment" else s for s in shown]  # the article has its title
     return Article(key, title_of(runs), summary, shown, sorted(runs.series.unique()), best, links)
 
 
@@ -167,13 +167,12 @@ def table(section: Section) -> dict[str, Any]:
 
 def _keys(figure: Figure) -> dict[str, list[str]]:
     """Return what a reader can choose in a figure: its scenes and its models."""
-    of = figure.table
-    return {name: list(dict.fromkeys(of[name])) if name in of else [] for name in ("scene", "series")}
+    return {name: list(dict.fromkeys(figure.table.get(name, []))) for name in ("scene", "series")}
 
 
-def _swatches(of: Section) -> list[tuple[str, str]]:
+def _swatches(section: Section) -> list[tuple[str, str]]:
     """Return the legend of the stacked bars of a section: each part with the variable of its colour."""
-    bars = [(figure.options["parts"], figure.options["colours"]) for figure in of.figures if figure.draw == "bars"]
+    bars = [(figure.options["parts"], figure.options["colours"]) for figure in section.figures if figure.draw == "bars"]
     return [pair for parts, hues in bars for pair in zip(parts, charts.part_colours(parts, hues), strict=True)]
 
 
@@ -186,7 +185,7 @@ def _template() -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    csv = lambda of: base64.b64encode(text.csv(of.table).encode()).decode()  # noqa: E731
+    csv = lambda section: base64.b64encode(text.csv(section.table).encode()).decode()  # noqa: E731
     environment.filters |= {"table": table, "csv": csv, "keys": _keys, "swatches": _swatches, "short": short}
     return environment.get_template("page.html.j2")
 

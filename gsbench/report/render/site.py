@@ -44,14 +44,14 @@ def _tables(results: Results) -> list[page.Article]:
     """Return the result table of each experiment, whose models lead to their pages."""
     articles = []
     for chapter in results.chapters():
-        key, of = _key(chapter), table(chapter, [])
-        models = of.table.model.str.partition(" ")[0]  # without variant
-        is_pair = of.table.scene.isin(set(chapter.runs.scene))  # not an average
+        key, section = _key(chapter), table(chapter, [])
+        models = section.table.model.str.partition(" ")[0]  # without variant
+        is_pair = section.table.scene.isin(set(chapter.runs.scene))  # not an average
         addresses = [
             quote(_file(key, scene, model).as_posix()) if has_page else ""
-            for scene, model, has_page in zip(of.table.scene, models, is_pair, strict=True)
+            for scene, model, has_page in zip(section.table.scene, models, is_pair, strict=True)
         ]
-        linked = replace(of, table=of.table.assign(**{"model link": addresses}))
+        linked = replace(section, table=section.table.assign(**{"model link": addresses}))
         links = [("Figures and statistics", quote(f"{key}/{INDEX}"))]
         articles.append(page.article(key, chapter, [linked], links=links))
     return articles

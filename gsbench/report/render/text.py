@@ -150,17 +150,17 @@ def tex(text: str) -> str:
 def plain(sections: Sequence[Section]) -> list[dict[str, Any]]:
     """Return sections as plain values, the numbers not rounded; `as_json` writes a number that is missing as null."""
     return [
-        {"key": of.key, "title": of.title, "text": of.text, "notes": of.notes, "rows": of.table.to_dict("records")}
-        for of in sections
+        {"key": s.key, "title": s.title, "text": s.text, "notes": s.notes, "rows": s.table.to_dict("records")}
+        for s in sections
     ]
 
 
-def csv(of: pd.DataFrame) -> str:
+def csv(frame: pd.DataFrame) -> str:
     """Return a table as CSV, the numbers not rounded.
 
     A text is on one line; if it begins like a formula, which a spreadsheet would compute, a ' is put before it.
     """
-    return of.map(_safe).rename(columns=_safe).to_csv(index=False)
+    return frame.map(_safe).rename(columns=_safe).to_csv(index=False)
 
 
 def _safe(value: Any) -> Any:

@@ -51,7 +51,7 @@ def tested(chapter: Results) -> pd.DataFrame:
 
 def built(chapter: Results, chosen: Callable[[Registered], bool] = lambda _: True) -> list[Section]:
     """Make the chosen sections of one experiment in ORDER; those that it lacks come before its last two."""
-    keys = [key for key, of in SECTIONS.items() if chosen(of)]
+    keys = [key for key, section in SECTIONS.items() if chosen(section)]
     ordered = sorted(keys, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER) - 2.5)
     tests = tested(chapter) if any(SECTIONS[key].asks for key in keys) else pd.DataFrame(columns=["section"])
     sections = [SECTIONS[key].build(chapter, tests[tests.section == key]) for key in ordered]

@@ -61,7 +61,7 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
 
     In a merged set (gsbench.report.merge) a row is of one contributor, machine and commit, and has its own times.
     """
-    runs, ok = (_by_row(of) for of in (chapter.runs, chapter.finished.runs))
+    runs, ok = _by_row(chapter.runs), _by_row(chapter.finished.runs)
     origin = [name for name in ORIGIN if "contributor" in runs]
     is_all = set(asked) in (set(), set(WITH_TRAIN))  # no --select column=..
     names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
