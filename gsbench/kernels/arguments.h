@@ -185,22 +185,26 @@ GSB_FIELDS(ColorGrads, GRADS, sh0, shN, means, times)
 // The `networks` MLPs of AGR, each with `features` inputs and HIDDEN hidden units, applied to every Gaussian. The first
 // `networks - 1` arrays of values are their inputs. MLP number i changes array i; the last MLP changes all further
 // arrays.
+//
+// On a GPU, Gaussians are changed for V views, and the kernel merges `units` and the encoded times `gamma` into the
+// weights. On the CPU, V is 1, torch has merged them, `encoded` is 0, and `units` and `gamma` are null.
 struct RefineArgs {
-    int64_t N, refined;  // Gaussians from `refined` on are not changed
-    int features, networks, arrays, outputs;  // features: inputs of the MLPs; outputs: the sum of widths
+    int64_t N, V, refined;  // Gaussians from `refined` on are not changed
+    int features, encoded, networks, arrays, outputs;  // features: inputs of the MLPs; outputs: the sum of widths
     int widths[MAX_NETWORKS], value_widths[MAX_VALUES];
     const float* values[MAX_VALUES];     // [arrays] of [N, value_widths]
-    const float *weight_in, *bias_in;    // [networks * 64, features] [networks * 64]
+    const float *weight_in, *bias_in;    // [networks * 64, features + encoded] [networks * 64]
     const float *weight_out, *bias_out;  // [outputs, 64] [outputs]
-    // [refined, 2] [], or both null: outside of its interval of time a Gaussian is not changed (is_awake).
+    const float *units, *gamma;          // [outputs] the sizes of inputs and outputs, [V, encoded]
+    // [refined, 2] [V], or both null: outside of its interval of time a Gaussian is not changed (is_awake).
     const float *intervals, *time;
     int threads;
 };
-GSB_FIELDS(RefineArgs, INPUTS, N, refined, features, networks, arrays, outputs, widths, value_widths, values, weight_in,
-           bias_in, weight_out, bias_out, intervals, time, threads)
+GSB_FIELDS(RefineArgs, INPUTS, N, V, refined, features, encoded, networks, arrays, outputs, widths, value_widths, values,
+           weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time, threads)
 
 struct Refined {
-    float* values[MAX_VALUES];  // [arrays] of [N, value_widths]
+    float* values[MAX_VALUES];  // [arrays] of [V, N, value_widths]
 };
 GSB_FIELDS(Refined, OUTPUTS, values)
 
@@ -210,11 +214,11 @@ struct RefinedGrads {
 GSB_FIELDS(RefinedGrads, GIVEN, values)
 
 struct RefineGrads {
-    float* values[MAX_VALUES];                           // of the MLPs' inputs: [networks - 1] of [N, value_widths]
+    float* values[MAX_VALUES];  // [N, value_widths]; null: an array that no MLP reads, whose gradient is that given
     float *weight_in, *bias_in, *weight_out, *bias_out;  // zero on entry
-    float* scratch;                                      // [networks, refined, features], on a GPU
+    float *scratch, *biases;  // [networks, V, refined, features] [V, networks * 64] zero on entry, on a GPU
 };
-GSB_FIELDS(RefineGrads, GRADS, values, weight_in, bias_in, weight_out, bias_out, scratch)
+GSB_FIELDS(RefineGrads, GRADS, values, weight_in, bias_in, weight_out, bias_out, scratch, biases)
 
 // ---- gsbench/kernels/raster.py
 

@@ -23,7 +23,8 @@ class Library:
     """The compiled kernels for tensors on the CPU."""
 
     needs_scratch = False  # whether torch must provide scratch memory; the kernels of the CPU allocate their own
-    takes_views = False  # whether a call may slice and colour several views; on a CPU, a view at a time stays in caches
+    # Whether one call of AGR, slices and colours computes several views; on a CPU, the data of one view stay in caches.
+    takes_views = False
 
     def __init__(self, extension: ModuleType) -> None:
         """Store the compiled extension and read the argument names of its kernels.

@@ -1,6 +1,7 @@
 """Apply AGR, the neural refinement of 7DGS: small MLPs that change the parameters of Gaussians over time.
 
-The kernels keep hidden layers in cache only, and the backward pass computes them again.
+The kernels keep hidden layers in cache only, and the backward pass computes them again. On a GPU, one call changes the
+parameters for the times of several views.
 """
 
 from collections.abc import Sequence
@@ -52,8 +53,18 @@ class _Inputs(NamedTuple):
         each = [(name, x if isinstance(x, list) else [x]) for name, x in self._asdict().items() if x is not None]
         return [(name, x) for name, listed in each for x in listed]
 
+    @property
+    def views(self) -> int | None:
+        """The number of views whose times are encoded; None: a single one, without a dimension."""
+        return len(self.gamma) if self.gamma.dim() > 1 else None
+
+    def weights(self) -> dict[str, Tensor]:
+        """Return the weights of the MLPs as they are, which the kernels of a GPU take."""
+        weights = {key: getattr(self, key).detach() for key in ("weight_in", "bias_in", "weight_out", "bias_out")}
+        return dict(zip(weights, in_rows(list(weights.values())), strict=True))
+
     def layers(self) -> dict[str, Tensor]:
-        """Return the weights of the MLPs in the form that the kernels take.
+        """Return the weights of the MLPs in the form that the kernels of the CPU take.
 
         The encoded time gamma(t) is merged into the biases of the first layers, and the scales `units` into the
         weights, because both are equal for all Gaussians.
@@ -101,7 +112,7 @@ class _Refine(Operation):
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
         slots = self.prepare(tensors, numbers)
         values = slots["rows"]
-        out = [allocate(self._memory, x, x.shape) for x in values]
+        out = [allocate(self._memory, x, _shape_of(_Inputs.of(tensors), x)) for x in values]
         library_of(values[0].device.type).call("refine", slots | {"out.values": addresses(out)}, values[0])
         return out, slots
 
@@ -114,36 +125,50 @@ class _Refine(Operation):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        values, weights = slots["rows"], slots["layers"]
-        like, networks = values[0], slots["networks"]
+        values, weights = slots["rows"], slots["weights"]
+        like, networks, inputs = values[0], slots["networks"], _Inputs.of(tensors)
         library, features = library_of(like.device.type), networks - 1
-        dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(upstream, values, strict=True)]
-        moved = [allocate("gradients of AGR's features", x, x.shape) for x in values[:features]]
+        dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(upstream, outputs, strict=True)]
+        # An array that no MLP reads has the gradient that is given, which is added up over views.
+        summed = values if inputs.views else values[:features]
+        g_values = [allocate("gradients of AGR's features", x, x.shape) for x in summed]
         g_weights = {key: torch.empty_like(x) for key, x in weights.items()}
-        torch._foreach_zero_(list(g_weights.values()))  # on a GPU in one launch
-        scratch = None
+        scratch = biases = None
         if library.needs_scratch:
-            shape = networks, slots["refined"], slots["features"]
+            shape = networks, slots["V"], slots["refined"], slots["features"]
             scratch = allocate("gradients of AGR's features", like, shape)
-        slots |= {"given.values": addresses(dense), "grad.values": addresses(moved), "grad.scratch": address(scratch)}
+            biases = allocate("gradients of AGR's biases", like, (slots["V"], len(inputs.bias_in)))
+        zeroed = [*g_weights.values(), *([] if biases is None else [biases])]
+        torch._foreach_zero_(zeroed)  # on a GPU in one launch
+        slots |= {"given.values": addresses(dense), "grad.values": addresses(g_values)}
+        slots |= {"grad.scratch": address(scratch), "grad.biases": address(biases)}
         slots |= {f"grad.{key}": g.data_ptr() for key, g in g_weights.items()}
         library.call("refine_backward", slots, like)
-        of_layers = _Inputs.of(tensors).of_layers(g_weights)
-        return [*moved, *dense[features:], *of_layers, None, None, None, None]
+        of_weights = list(g_weights.values()) if library.takes_views else inputs.of_layers(g_weights)
+        return [*g_values, *dense[len(g_values) :], *of_weights, None, None, None, None]
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
         """Return the kernel arguments by name, and the tensors that must not be freed before the kernels have run."""
         slots = self.match(tensors, numbers).copy()
         inputs = _Inputs.of(tensors)
-        values, weights = in_rows(inputs.values), inputs.layers()
-        intervals = None if inputs.intervals is None else in_rows([inputs.intervals])[0]
+        values, units, gamma = in_rows(inputs.values), None, None
+        if library_of(values[0].device.type).takes_views:
+            weights, (units, gamma) = inputs.weights(), in_rows([inputs.units, inputs.gamma])
+        else:
+            weights = inputs.layers()
+        intervals, time = inputs.intervals, inputs.time
+        if intervals is not None and time is not None:
+            intervals, time = in_rows([intervals, time])
         slots |= {
             "values": addresses(values),
+            "units": address(units),
+            "gamma": address(gamma),
+            "encoded": 0 if gamma is None else gamma.shape[-1],
             "intervals": address(intervals),
-            "time": address(inputs.time),
+            "time": address(time),
             "rows": values,
-            "layers": weights,
-            "kept": (intervals, inputs.time),
+            "weights": weights,
+            "kept": (intervals, time, units, gamma),
         }
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
@@ -171,10 +196,14 @@ class _Refine(Operation):
         like, features, outputs, hidden = inputs.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
         rows = first_rows("refine: rows", numbers[0], like)
         shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
-        shapes += [(hidden, features + len(inputs.gamma)), (hidden,), (outputs, HIDDEN), (outputs,)]
-        shapes += [(outputs,), (len(inputs.gamma),)]
+        views = () if inputs.views is None else (inputs.views,)
+        if views and not library_of(like.device.type).takes_views:
+            raise InputError(f"refine: expected one view on {like.device}, got {inputs.views} in one call")
+        encoded = inputs.gamma.shape[-1]
+        shapes += [(hidden, features + encoded), (hidden,), (outputs, HIDDEN), (outputs,)]
+        shapes += [(outputs,), (*views, encoded)]
         if inputs.intervals is not None:
-            shapes += [(rows, 2), ()]
+            shapes += [(rows, 2), views]
         for (name, x), shape in zip(listed, shapes, strict=True):
             if tuple(x.shape) != shape or x.device != like.device:
                 raise InputError(
@@ -183,6 +212,7 @@ class _Refine(Operation):
                 )
         return {
             "N": len(like),
+            "V": inputs.views or 1,
             "refined": rows,
             "features": features,
             "networks": networks,
@@ -194,7 +224,13 @@ class _Refine(Operation):
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
         self._match(tensors, numbers)
-        return [x.new_empty(x.shape) for x in _Inputs.of(tensors).values]
+        inputs = _Inputs.of(tensors)
+        return [x.new_empty(_shape_of(inputs, x)) for x in inputs.values]
+
+
+def _shape_of(inputs: _Inputs, values: Tensor) -> tuple[int, ...]:
+    """Return the shape of values that AGR has changed: [N, c], or [V, N, c] for several views."""
+    return tuple(values.shape) if inputs.views is None else (inputs.views, *values.shape)
 
 
 _refine = _Refine()
@@ -207,12 +243,12 @@ def refine(
     weight_out: Tensor,  # [sum of c, 64] the second layers, a row for each output
     bias_out: Tensor,  # [sum of c]
     units: Tensor,  # [sum of c] the scales of inputs and outputs: MLPs read and give numbers in these units
-    gamma: Tensor,  # [G] the encoded time
+    gamma: Tensor,  # [G] the encoded time, or on a GPU [V, G] those of V views
     *,
     rows: int | None = None,  # only the first `rows` Gaussians change, the others are copied; None: all
     intervals: Tensor | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
-    time: Tensor | None = None,  # [] of the view, required with `intervals`
-) -> Tensors:  # of [N, c], as `values`
+    time: Tensor | None = None,  # [] or [V] of the views, required with `intervals`
+) -> Tensors:  # of [N, c], as `values`, or [V, N, c]
     """Change raw parameters of Gaussians by P small MLPs with ReLU, as AGR of 7DGS does (eq. 14 and 15).
 
     MLP number i adds its output to `values[i]`, the last one to all remaining tensors.

@@ -18,7 +18,6 @@ from gsbench.kernels.backends import AUTO, Backend
 from gsbench.kernels.colors import show_colors
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.kernels.operation import Operation
-from gsbench.kernels.tape import stack
 from gsbench.kernels.tensors import check_positive, check_whole
 from gsbench.models.appearance import ColorOrder, sh_colors
 from gsbench.models.camera_time import CameraTime, together, unit
@@ -384,11 +383,7 @@ class GaussianModel(nn.Module, ABC):
         by_kernel = self.backend.serves(raw["means"])
         intervals = None if self.effect_sets is None else self.effect_sets.intervals
         values = [raw[name] for name in names]
-        changes = partial(self.refinement, values, by_kernel=by_kernel, rows=rows, intervals=intervals)
-        if query.time.dim():
-            moved = stack(list(zip(*map(changes, query.time.unbind()), strict=True)))
-        else:
-            moved = changes(query.time)
+        moved = self.refinement(values, query.time, by_kernel=by_kernel, rows=rows, intervals=intervals)
         return raw | dict(zip(names, moved, strict=True))
 
     def add_lambda(self, name: str, value: float) -> None:

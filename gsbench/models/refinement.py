@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from gsbench.kernels.headers import HIDDEN
 from gsbench.kernels.refine import refine
-from gsbench.kernels.tape import collect_gradients
+from gsbench.kernels.tape import collect_gradients, stack
 from gsbench.models.networks import HiddenLayers, Linear, encode
 from gsbench.models.portable_math import cos, sin
 
@@ -21,9 +21,12 @@ OCTAVES = 10  # K of the time encoding in the 7DGS paper
 
 
 def encode_time(time: Tensor, octaves: int = OCTAVES) -> Tensor:
-    """Return the positional encoding of a time, (sin 2^k pi t, cos 2^k pi t) for k = 0 .. octaves-1, [2 octaves]."""
-    angles = time * _frequencies(octaves, time.device, time.dtype)
-    return torch.stack([sin(angles), cos(angles)], -1).flatten()
+    """Return the positional encoding of a time [], (sin 2^k pi t, cos 2^k pi t) for k = 0 .. octaves-1, [2 octaves].
+
+    That of several times [V] is [V, 2 octaves].
+    """
+    angles = time[..., None] * _frequencies(octaves, time.device, time.dtype)
+    return torch.stack([sin(angles), cos(angles)], -1).flatten(-2)
 
 
 @functools.cache
@@ -44,14 +47,17 @@ class Changes(nn.Module, ABC):
         values: list[
             Tensor
         ],  # raw parameters [N, c]: first the means, which are the input, then those of the covariance
-        time: Tensor,  # [] in [0, 1]
+        time: Tensor,  # [] in [0, 1], or [V] those of several views
         *,
         by_kernel: bool = False,  # whether the backend's kernel (float32) may compute it
         rows: int | None = None,  # only the first `rows` Gaussians change; None: all
         intervals: Tensor
         | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
     ) -> list[Tensor]:
-        """Return the raw parameters plus the outputs of the networks at a time."""
+        """Return the raw parameters plus the outputs of the networks at a time, or at several times [V, N, c]."""
+        if time.dim():
+            of_views = [self.forward(values, at, rows=rows, intervals=intervals) for at in time.unbind()]
+            return stack(list(zip(*of_views, strict=True)))
         resting = values if rows is None else [x[:rows] for x in values]
         moved = [x + added for x, added in zip(resting, self.added(resting, time), strict=True)]
         if rows is None:

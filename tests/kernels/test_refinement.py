@@ -96,6 +96,27 @@ def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, place: P
     assert all(torch.equal(x[~at_rest], y[~at_rest]) for x, y in zip(moved, always, strict=True)), "bits of the others"
 
 
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_several_views_in_one_call(share: float, cuda_device: str) -> None:
+    """Catches a view that sees the time of another, and gradients that are not the sum over views."""
+    exact, values = exact_network(300, [3, 1, 9], [3, 1, 2, 7])
+    network, times = exact.to(cuda_device, torch.float32), torch.tensor([0.375, 0.5, 0.1], device=cuda_device)
+    values = [x.detach().to(times).requires_grad_() for x in values]
+    inputs, count = [*values, *network.parameters()], round(share * 300)
+    options = {"by_kernel": True, "rows": count, "intervals": intervals_around(TIME, count)[1].to(cuda_device)}
+    outputs = network(values, times, **options)
+    weights, of_views = weights_of(outputs), []
+    for i, time in enumerate(times):
+        of_view = network(values, time, **options)
+        assert all(torch.equal(x[i], y) for x, y in zip(outputs, of_view, strict=True))
+        of_views.append(torch.autograd.grad(of_view, inputs, [weight[i] for weight in weights]))
+    for x, got, *parts in zip(inputs, torch.autograd.grad(outputs, inputs, weights), *of_views, strict=True):
+        want = parts[0] + parts[1] + parts[2]
+        if any(x is value for value in values):
+            assert torch.equal(got, want)
+        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5 * float(want.abs().max()))  # blocks add up all views
+
+
 def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: list[Tensor]) -> list[Tensor]:
     """By the kernel: gradients of the two features, then of the weights."""
     tensors = [*values, *weights, torch.ones(16), *[torch.empty(0)] * 3]  # units, no encoded time, no intervals
@@ -152,6 +173,22 @@ def test_arrays_that_do_not_fit_are_refused(place: Place) -> None:
             refine(values, ones(rows, 3), ones(rows), ones(10, 64), ones(10), *ten)
     with pytest.raises(InputError, match="intervals and time together"):
         refine(values, ones(128, 3), ones(128), ones(10, 64), ones(10), *ten, intervals=ones(4, 2))
+    several = single.new_empty(2, 0)
+    with pytest.raises(InputError, match="refine: expected"):
+        refine(
+            values,
+            ones(128, 3),
+            ones(128),
+            ones(10, 64),
+            ones(10),
+            ten[0],
+            several,
+            time=single[0],
+            intervals=ones(4, 2),
+        )
+    if place.name != "cuda":
+        with pytest.raises(InputError, match="refine: expected one view on cpu, got 2 in one call"):
+            refine(values, ones(128, 3), ones(128), ones(10, 64), ones(10), ten[0], several)
     if place.name == "cuda":
         with pytest.raises(InputError, match="at most 28 outputs"):
             refine([ones(4, 3), ones(4, 29)], ones(128, 3), ones(128), ones(32, 64), ones(32), ones(32), single[:0])

@@ -76,7 +76,7 @@ def launched(fitted: Training) -> Training:
         ("4dgs", (), 11, 34),
         ("4dgs", ("optim=sparse_adam",), 11, 36),
         ("7dgs_noagr", (), 11, 29),
-        ("7dgs", (), 19, 107),
+        ("7dgs", (), 13, 38),
     ],
 )
 def test_calls_of_a_step(
