@@ -3,6 +3,7 @@
 import math
 import os
 import secrets
+import sys
 from collections.abc import Generator, Iterable
 from contextlib import suppress
 from dataclasses import replace
@@ -134,10 +135,17 @@ def _frame_count(path: Path) -> int:
 
 
 def write_images(images: Iterable[Pixels], folder: Path) -> None:
-    """Write images as 0000.png, 0001.png and so on into a folder, which is created if its parent exists."""
+    """Write images as 0000.png, 0001.png and so on into a folder, which is created if its parent exists.
+
+    If the folder has a next image, of a longer clip, this is printed.
+    """
     folder.mkdir(exist_ok=True)
-    for i, image in enumerate(images):
-        write_png(image, folder / f"{i:04d}.png")
+    written = 0
+    for image in images:
+        write_png(image, folder / f"{written:04d}.png")
+        written += 1
+    if (following := folder / f"{written:04d}.png").exists():
+        print(f"{following}: it was there before, and is not of these {written} images: delete it", file=sys.stderr)
 
 
 def check_file(option: str, path: Path, *suffixes: str) -> None:

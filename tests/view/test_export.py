@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -242,6 +243,13 @@ def test_images_are_what_the_model_renders(folder: Path) -> None:
     for file, view in zip(sorted(Path("a").iterdir()), load_scene(run.config).test, strict=True):
         rendered = render(run.model, view.camera, view.time, torch.tensor(run.scene.background))
         assert (cv2.imread(str(file))[:, :, ::-1] == to_bytes(rendered.numpy())).all()
+
+
+def test_images_of_a_longer_clip_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a clip whose last images are those of an earlier export, in silence."""
+    for count, is_told in ((3, False), (2, True), (3, False)):
+        video.write_images([np.zeros((2, 2, 3), np.uint8)] * count, tmp_path / "a")
+        assert ("0002.png: it was there before" in capsys.readouterr().err) == is_told
 
 
 def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) -> None:
