@@ -38,10 +38,10 @@ def main() -> None:
     images = torch.rand(2, 37, 50, 3, device="cuda").requires_grad_()
     l1_ssim(images, torch.rand(2, 37, 50, 3, device="cuda"), 0.2).sum().backward()
     arrays = [[x, y] for x, y in zip(*(torch.rand(4, 300, 7, device="cuda").unbind() for _ in range(2)), strict=True)]
-    steps, skip = [torch.ones((), device="cuda")] * 2, torch.zeros((), device="cuda")
-    flag_arrays([*arrays[1], skip / skip], torch.zeros(3, device="cuda").bool(), skip)
+    (*steps, skip), rates = torch.zeros(3, device="cuda"), torch.full((2,), 0.1, device="cuda")
+    flag_arrays([*arrays[1], skip / skip], torch.zeros(3, device="cuda"), skip)
     drawn = [torch.rand(300, device="cuda") < 0.5, None]
-    adam_all(*arrays, steps, [0.1, 0.2], [0.9, 0.999], 1e-15, 1 - skip, drawn)
+    adam_all(*arrays, steps, [*rates], [0.9, 0.999], 1e-15, 1 - skip, drawn)
     counts = torch.zeros(2, 300, device="cuda").unbind()
     add_density(drawn[0][None], arrays[0][0][None, :, :2], (1.0, 1.0), *counts, counts[0].int())
     torch.cuda.synchronize()

@@ -47,12 +47,12 @@ def adam_of(fitted: GaussianModel) -> Callable[[], None]:
     if not fitted.backend.serves(parameters[0]):
         return torch.optim.Adam(parameters, lr=RATE, betas=BETAS, eps=EPS, fused=True).step
     states = [(p, torch.zeros_like(p), torch.zeros_like(p), p.new_zeros(())) for p in parameters]
+    rate = parameters[0].new_tensor(RATE)
 
     def call() -> None:
         learning = [state for state in states if state[0].grad is not None]
         gradients = [p.grad for p, *_ in learning]
         updated, means, squares, steps = ([state[i] for state in learning] for i in range(4))
-        torch._foreach_add_(steps, 1)
-        adam_all(updated, gradients, means, squares, steps, [RATE] * len(learning), BETAS, EPS)
+        adam_all(updated, gradients, means, squares, steps, [rate] * len(learning), BETAS, EPS)
 
     return call

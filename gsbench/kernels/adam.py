@@ -21,8 +21,8 @@ def adam_all(
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],  # the running means of the gradients, updated
     squares: Sequence[Tensor],  # the running means of the squared gradients, updated
-    steps: Sequence[Tensor],  # of []: the number of this update for each parameter, from 1
-    rates: Sequence[float],  # the learning rates
+    steps: Sequence[Tensor],  # of []: how often each parameter was updated, updated
+    rates: Sequence[Tensor],  # of []: the learning rates
     betas: Sequence[float],  # the decay rates of the two running means
     eps: float,  # added to the square root of the mean square
     skip: Tensor | None = None,  # []: nothing is updated unless it is 0
@@ -42,9 +42,9 @@ def adam_all(
         for x, parameter in zip(listed, parameters, strict=True):
             if not (x.shape == parameter.shape and _is_in_rows(x, torch.float32, device)):
                 raise _refusal(f"adam_all: {name}", x, torch.float32, parameter.shape, device)
-    for x in steps if skip is None else [*steps, skip]:
+    for x in [*steps, *rates, *([] if skip is None else [skip])]:
         if x.dim() or not _is_in_rows(x, torch.float32, device):
-            raise _refusal("adam_all: step or skip", x, torch.float32, (), device)
+            raise _refusal("adam_all: step, rate or skip", x, torch.float32, (), device)
     for parameter, rows in updated:
         if rows is not None and not (rows.shape == parameter.shape[:1] and _is_in_rows(rows, torch.bool, device)):
             raise _refusal("adam_all: drawn", rows, torch.bool, parameter.shape[:1], device)
@@ -55,15 +55,15 @@ def adam_all(
             "widths": tuple([0 if rows is None else x.numel() // max(1, len(rows)) for x, rows in updated[part]]),
             "drawn": tuple([address(rows) for _, rows in updated[part]]),
             "gradients": addresses(gradients[part]),
-            "steps": addresses(steps[part]),
+            "rates": addresses(rates[part]),
             "skip": address(skip),
-            "rates": tuple(rates[part]),
             "beta1": betas[0],
             "beta2": betas[1],
             "eps": eps,
             "out.parameters": addresses(parameters[part]),
             "out.means": addresses(means[part]),
             "out.squares": addresses(squares[part]),
+            "out.steps": addresses(steps[part]),
         }
         library_of(like.device.type).call("adam_all", slots, like)
 
@@ -71,7 +71,7 @@ def adam_all(
 @torch.no_grad()
 def flag_arrays(
     arrays: Sequence[Tensor | None],  # of any shapes; None counts as finite
-    flags: Tensor,  # bool, one for each array, set to true for those that have a number that is not finite
+    flags: Tensor,  # one for each array, set to 1 for those that have a number that is not finite
     skip: Tensor,  # [], set to 1 if any array has
 ) -> None:
     """Find which arrays are not finite, without waiting for a GPU. What is finite changes neither `flags` nor `skip`.
@@ -84,8 +84,8 @@ def flag_arrays(
     for x in [*rows, skip]:
         if not _is_in_rows(x, torch.float32, device):
             raise _refusal("flag_arrays: arrays", x, torch.float32, x.shape, device)
-    if not (flags.shape == (len(rows),) and _is_in_rows(flags, torch.bool, device)):
-        raise _refusal("flag_arrays: flags", flags, torch.bool, (len(rows),), device)
+    if not (flags.shape == (len(rows),) and _is_in_rows(flags, torch.float32, device)):
+        raise _refusal("flag_arrays: flags", flags, torch.float32, (len(rows),), device)
     for part in _parts(len(rows)):
         slots: Slots = {
             "count": len(rows[part]),

@@ -333,17 +333,18 @@ struct AdamArgs {
     int count;
     int64_t numbers[MAX_ADAM], widths[MAX_ADAM];         // of each parameter; of each of its rows
     const bool* drawn[MAX_ADAM];                         // [numbers / widths]; null: all rows
-    const float *gradients[MAX_ADAM], *steps[MAX_ADAM];  // [numbers]; [], from 1
+    const float *gradients[MAX_ADAM], *rates[MAX_ADAM];  // [numbers]; []
     const float* skip;                                   // []: nothing is updated unless it is 0; may be null
-    double rates[MAX_ADAM], beta1, beta2, eps;
+    double beta1, beta2, eps;
     int threads;
 };
-GSB_FIELDS(AdamArgs, INPUTS, count, numbers, widths, drawn, gradients, steps, skip, rates, beta1, beta2, eps, threads)
+GSB_FIELDS(AdamArgs, INPUTS, count, numbers, widths, drawn, gradients, rates, skip, beta1, beta2, eps, threads)
 
 struct AdamState {
     float *parameters[MAX_ADAM], *means[MAX_ADAM], *squares[MAX_ADAM];  // [numbers]
+    float* steps[MAX_ADAM];                                             // []: updates of the parameter so far
 };
-GSB_FIELDS(AdamState, OUTPUTS, parameters, means, squares)
+GSB_FIELDS(AdamState, OUTPUTS, parameters, means, squares, steps)
 
 // Whether several arrays are finite.
 struct FiniteArgs {
@@ -356,8 +357,8 @@ GSB_FIELDS(FiniteArgs, INPUTS, count, numbers, arrays, threads)
 
 // What is finite changes neither.
 struct ArrayFlags {
-    bool* flags;  // [count]: true if the array has a number that is not finite
-    float* skip;  // []: 1 if any array has
+    float* flags;  // [count]: 1 if the array has a number that is not finite
+    float* skip;   // []: 1 if any array has
 };
 GSB_FIELDS(ArrayFlags, OUTPUTS, flags, skip)
 

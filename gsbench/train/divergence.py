@@ -19,37 +19,44 @@ class DivergedError(RuntimeError):
 class FiniteCheck:
     """Check the loss and the gradients of every step for NaN and infinity.
 
-    On a GPU the result is read only every LOOK_EVERY steps. Until then, the tensor `skip` [] stops the updates: it is 1
-    from the first bad step on, and Adam reads it.
+    From the first bad step on, the tensor `skip` [] is 1, and Adam reads it. So nothing is updated until the CPU looks:
+    on a GPU every LOOK_EVERY steps, because it then waits, and on a CPU after each step.
     """
 
     def __init__(self, device: str) -> None:
         """Prepare the checks of a training on `device`, such as "cpu", "cuda" or "cuda:1"."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
-        self.loss = math.nan  # loss of the last step whose result was read
+        self.loss = math.nan  # loss of the last step that was looked at
         self.skip = torch.zeros((), device=device)
         self._names: list[str] = []  # the group of each parameter
-        self._steps: list[tuple[int, Tensor]] = []  # number and loss of each step since the last look
-        self._flags = torch.empty(0)  # [every, parameters + 1] bool: what of each of these steps is not finite
+        # [parameters + 2]: 1 for each gradient, and then the loss, that was not finite in any step; the last loss
+        self._now = torch.empty(0)
+        self._steps: list[int] = []  # since the last look
+        self._then = torch.empty(0)  # [every, parameters + 2]: `_now` after each of these steps
 
     @torch.no_grad()
-    def check(self, step: int, loss: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
-        """Check the loss and the gradients of a step, before the optimizer uses them.
+    def check(self, losses: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
+        """Check the loss, the sum of `losses` [V], and the gradients of all groups, before Adam uses them.
 
-        Args:
-            step: the number of the step.
-            loss: the loss, [].
-            groups: the parameters by group.
+        This can be recorded and repeated in other steps.
+        """
+        gradients = [p.grad for group in groups.values() for p in group]
+        if len(self._now) != len(gradients) + 2:
+            self._names = [name for name, group in groups.items() for _ in group]
+            self._now = losses.new_zeros(len(gradients) + 2)
+            self._then = self._now.new_empty(self.every, len(self._now))
+        loss = self._now[-1]
+        torch.sum(losses, 0, out=loss)
+        _flag([*gradients, loss], self._now[:-1], self.skip)
+
+    def end(self, step: int) -> None:
+        """Look at the result of the checks if it is time, after each step that was checked.
 
         Raises:
-            DivergedError: a check failed, in this step or since the result was last read.
+            DivergedError: as `look`.
         """
-        arrays = [*[p.grad for group in groups.values() for p in group], loss]
-        if self._flags.shape != (self.every, len(arrays)):
-            self._names = [name for name, group in groups.items() for _ in group]
-            self._flags = torch.zeros(self.every, len(arrays), dtype=torch.bool, device=loss.device)
-        _flag(arrays, self._flags[len(self._steps)], self.skip)
-        self._steps.append((step, loss))
+        self._then[len(self._steps)].copy_(self._now)
+        self._steps.append(step)
         if len(self._steps) == self.every:
             self.look()
 
@@ -59,28 +66,24 @@ class FiniteCheck:
         Raises:
             DivergedError: a check failed; the message names the step and the parameter.
         """
-        for (step, loss), flags in zip(self._steps, self._flags.tolist(), strict=False):
+        for step, (*flags, loss) in zip(self._steps, self._then.tolist(), strict=False):
+            self.loss = loss
             if any(flags):
-                self.loss = float(loss)
-                bad = flags.index(True)
+                bad = flags.index(1)
                 if bad == len(self._names):
-                    raise DivergedError(f"step {step}: the loss is {self.loss}")
-                raise DivergedError(
-                    f"step {step}: the gradient of '{self._names[bad]}' is not finite (loss {self.loss})"
-                )
-        if self._steps:
-            self.loss = float(self._steps[-1][1])
-            self._steps.clear()
+                    raise DivergedError(f"step {step}: the loss is {loss}")
+                raise DivergedError(f"step {step}: the gradient of '{self._names[bad]}' is not finite (loss {loss})")
+        self._steps.clear()
 
 
 def _flag(arrays: list[Tensor | None], flags: Tensor, skip: Tensor) -> None:
-    """Set `flags` [arrays] to true for arrays that are not finite, and then `skip` [] to 1."""
+    """Set `flags` [arrays] to 1 for arrays that are not finite, and then `skip` [] to 1."""
     if AUTO.serves(skip) and all(x is None or x.dtype == skip.dtype for x in arrays):
         flag_arrays(arrays, flags, skip)
         return
     for flag, x in zip(flags, arrays, strict=True):
         if x is not None:
-            flag.copy_(~x.isfinite().all())
+            flag.masked_fill_(~x.isfinite().all(), 1)
     skip.masked_fill_(flags.any(), 1)
 
 

@@ -77,14 +77,13 @@ class Trainer(TrainingParts):
             results = self.gradients(views, terms, maps)
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
-        with stages("density"):
-            self.density.accumulate(step, views, results)
-        self.finite_check.check(step, torch.cat([part.loss for part in results]).sum(), self.optimizer.groups)
+        if self.schedule.densifies(step):
+            with stages("density"):
+                self.density.before_round(views, results)
         with torch.no_grad():
+            factors = {name: x for hook in self.hooks for name, x in hook.rate_factors(step).items()}
+            self.update(step, views, results, factors)
             with stages("optimizer"):
-                drawn = torch.cat([part.drawn for part in results]).any(0) if self.optimizer.is_sparse else None
-                factors = {name: x for hook in self.hooks for name, x in hook.rate_factors(step).items()}
-                self.optimizer.step(step, drawn, factors)
                 for hook in self.hooks:
                     hook.after_update(step)
             with stages("density"):

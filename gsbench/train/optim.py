@@ -52,49 +52,68 @@ class Optimizer:
         self.is_sparse = kind == "sparse_adam"
         # The step count and both moments of each parameter, in the form of torch.optim.Adam.state.
         self.moments: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
-        # [] on a GPU: 1 from the first step whose loss or gradient was not finite, so that no step changes anything
-        self.skip: Tensor | None = None
+        self.skip: Tensor | None = None  # []: nothing is updated unless it is 0 (`FiniteCheck`)
+        self._rates: dict[str, float] = {}  # of the present step, by group
 
     def add(self, name: str, parameters: list[nn.Parameter], rate: LearningRate) -> None:
         """Also optimize a group of parameters that is not of the model; use it before the first step."""
         self.groups[name], self.rates[name] = parameters, rate
 
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """Return the parameters of all groups."""
+        return [p for group in self.groups.values() for p in group]
+
     @cached_property
     def torch_adam(self) -> torch.optim.Adam:
-        """torch's Adam with the same groups and moments; created at first use, because its import takes a second."""
-        groups = [{"params": parameters, "name": name} for name, parameters in self.groups.items()]
+        """torch's Adam with the same moments, of what is not updated by rows; its import takes a second."""
+        rest = [(name, [p for p in group if id(p) not in self._by_rows]) for name, group in self.groups.items()]
+        groups = [{"params": parameters, "name": name} for name, parameters in rest]
         adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPS, fused=True)
         adam.state = self.moments
         return adam
 
-    def step(
-        self,
-        step: int,
-        drawn: Tensor | None,  # [N] bool: which Gaussians are visible in the batch; for sparse_adam
-        factors: Mapping[str, float] = NO_FACTORS,  # of the learning rates, by group
-    ) -> None:
-        """Update the parameters that have a gradient, then delete the gradients.
+    @cached_property
+    def _by_rows(self) -> set[int]:
+        """The ids of the parameters of which only the rows of visible Gaussians are updated."""
+        return {id(p) for p in self.model.splats.values()} if self.is_sparse else set()
 
-        On a GPU nothing is updated from the first step on whose loss or gradient was not finite (`skip` is 1), until
-        `FiniteCheck` ends the training.
+    @cached_property
+    def _rates_in_memory(self) -> Tensor:
+        """The learning rates of the present step where kernels read them, [groups]."""
+        return self.model.splats["means"].detach().new_zeros(len(self.groups))
+
+    def begin(self, step: int, factors: Mapping[str, float] = NO_FACTORS) -> None:
+        """Set the learning rates to those of a step, multiplied by the factors of some groups."""
+        self._rates, memory = self.rates_at(step, factors), self._rates_in_memory
+        # The copy from pinned memory does not wait for the GPU.
+        rates = torch.tensor(list(self._rates.values()), dtype=memory.dtype, pin_memory=memory.is_cuda)
+        memory.copy_(rates, non_blocking=True)
+
+    def update(self, drawn: Tensor | None) -> None:
+        """Update the parameters that have a gradient. By kernels, this can be recorded and repeated in other steps.
+
+        `drawn` [N] bool are the Gaussians that are visible in the batch; for sparse_adam.
         """
-        rates = self.rates_at(step, factors)
-        means = self.model.splats["means"]  # the device and the type of all parameters
-        if self.model.backend.serves(means):
-            self._step_all(rates, drawn)
+        if self.model.backend.serves(self.model.splats["means"]):  # which has the device and the type of all parameters
+            self._update_all(drawn)
             return
-        if self.is_sparse:
-            assert drawn is not None
-            for name, parameter in self.model.splats.items():
-                self._step_rows(parameter, rates[name], drawn)
-        if any(p.grad is not None for group in self.groups.values() for p in group):
+        for name, parameter in self.model.splats.items():
+            if id(parameter) in self._by_rows:
+                assert drawn is not None
+                self._update_rows(parameter, self._rates[name], drawn)
+        if any(p.grad is not None for p in self.parameters if id(p) not in self._by_rows):
             for group in self.torch_adam.param_groups:
-                group["lr"] = rates[group["name"]]
+                group["lr"] = self._rates[group["name"]]
             if self.skip is not None:
                 # torch's fused Adam changes nothing where it is 1.
                 self.torch_adam.found_inf = self.skip  # type: ignore[attr-defined]
             self.torch_adam.step()
-            self.torch_adam.zero_grad(set_to_none=True)
+
+    def end(self) -> None:
+        """Delete the gradients of a step."""
+        for p in self.parameters:
+            p.grad = None
 
     def rates_at(self, step: int, factors: Mapping[str, float] = NO_FACTORS) -> dict[str, float]:
         """Return the learning rate of each group at a step, multiplied by the factors of some groups."""
@@ -111,26 +130,19 @@ class Optimizer:
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         return state
 
-    def _step_all(self, rates: dict[str, float], drawn: Tensor | None) -> None:
+    def _update_all(self, drawn: Tensor | None) -> None:
         """Update all parameters by one call of the kernel."""
-        rated = [(p, rates[name]) for name, group in self.groups.items() for p in group if p.grad is not None]
-        if not rated:
-            return
-        parameters = [p for p, _ in rated]
+        each = zip(self.groups.values(), self._rates_in_memory.unbind(), strict=True)
+        rated = [(p, rate) for group, rate in each for p in group if p.grad is not None]
+        parameters, rates = [p for p, _ in rated], [rate for _, rate in rated]
         gradients = [p.grad for p in parameters if p.grad is not None]
         states = [self._state_of(p) for p in parameters]
         steps, means, squares = ([state[key] for state in states] for key in ("step", "exp_avg", "exp_avg_sq"))
-        torch._foreach_add_(steps, 1)
-        if self.skip is not None:
-            torch._foreach_sub_(steps, [self.skip] * len(steps))
-        of_gaussians = {id(p) for p in self.model.splats.values()} if self.is_sparse else set()
-        rows = [drawn if id(p) in of_gaussians else None for p in parameters]
-        adam_all(parameters, gradients, means, squares, steps, [rate for _, rate in rated], BETAS, EPS, self.skip, rows)
-        for p in parameters:
-            p.grad = None
+        rows = [drawn if id(p) in self._by_rows else None for p in parameters]
+        adam_all(parameters, gradients, means, squares, steps, rates, BETAS, EPS, self.skip, rows)
 
-    def _step_rows(self, parameter: nn.Parameter, rate: float, drawn: Tensor) -> None:
-        """Update only the Gaussians `drawn` [N] bool of a parameter, unless a gradient was not finite."""
+    def _update_rows(self, parameter: nn.Parameter, rate: float, drawn: Tensor) -> None:
+        """Update only the Gaussians `drawn` [N] bool of a parameter."""
         if parameter.grad is None:
             return
         if self.skip is not None:
@@ -140,7 +152,6 @@ class Optimizer:
         moments = state["exp_avg"], state["exp_avg_sq"]
         with torch.no_grad():
             adam_reference(parameter, parameter.grad, *moments, drawn, rate, BETAS, EPS, state["step"])
-        parameter.grad = None
 
     def reindex(self, rows: Tensor, fresh: Tensor) -> None:
         """Reorder Adam's moments after Gaussians were added, removed or sorted; those of new Gaussians become zero.

@@ -67,12 +67,11 @@ def _tensors_of(cameras: Sequence[Camera]) -> list[Tensor]:
     return [x for camera in cameras for x in (camera.viewmat, camera.K, camera.center)]
 
 
-class _RecordedPart(Generic[Result]):
-    """The recorded work on one part, stage by stage, what it reads, and the result that a repetition overwrites."""
+class Recorded(Generic[Result]):
+    """Work that was recorded, stage by stage, and the result that a repetition overwrites."""
 
-    def __init__(self, work: Callable[[Observed, Stages], Result], observed: Observed, stages: Stages) -> None:
-        """Do the work on a copy of `observed`, and record it."""
-        self._observed = observed.copy()
+    def __init__(self, work: Callable[[Stages], Result], stages: Stages, device: str) -> None:
+        """Do the work, all of whose calculations are inside of stages, and record it; `device` is a type."""
         self._recordings: list[tuple[str, Recording]] = []  # by stage
 
         @contextmanager
@@ -81,16 +80,16 @@ class _RecordedPart(Generic[Result]):
                 self._recordings.append((stage, recording))
                 yield
 
-        self.result = work(self._observed, recorded)
+        self.result = work(recorded)
         self.is_repeatable = all(recording.is_repeatable for _, recording in self._recordings)
-        if self.is_repeatable and observed.images[0].device.type in GRAPHED_ON:
+        if self.is_repeatable and device in GRAPHED_ON:
             with suppress(RuntimeError):  # then single calls are repeated
                 for _, recording in self._recordings:
                     recording.capture()
 
     @torch.no_grad()
-    def repeat(self, observed: Observed, stages: Stages) -> Result:
-        self._observed.overwrite(observed)
+    def repeat(self, stages: Stages) -> Result:
+        """Do the work again, with the present values of the tensors that it reads."""
         for stage, recording in self._recordings:
             with stages(stage):
                 recording.repeat()
@@ -100,6 +99,18 @@ class _RecordedPart(Generic[Result]):
         """Raise OutdatedError if the repetition met other numbers than its calls can work with."""
         for _, recording in self._recordings:
             recording.check()
+
+
+class _RecordedPart(Recorded[Result]):
+    """The recorded work on one part, and the copy of the views that it reads."""
+
+    def __init__(self, work: Callable[[Observed, Stages], Result], observed: Observed, stages: Stages) -> None:
+        self._observed = observed.copy()
+        super().__init__(partial(work, self._observed), stages, observed.images[0].device.type)
+
+    def repeat_on(self, observed: Observed, stages: Stages) -> Result:
+        self._observed.overwrite(observed)
+        return self.repeat(stages)
 
 
 class StepReplay(Generic[Result]):
@@ -115,6 +126,11 @@ class StepReplay(Generic[Result]):
         self._signature: Hashable = None
         self._recorded: list[_RecordedPart[Result]] = []  # one for each part of a batch
         self._is_repeatable = True
+
+    @property
+    def recording(self) -> int | None:
+        """Return a number of the recording whose memory the last results are in; None: they are of no recording."""
+        return self.counts["recordings"] if self._recorded else None
 
     def __call__(
         self,
@@ -138,7 +154,7 @@ class StepReplay(Generic[Result]):
             self._signature, self._recorded, self._is_repeatable = signature, [], True
         if recorded := self._recorded:
             with suppress(OutdatedError):  # then the work is recorded anew
-                results = of_all(lambda index, stages: recorded[index].repeat(observed[index], stages))
+                results = of_all(lambda index, stages: recorded[index].repeat_on(observed[index], stages))
                 for part in recorded:
                     part.check()
                 self.counts["replayed"] += 1

@@ -24,6 +24,7 @@ from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
 from gsbench.train.rows import Rows
 from gsbench.train.step import Step
+from gsbench.train.update import Update
 
 H = TypeVar("H", bound=Hook)
 
@@ -57,8 +58,8 @@ class TrainingParts:
             model, self.renderer.background, config.train.ssim_weight, config.raster.antialias, self.stages
         )
         self.finite_check = FiniteCheck(config.device)
-        if config.device.startswith("cuda"):  # a bad step is found some steps later, and must not be applied until then
-            self.optimizer.skip = self.finite_check.skip
+        replay = self.gradients.replay
+        self.update = Update(self.optimizer, self.finite_check, self.density, self.rows, replay, self.stages)
         self.curve = Curve()
         self.exact: set[str] = set()  # names of views that a measurement found exact (gsbench.measure.exact_views)
         self.hooks: list[Hook] = [hook(self) for hook in hook_types()]
@@ -128,6 +129,7 @@ class TrainingParts:
             self.step = whole_number("step", state["step"], self.config.train.iterations)
             self.model.load_state(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
+            self.update.forget()
             self.density.rule.load_state_dict(state["density"])
             for hook in self.hooks:
                 if not isinstance(saved := state["hooks"][hook.name], dict):

@@ -28,8 +28,9 @@ def test_adam_updates_what_was_drawn(shape: tuple[int, ...], step: float, place:
     updated = []
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        actual = [[x.clone().to(place.device)] for x in (p, g, m, v, torch.tensor(step), drawn)]
-        adam_all(*actual[:5], [0.01], BETAS, EPS, drawn=actual[5])
+        actual = [[x.clone().to(place.device)] for x in (p, g, m, v, torch.tensor(step - 1), torch.tensor(0.01), drawn)]
+        adam_all(*actual[:6], BETAS, EPS, drawn=actual[6])
+        assert actual[4][0] == step
         updated.append([actual[i][0].cpu() for i in (0, 2, 3)])
     for x, again, want, before in zip(*updated, expected, (p, m, v), strict=True):
         torch.testing.assert_close(x.double(), want, rtol=1e-5, atol=1e-6)
@@ -39,8 +40,8 @@ def test_adam_updates_what_was_drawn(shape: tuple[int, ...], step: float, place:
 
 @pytest.mark.usefixtures("threads")
 def test_all_parameters_in_one_call_are_updated_as_torch_does(place: Place) -> None:
-    """Catches a parameter that is left out or updated twice, another's rate or step, a 33rd that is forgotten, numbers
-    after the last whole block of a GPU, and what `skip` should have stopped."""
+    """Catches a parameter that is left out or updated twice, another's rate or count of updates, a 33rd that is
+    forgotten, numbers after the last whole block of a GPU, and what `skip` should have stopped."""
     random = torch.Generator().manual_seed(0)
     shapes = [(), (0, 3), (1,), (700, 1, 3), (60_000, 2), *[(i + 1,) for i in range(MAX_ADAM)]]
     rates = [0.001 * (i + 1) for i in range(len(shapes))]
@@ -58,12 +59,13 @@ def test_all_parameters_in_one_call_are_updated_as_torch_does(place: Place) -> N
         torch.set_num_threads(threads)
         x = [y.to(place.device, copy=True) for y in start]
         m, v = ([torch.zeros_like(y) for y in x] for _ in range(2))
-        for step, of_step in enumerate(gradients):
-            g, steps = [y.to(place.device) for y in of_step], [skip.new_tensor(step + 1.0)] * len(x)
-            adam_all(x, g, m, v, steps, rates, BETAS, EPS, skip)
-        updated.append([[y.cpu() for y in x], *[[y.clone() for y in z] for z in (x, m, v)]])
-        adam_all(x, g, m, v, steps, rates, BETAS, EPS, skip + 1)
-        assert all(map(torch.equal, [*x, *m, *v], [y for z in updated[-1][1:] for y in z]))
+        steps, in_memory = list(skip.new_zeros(len(x))), list(skip.new_tensor(rates))
+        for of_step in gradients:
+            g = [y.to(place.device) for y in of_step]
+            adam_all(x, g, m, v, steps, in_memory, BETAS, EPS, skip)
+        updated.append([[y.cpu() for y in x], *[[y.clone() for y in z] for z in (x, m, v, steps)]])
+        adam_all(x, g, m, v, steps, in_memory, BETAS, EPS, skip + 1)
+        assert all(map(torch.equal, [*x, *m, *v, *steps], [y for z in updated[-1][1:] for y in z]))
     for x, again, want in zip(updated[0][0], updated[1][0], expected, strict=True):
         torch.testing.assert_close(x, want.detach(), rtol=1e-5, atol=1e-6)
         assert torch.equal(x, again)
@@ -83,7 +85,7 @@ def test_one_bad_number_among_many_arrays_is_found(array: int, at: int, bad: flo
     arrays: list[Tensor | None] = [torch.full((n,), 3e38, device=place.device) for n in LENGTHS]
     arrays[3:5] = [None, torch.zeros(0, 3, device=place.device)]
     skip = torch.zeros((), device=place.device)
-    flags = torch.zeros(len(arrays), dtype=torch.bool, device=place.device)
+    flags = torch.zeros(len(arrays), device=place.device)
     flag_arrays(arrays, flags, skip)
     assert not flags.any()
     assert skip == 0
@@ -102,9 +104,9 @@ def test_every_array_is_flagged(place: Place) -> None:
     arrays = [torch.full((n,), math.nan, device=place.device) for n in (1, 2, 255, 256, 257, 1025)]
     arrays.append(torch.full((4, 3), math.inf, device=place.device).T[1:])
     arrays.append(torch.tensor([[0.0, math.nan]] * 9, device=place.device)[:, 0])  # the gaps alone are bad
-    skip, flags = torch.zeros((), device=place.device), torch.zeros(len(arrays), device=place.device).bool()
+    skip, flags = torch.zeros((), device=place.device), torch.zeros(len(arrays), device=place.device)
     flag_arrays(arrays, flags, skip)
-    assert flags.tolist() == [True] * 7 + [False]
+    assert flags.tolist() == [1] * 7 + [0]
 
 
 X, ONE = torch.zeros(4, 2), torch.ones(())
@@ -118,28 +120,29 @@ X, ONE = torch.zeros(4, 2), torch.ones(())
         ({2: torch.zeros(4, 2, dtype=torch.float16)}, "mean: .* got torch.float16"),
         ({3: torch.zeros(4, 2, dtype=torch.bfloat16)}, "square: .* got torch.bfloat16"),
         ({0: torch.zeros(2, 4).T}, "parameter: expected contiguous"),
-        ({4: torch.ones((), dtype=torch.int64)}, "step or skip: .* got torch.int64"),
-        ({5: torch.ones(3, dtype=torch.bool)}, r"drawn: expected contiguous torch.bool of shape \[4\] .* \[3\]"),
-        ({5: torch.ones(4)}, "drawn: .* got torch.float32"),
-        ({6: torch.zeros(1)}, r"skip: .* of shape \[\] on cpu, got torch.float32 of shape \[1\]"),
+        ({4: torch.ones((), dtype=torch.int64)}, "step, rate or skip: .* got torch.int64"),
+        ({5: torch.ones((), dtype=torch.float64)}, "step, rate or skip: .* got torch.float64"),
+        ({6: torch.ones(3, dtype=torch.bool)}, r"drawn: expected contiguous torch.bool of shape \[4\] .* \[3\]"),
+        ({6: torch.ones(4)}, "drawn: .* got torch.float32"),
+        ({7: torch.zeros(1)}, r"skip: .* of shape \[\] on cpu, got torch.float32 of shape \[1\]"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(changed: dict[int, Any], message: str) -> None:
     """Catches a mask or an array of another size or type, and a parameter with gaps, whose address reaches the
     kernel."""
-    listed = {i: X.clone() for i in range(4)} | {4: ONE.clone(), 5: None, 6: None} | changed
+    listed = {i: X.clone() for i in range(4)} | {4: ONE.clone(), 5: ONE.clone(), 6: None, 7: None} | changed
     *arrays, drawn, skip = listed.values()
     with pytest.raises(InputError, match=message):
-        adam_all(*[[x] for x in arrays], [0.1], BETAS, EPS, skip, [drawn])
+        adam_all(*[[x] for x in arrays], BETAS, EPS, skip, [drawn])
 
 
 @pytest.mark.parametrize(
     ("arrays", "flags", "message"),
     [
-        ([X.double()], torch.zeros(1).bool(), "arrays: expected contiguous torch.float32 .* got torch.float64"),
-        ([X.half()], torch.zeros(1).bool(), "arrays: .* got torch.float16"),
-        ([X, X], torch.zeros(1).bool(), r"flags: .* of shape \[2\] on cpu, got torch.bool of shape \[1\]"),
-        ([X], torch.zeros(1), "flags: expected contiguous torch.bool .* got torch.float32"),
+        ([X.double()], torch.zeros(1), "arrays: expected contiguous torch.float32 .* got torch.float64"),
+        ([X.half()], torch.zeros(1), "arrays: .* got torch.float16"),
+        ([X, X], torch.zeros(1), r"flags: .* of shape \[2\] on cpu, got torch.float32 of shape \[1\]"),
+        ([X], torch.zeros(1).bool(), "flags: expected contiguous torch.float32 .* got torch.bool"),
     ],
 )
 def test_flags_that_do_not_fit_are_refused(arrays: list[Tensor], flags: Tensor, message: str) -> None:

@@ -41,12 +41,13 @@ def test_the_parameter_is_named_at_its_step(loss: float, gradient: list[float] |
     alone, and a parameter without a gradient taken for a fault."""
     groups = {"means": [parameter([1.0, 2.0])], "refinement": [parameter([1.0, 1.0]), parameter(gradient)]}
     check = FiniteCheck("cpu")
+    check.check(torch.tensor([loss]), groups)
     if message is None:
-        check.check(3, torch.tensor(loss), groups)
+        check.end(3)
         assert check.loss == loss
     else:
         with pytest.raises(DivergedError, match=message):
-            check.check(3, torch.tensor(loss), groups)
+            check.end(3)
 
 
 def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
@@ -62,8 +63,9 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
         for step in range(1, 20):
             fitted.grad = torch.full((3,), math.nan if step == 6 else 1.0)
             before.append(fitted.detach().clone())
-            finite_check.check(step, torch.tensor(float(step)), {"means": [fitted]})
+            finite_check.check(torch.tensor([float(step)]), {"means": [fitted]})
             adam.step()
+            finite_check.end(step)
 
     with pytest.raises(DivergedError, match=r"step 6: the gradient of 'means' is not finite \(loss 6.0\)"):
         train()

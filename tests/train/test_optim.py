@@ -26,7 +26,9 @@ def fitted(
 def descend(model: GaussianModel, optimizer: Optimizer, step: int, drawn: torch.Tensor | None = None) -> None:
     loss = sum(((p + 1) * (i + 1)).square().sum() for i, p in enumerate(model.splats.values()))
     loss.backward()
-    optimizer.step(step, torch.ones(len(model), dtype=torch.bool) if drawn is None else drawn)
+    optimizer.begin(step)
+    optimizer.update(torch.ones(len(model), dtype=torch.bool) if drawn is None else drawn)
+    optimizer.end()
 
 
 PER_EXTENT, PER_RUN = LearningRate(1.6e-4, 1.6e-6, per_extent=True), LearningRate(1e-3, 1e-5, per_run=True)

@@ -10,10 +10,10 @@ namespace {
 constexpr int64_t CHUNK = 256;     // rows a thread takes at a time
 constexpr int64_t MANY = 1 << 16;  // numbers that are worth a second thread
 
-AdamRule rule_of(double rate, double beta1, double beta2, double eps, double step) {
+AdamRule rule_of(float rate, double beta1, double beta2, double eps, double step) {
     const auto f = [](double x) { return static_cast<float>(x); };
     const double left1 = 1.0 - ::pow(beta1, step), left2 = 1.0 - ::pow(beta2, step);
-    return {f(rate), f(beta1), f(beta2), f(eps), f(1.0 / left1), f(1.0 / ::sqrt(left2))};
+    return {rate, f(beta1), f(beta2), f(eps), f(1.0 / left1), f(1.0 / ::sqrt(left2))};
 }
 
 }  // namespace
@@ -21,10 +21,10 @@ AdamRule rule_of(double rate, double beta1, double beta2, double eps, double ste
 void adam_all(const AdamArgs& a, const AdamState& state) {
     if (a.skip && *a.skip != 0.0f) return;
     int64_t total = 0;
-    for (int i = 0; i < a.count; ++i) total += a.numbers[i];
+    for (int i = 0; i < a.count; ++i) total += a.numbers[i], *state.steps[i] += 1.0f;
 #pragma omp parallel num_threads(a.threads) if (total > MANY)
     for (int i = 0; i < a.count; ++i) {
-        const AdamRule rule = rule_of(a.rates[i], a.beta1, a.beta2, a.eps, *a.steps[i]);
+        const AdamRule rule = rule_of(*a.rates[i], a.beta1, a.beta2, a.eps, *state.steps[i]);
         const float* g = a.gradients[i];
         float *p = state.parameters[i], *m = state.means[i], *v = state.squares[i];
         if (!a.drawn[i]) {

@@ -45,8 +45,7 @@ void flag_values(const ValueArgs& a, const ValueFlags& out) {
 void flag_arrays(const FiniteArgs& a, const ArrayFlags& out) {
     for (int i = 0; i < a.count; ++i) {
         if (!good(finite(a.arrays[i], a.numbers[i], 0), a.threads)) {
-            out.flags[i] = true;
-            *out.skip = 1.0f;
+            out.flags[i] = *out.skip = 1.0f;
         }
     }
 }

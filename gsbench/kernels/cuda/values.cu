@@ -27,7 +27,7 @@ __global__ void flag_arrays_kernel(const __grid_constant__ FiniteArgs a, ArrayFl
             const float x = a.arrays[i][k];
             good &= x >= -FLT_MAX && x <= FLT_MAX;  // false for NaN
         }
-        if (!good) out.flags[i] = true, *out.skip = 1.0f;  // all threads write the same
+        if (!good) out.flags[i] = *out.skip = 1.0f;  // all threads write the same
     }
 }
 

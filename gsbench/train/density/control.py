@@ -55,14 +55,20 @@ class DensityControl:
         self._is_full = False  # whether the limit was reached
 
     def accumulate(self, step: int, views: Sequence[View], results: Sequence[PartResult]) -> None:
-        """Accumulate the gradients of a step, while Gaussians are densified, and prepare the model for a round."""
-        if step < self.schedule.densify_stop:
+        """Accumulate the gradients of a step, if they count; this can be recorded and repeated in other steps."""
+        if self.accumulates(step):
             for part in results:
                 camera = views[part.views[0]].camera
                 self.rule.accumulate(part.drawn, part.g_means2d, camera.width, camera.height, len(views))
-        if self.schedule.densifies(step):
-            centers = torch.stack([views[i].camera.center for part in results for i in part.views])
-            self.rows.model.before_density(centers, torch.cat([part.drawn for part in results]))
+
+    def accumulates(self, step: int) -> bool:
+        """Return whether the gradients of a step count: while Gaussians are densified."""
+        return step < self.schedule.densify_stop
+
+    def before_round(self, views: Sequence[View], results: Sequence[PartResult]) -> None:
+        """Prepare the model, before its update, for a round of densification at the end of the step."""
+        centers = torch.stack([views[i].camera.center for part in results for i in part.views])
+        self.rows.model.before_density(centers, torch.cat([part.drawn for part in results]))
 
     def after_update(self, step: int, optimizer: Optimizer) -> None:
         """Add noise, densify, thin and sort the Gaussians as the schedule says."""

@@ -40,7 +40,7 @@ class GradientRule(DensificationRule):
         self.gradient += torch.hypot(x * scale[0], y * scale[1]).sum(0)
         self.times_visible += drawn.sum(0)
         if self.unseen is not None:
-            self.unseen = (self.unseen + len(drawn)).masked_fill_(drawn.any(0), 0)
+            self.unseen.add_(len(drawn)).masked_fill_(drawn.any(0), 0)
 
     def mean_gradient(self) -> Tensor:
         """Return the mean of these norms over the views that saw each Gaussian, [N]."""

@@ -68,7 +68,10 @@ class DensificationRule(ABC):
         height: int,
         views: int,  # in the batch
     ) -> None:
-        """Accumulate the gradients of the 2D means in C views of a batch; by default they are not used."""
+        """Accumulate the gradients of the 2D means in C views of a batch; by default they are not used.
+
+        This is recorded and repeated, so it must change tensors in place, and no other state.
+        """
 
     def add_noise(self, rate: float, generator: torch.Generator) -> None:
         """Move means by noise after a step, where `adds_noise`; `rate` is the learning rate of means, world units."""
