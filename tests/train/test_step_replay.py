@@ -69,6 +69,18 @@ def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: Counter[st
         fitted.train_step()
 
 
+def test_moments_and_statistics_may_move(repeats: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches repeated updates of the memory in which Adam's moments or density statistics were before."""
+    states = []
+    for signature in (Step._signature, lambda *_: None):
+        monkeypatch.setattr(Step, "_signature", signature)
+        fitted = train(trainer("3dgs"), until=14)
+        fitted.rows.moved(torch.arange(len(fitted.model)))  # the parameters stay where they are
+        states.append(without_times(train(fitted, until=18).state_dict()))
+    assert_same_bits(*states)
+    assert repeats["done"] > 0
+
+
 def test_an_attribute_of_a_model_may_change(repeats: Counter[str]) -> None:
     """Catches a model of another author whose option, which a schedule of its own changes, is read only once."""
     fitted = trainer("3dgs")
