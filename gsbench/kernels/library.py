@@ -56,6 +56,11 @@ class Library:
         except ValueError as error:
             raise InputError(str(error)) from None
 
+    def zero(self, tensors: list[Tensor]) -> None:
+        """Set contiguous float32 tensors to zero; torch would first read those that do not fit into a cache."""
+        sizes, addresses = zip(*[(x.numel(), x.data_ptr()) for x in tensors], strict=True)
+        self.call("zero_arrays", {"count": len(tensors), "numbers": sizes, "arrays": addresses}, tensors[0])
+
     def has(self, name: str) -> bool:
         """Return whether there is a kernel with this name; some exist only on a GPU."""
         return name in self._fields
@@ -81,6 +86,10 @@ class CudaLibrary(Library):
             return
         with torch.cuda.device(device):
             super()._run(device, name, *values, torch.cuda.current_stream(device).cuda_stream)
+
+    def zero(self, tensors: list[Tensor]) -> None:
+        """Set tensors to zero, in one launch."""
+        torch._foreach_zero_(tensors)
 
     def similarity_parts(self, height: int, width: int) -> int:
         """Return the number of partial sums that the kernel of `l1_ssim` writes: one per thread block."""

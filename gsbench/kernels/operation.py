@@ -283,7 +283,7 @@ class Operation:
             else:
                 slots["grad.scratch"] = 0
         if zeroed:
-            torch._foreach_zero_(zeroed)  # on a GPU in one launch
+            library.zero(zeroed)
         library.call(self.backward_kernel, slots, like)
         return gradients
 

@@ -345,3 +345,15 @@ def test_the_extension_counts_and_types_its_values() -> None:
         native.slice_static(1, 2, 3)
     with pytest.raises(TypeError):
         native.slice_static(0, "means", 0, 0, 1, 0, 0)
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("sizes", [(0, 1, 7), (5, (1 << 20) + 3)])
+def test_zeroed_arrays_are_zero_and_their_neighbours_are_not(sizes: tuple[int, ...]) -> None:
+    """Catches the ends of arrays, which begin anywhere; zeros of large ones are written past the cache."""
+    around = [torch.ones(1 + n + 2) for n in sizes]
+    library_of("cpu").zero([x[1:-2] for x in around])
+    for x in around:
+        assert not x[1:-2].any()
+        assert x[0] == 1
+        assert (x[-2:] == 1).all()

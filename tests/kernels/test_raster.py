@@ -1,5 +1,6 @@
 """The rasterizer's kernels against a brute-force picture, the reference's gradients in float64, and their promises."""
 
+import math
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
@@ -13,7 +14,7 @@ from raster.cases import CASES, assert_beta_vector, camera, case, gaussians
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels import raster
+from gsbench.kernels import operation, raster
 from gsbench.raster import RasterOutput, rasterize
 
 DIFFERENTIABLE = ("means", "factors", "opacities", "colors", "viewmats", "background", "beta_exponents")
@@ -213,6 +214,23 @@ def test_bad_values_are_named(name: str, value: float, message: str, place: Plac
 def test_beta_vector(place: Place) -> None:
     """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
     assert_beta_vector(place.device, torch.float32, 2e-4)
+
+
+@pytest.mark.usefixtures("instruction_set")
+def test_gradients_of_many_gaussians_are_zero_where_none_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches rows that stay as they were in memory, where zeros are written past the cache."""
+    monkeypatch.setattr(operation, "allocate", lambda _, like, shape: like.new_full(shape, math.nan))
+    N, last = 90_001, 20
+    arguments = cast(gaussians(torch.Generator().manual_seed(0), N) | camera(64, 64), torch.float32)
+    leaves = [arguments[name].requires_grad_() for name in ("means", "factors", "opacities")]
+    rest = [arguments[name] for name in ("colors", "viewmats", "Ks")]
+    inputs = raster.RasterInputs(*leaves, *rest, torch.zeros(3), None)
+    splats = raster.project(inputs, raster.Viewport(64, 64, 0.01, 100.0, 0.3, False))
+    (splats.means2d[0, -last:].sum() + splats.roots[0, -last:].sum()).backward()
+    for x in leaves:
+        assert x.grad is not None
+        assert not x.grad[:-last].any()
+        assert x.grad[-last:].any(0).all()
 
 
 @pytest.mark.usefixtures("instruction_set")

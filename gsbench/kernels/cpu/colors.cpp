@@ -57,11 +57,12 @@ struct Rows {
             all[k] = ones[k] * stride;
         }
     }
-    // Prefetches the first floats of the row sixteen rows further on; picked rows are not adjacent, so the processor
-    // would not.
+    // Prefetches the first floats of the row sixteen rows further on. Only long adjacent rows does the processor itself
+    // fetch in time; picked rows need not be adjacent.
     template <bool WRITE>
     GSB_HD void prefetch(const float* p, int width, int i) const {
-        if (!width || i + LANES >= left || which[i + LANES] == which[i + LANES - 1] + 1) return;
+        if (!width || i + LANES >= left) return;
+        if (width > 4 * LANES && which[i + LANES] == which[i + LANES - 1] + 1) return;
         const float* row = p + static_cast<int64_t>(which[i + LANES]) * stride;
         for (int k = 0; k < width; k += LANES) __builtin_prefetch(row + k, WRITE);
         __builtin_prefetch(row + width - 1, WRITE);

@@ -189,6 +189,15 @@ struct NodeGrads {
 };
 GSB_FIELDS(NodeGrads, GRADS, of_space, of_time)
 
+// Arrays to set to zero.
+struct ZeroArgs {
+    int count;
+    int64_t numbers[MAX_ADAM];
+    float* arrays[MAX_ADAM];  // [numbers]
+    int threads;
+};
+GSB_FIELDS(ZeroArgs, INPUTS, count, numbers, arrays, threads)
+
 }  // namespace gsb
 
 #define GSB_CPU_KERNELS(kernel)                    \
@@ -204,7 +213,8 @@ GSB_FIELDS(NodeGrads, GRADS, of_space, of_time)
     kernel(sample_planes, PlaneArgs, Products)     \
     kernel(sample_planes_backward, PlaneArgs, ProductGrads, PlaneGrads) \
     kernel(plane_penalty, PenaltyArgs, Penalty)    \
-    kernel(plane_penalty_backward, PenaltyArgs, PenaltyGrad, NodeGrads)
+    kernel(plane_penalty_backward, PenaltyArgs, PenaltyGrad, NodeGrads) \
+    kernel(zero_arrays, ZeroArgs)
 
 namespace gsb {
 

@@ -85,7 +85,7 @@ void project_as(const ProjectArgs& a, const Splats& out) {
 
 template <class Profile>
 void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const ProjectGrads& out) {
-    const int64_t chunks = (a.N + CHUNK - 1) / CHUNK;
+    const int64_t chunks = (a.N + CHUNK - 1) / CHUNK, written = 13 * a.N * (a.gaussian_per_camera ? a.C : 1);
     Buffer<float> camera_grads(static_cast<size_t>(chunks * a.C * 12));
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
@@ -100,9 +100,9 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
                 const int64_t at = first_of(a, c) + i;
                 if (is_zero(grads, c * a.N + i, n)) {
                     if (adds) continue;
-                    fill_zero(out.means, 3, at, at + n);
-                    fill_zero(out.factors, 9, at, at + n);
-                    fill_zero(out.opacities, 1, at, at + n);
+                    zero_rows(out.means, 3, at, at + n, written);
+                    zero_rows(out.factors, 9, at, at + n, written);
+                    zero_rows(out.opacities, 1, at, at + n, written);
                     continue;
                 }
                 Projection<Vec> projection = load(a, camera, at, n);
@@ -133,6 +133,7 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
                     g_view[3] += masked(drawn, grad.translation);
                 }
             }
+            finish_zeros();
             if (!out.viewmats) continue;
             float* g = &camera_grads[static_cast<size_t>((chunk * a.C + c) * 12)];
             for (int k = 0; k < 4; ++k, g += 3) {

@@ -104,5 +104,26 @@ GSB_HD inline void fill_zero(float* rows, int width, int64_t first, int64_t end)
     __builtin_memset(rows + first * width, 0, sizeof(float) * static_cast<size_t>((end - first) * width));
 }
 
+// Sets rows of new arrays of `total` floats to zero. If these do not stay in cache, zeros are written past it: otherwise
+// a processor reads all memory that it is about to overwrite. Call `finish_zeros` before other threads read them.
+GSB_HD inline void zero_rows(float* rows, int width, int64_t first, int64_t end, int64_t total) {
+#if defined(__SSE__)
+    constexpr int64_t CACHED = 1 << 20;  // 4 MB: larger than the cache of a core
+    if (total > CACHED) {
+        float *p = rows + first * width, *const last = rows + end * width;
+        for (; p < last && reinterpret_cast<uintptr_t>(p) % 16; ++p) *p = 0.0f;
+        for (; p + 4 <= last; p += 4) _mm_stream_ps(p, _mm_setzero_ps());
+        for (; p < last; ++p) *p = 0.0f;
+        return;
+    }
+#endif
+    fill_zero(rows, width, first, end);
+}
+GSB_HD inline void finish_zeros() {
+#if defined(__SSE__)
+    _mm_sfence();
+#endif
+}
+
 }  // namespace GSB_ISA
 }  // namespace gsb
