@@ -131,22 +131,23 @@ def _indicators(groups: list[list[int]]) -> Array:  # [V, P]
 
 
 def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:
-    """Combine the p-values of two tests whether a scene changes with time, by Fisher's method.
+    """Combine two tests whether a scene changes with time.
 
     One test has the views from repeated camera positions, the other has all other views. The combined p-value is q (1 -
-    ln q), where q is the product of the two p-values.
+    ln q), where q is the product of the two p-values (Fisher). z-scores are added and divided by sqrt 2 (Stouffer).
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:
         return _answer(OFF, reason, loose.p, loose.z, loose.free)
     is_blind = loose.free is not None and loose.free < LEAST_FREE  # time and camera position are too correlated
-    tested = [answer for answer in (fixed, *[loose] * (not is_blind)) if answer.p is not None]
+    usable = [fixed] if is_blind else [fixed, loose]
+    tested = [(answer.p, answer.z) for answer in usable if answer.p is not None and answer.z is not None]
     if not tested:
         return _answer(UNDECIDED, reason, free=loose.free)
     if len(tested) == 1:
-        p, z = tested[0].p, tested[0].z
+        ((p, z),) = tested
     else:
-        q = math.prod(answer.p or 1.0 for answer in tested)
-        p, z = q * (1 - math.log(q)), sum(answer.z or 0.0 for answer in tested) / math.sqrt(2)
+        q = math.prod(p for p, _ in tested)
+        p, z = q * (1 - math.log(q)), sum(z for _, z in tested) / math.sqrt(2)
         reason += f"; together p = {p:.3f}"
-    return _answer(ON if p is not None and p <= LEVEL else UNDECIDED, reason, p, z, loose.free)
+    return _answer(ON if p <= LEVEL else UNDECIDED, reason, p, z, loose.free)

@@ -123,7 +123,10 @@ class FlickerScores:
 
 
 def films_of(views: Sequence[View]) -> list[list[View]]:
-    """Return the views of each camera that has at least three, in the order of their times."""
+    """Return the views of each camera that is a film: it has at least three, and their times rise from view to view.
+
+    Other cameras are left out, because a film's frames are compared in the order in which they are rendered.
+    """
 
     def is_in_order(group: list[View]) -> bool:
         times = [view.time for view in group]

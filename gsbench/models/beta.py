@@ -48,16 +48,19 @@ class BetaModel(GaussianModel):
         return skew_factor(raw["scales"], raw["skew"])
 
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
-        """Return spheres without rotation that end at the distances [N] of the points to their neighbours."""
-        N, time = len(distances), "time" in self.observes
-        view = VIEW_BETA if time else 0.0
+        """Return spheres without rotation that end at the distances [N] of the points to their neighbours.
+
+        Mean directions are random in the cube [-1, 1]^3, and mean times in [0, 1], as in the authors' code.
+        """
+        N, has_time = len(distances), "time" in self.observes
+        exponents = [0.0, *([VIEW_BETA] * 3 if has_time else [0.0] * 3), *([0.0] if has_time else [])]
         raw = {
             "directions": torch.rand(N, 3, generator=generator) * 2 - 1,
             "scales": softplus_inverse(distances)[:, None].repeat(1, 3),
             "skew": torch.zeros(N, 3),
-            "betas": torch.tensor([0.0, view, view, view] + [0.0] * time).repeat(N, 1),
+            "betas": torch.tensor(exponents).repeat(N, 1),  # alpha's profile, direction x, y, z, time
         }
-        return raw | {"times": initial_times(points, generator, margin=0)} if time else raw
+        return raw | {"times": initial_times(points, generator, margin=0)} if has_time else raw
 
     def spatial_scales(self) -> Tensor:
         """Return the sizes S of the Gaussians that look like the profiles, [N, 3]; gradients reach S, not b."""

@@ -121,7 +121,7 @@ class GatedModel(GaussianModel):
 
     def _unpacked(self, state: dict[str, Any], effect_sets: EffectSets) -> dict[str, Any]:
         """Restore full parameter tensors from a checkpoint, which stores only the entries that change an image."""
-        assert effect_sets.orders is not None
+        assert effect_sets.orders is not None  # a checkpoint always has them
         unpacked = {key: value for key, value in state.items() if not key.startswith(_STATE)}
         for name, mask in self.used_entries(effect_sets).items():
             key, shape = f"splats.{name}", (len(effect_sets.orders), *self.splats[name].shape[1:])

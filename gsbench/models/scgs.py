@@ -116,7 +116,7 @@ class Nodes(nn.Module):
 
     def __init__(self, count: int) -> None:
         super().__init__()
-        self.positions = nn.Parameter(torch.zeros(count, 3))
+        self.positions = nn.Parameter(torch.zeros(count, 3))  # until `place`, as log_radii
         self.features = nn.Parameter(torch.full((count, FEATURES), 1e-2))
         self.log_radii = nn.Parameter(torch.zeros(count))
         self.logits = nn.Parameter(torch.zeros(count))

@@ -90,6 +90,7 @@ def check_device_name(name: str) -> None:
 
 def _check_keys(value: Any, place: str = "") -> None:
     """Raise InputError if the settings have an unknown key, which Hydra's `+key=` adds without an error."""
+    # The keys of a dict are free. The attributes of a dataclass must be its fields.
     fields = {field.name for field in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else None
     members = value if isinstance(value, dict) else vars(value) if fields else {}
     for name, member in members.items():

@@ -195,9 +195,9 @@ def _open(name: str, path: Path) -> _Film:
     if path.is_dir():
         folder = path / "images" if (path / "images").is_dir() else path
         numbered = sorted(
-            (int(number[0]), name)
-            for name in os.listdir(folder)
-            if (stem := files.without_suffix(name)) != name and (number := re.search(r"\d{1,9}$", stem))
+            (int(number[0]), file)
+            for file in os.listdir(folder)
+            if (stem := files.without_suffix(file)) != file and (number := re.search(r"\d{1,9}$", stem))
         )
         if not numbered:
             raise InputError(f"{folder}: expected a PNG or JPEG for each frame, with its number at the end of the name")

@@ -145,7 +145,11 @@ def read(
     in_8_bits: bool | None = None,  # whether pixels stay in 8 bits (not if reduced); None: those of a large scene do
     decode: Callable[[Shot, bytes], Pixels] = lambda shot, data: images.decode_photo(data, shot.where),
 ) -> Shots:
-    """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis."""
+    """Read all images by several threads; K is scaled as the image is, by the ratio of the sizes along each axis.
+
+    Raises:
+        InputError: an image is damaged, or has another size than the first one.
+    """
     first, downscale = shots[0], rendition.downscale
     data = images.read_image(first.path, first.where)
     size = images.photo_size(data, first.where)

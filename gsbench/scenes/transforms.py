@@ -139,7 +139,7 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
         splits["val"] = _read_split(root, "transforms_val.json", finder)
     timed, notes = _times(list(splits.values()))
-    size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)
+    size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)  # shots.read refuses others
     listed = [
         shot for split, part in zip(splits.values(), timed, strict=True) for shot in _shots_of(split.frames, part, size)
     ]

@@ -79,7 +79,7 @@ class DensityControl:
         if schedule.densifies(step):
             most = schedule.most_gaussians(step, self.limit)
             refused = self.rule.densify(generator(seed, step), schedule.has_reset(step), most)
-            if refused and schedule.resolution(step) == 1:
+            if refused and schedule.resolution(step) == 1:  # at a lower one, the limit is lower for a while only
                 self._report_full(step, refused, most)
         if schedule.thins(step):
             self.thin()

@@ -45,7 +45,7 @@ class EarlyStop(Hook):
         self.stop: Stop | None = None  # of a training that has ended
         self._best: tuple[int, float] | None = None  # iteration and PSNR on val, dB
         self._kept: dict[str, Any] | None = None  # the state at that iteration; None if it is the last one
-        self._last = 0  # the last measured iteration
+        self._last = 0  # the last measured iteration; not stored, as the last step is always measured
 
     @classmethod
     def check(cls, config: Config) -> None:
