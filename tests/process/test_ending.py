@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from tiny_run import ROOT
 
+from gsbench.process.ending import end_with
+
 FULL = Path("/dev/full")
 PRINTS = "from gsbench.process.ending import end_with; end_with('gsbench.x', lambda: print('text') or {status})"
 
@@ -63,3 +65,11 @@ def test_all_commands_end_so():
     for path, end in ends.items():
         command = ".".join(path.with_suffix("").parts).removesuffix(".__main__")
         assert not end or f'end_with("{command}", ' in end or path == Path("gsbench/__main__.py"), path
+
+
+def test_an_output_that_was_closed_before_is_no_error(monkeypatch):
+    """Catches a stack trace of `python -m gsbench.report ... >&-`, where Python has no sys.stdout."""
+    monkeypatch.setattr(sys, "stdout", None)
+    with pytest.raises(SystemExit) as end:
+        end_with("gsbench.x", lambda: 3)
+    assert end.value.code == 3
