@@ -213,17 +213,17 @@ def apply(
     for way in simplifications:
         if way.raw is None:
             continue
-        rows = (
+        chosen = (
             choice.geometry[way.name]
             if way.order is None
             else ((choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order)))
         )
         for key, value in way.raw.items():
-            model.splats[key].data[rows] = value[rows]
+            model.splats[key].data[chosen] = value[chosen]
     place = torch.arange(len(model), device=now.orders.device)
     static = (place >= now.conditioned) | choice.geometry.get(STATIC, torch.zeros_like(place, dtype=torch.bool))
     refined = (place < now.refined) & choice.geometry[LIVE]
-    kind = torch.where(refined, 0, torch.where(static, 2, 1))
+    kind = torch.where(refined, 0, torch.where(static, 2, 1))  # 1: conditioned
     # Gaussians are sorted by the effects that remain, then by the order of their colours, so that neighbours need the
     # same work. Otherwise their order does not change.
     rank = kind * (MOST_PACKED + 1) + MOST_PACKED - choice.orders

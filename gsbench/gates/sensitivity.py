@@ -179,13 +179,14 @@ class ProbedView:
         thin = changed._replace(opacities=changed.opacities.clamp(max=THIN))
         pairs = zip(tensors_of(live), tensors_of(thin), strict=True)
         both = self._draw(Gaussians3D(*(torch.cat(pair) for pair in pairs)))
-        size = torch.maximum(self.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3
-        distance = (both.means2d[N:] - self.drawn.means2d[:n]) / (2 * size[:, None])
-        overlap = torch.exp(-distance.square().sum(-1))
+        size = torch.maximum(self.drawn.radii[:n], both.radii[N:]).clamp(min=1) / 3  # pixels; not drawn: radius 0
+        half_offset = (both.means2d[N:] - self.drawn.means2d[:n]) / (2 * size[:, None])  # [n, 2] d / 2
+        overlap = torch.exp(-half_offset.square().sum(-1))
         shown = 1 - HIDDEN * live.opacities[:n] * overlap
         scale = changed.opacities / (thin.opacities.clamp(min=1e-12) * shown)  # the image is linear in each opacity
         thin_products = both.products(self.vectors)[:, N:]
         products = thin_products * scale[:, None]  # as if `changed` was in the image, instead of `thin`
+        # A derivative by an opacity does not grow with this opacity.
         products[..., OPACITY] = thin_products[..., OPACITY] / shown
         moved = ((self.products[:, :n] + products) * (_matrix_of(changed) - self.matrix[:n])).sum(-1) / 2
         added = products[..., OPACITY] * changed.opacities

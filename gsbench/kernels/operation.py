@@ -162,8 +162,8 @@ class Operation:
     def record(self, tensors: Tensors, numbers: tuple[Any, ...], results: Results | None = None) -> Tensors:
         """Return the outputs of a call, recorded for the backward pass.
 
-        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`; what looks at
-        each operator sees this one, which computes them again.
+        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`. torch.compile
+        and dispatch modes see the registered operator, which computes them again.
         """
         if (recording := getattr(active, "tape", None)) is not None:
             return recording.record(self, tensors, numbers, results)

@@ -251,7 +251,7 @@ def enqueue(inputs: RasterInputs, viewport: Viewport, room: int) -> Drawing:
     library, size = library_of(means.device.type), viewport[:2]
     projection = _project.split((means, factors, opacities, viewmats, Ks, beta_exponents, *viewport))
     splats, slots = projected = _project.allocate_results(*projection)
-    means2d, roots, depths, half_sizes = splats
+    means2d, roots, depths, half_sizes = splats  # depths [C, N]
     offsets = allocate("lists of tiles", means, (len(depths) * count_tiles(*size) + 1,), torch.int32)
     ids = allocate(PAIRS, means, (room,), torch.int32)
     blending = _blend.split((means2d, roots, half_sizes, colors, background, offsets, ids, beta_exponents, *size))
@@ -260,9 +260,10 @@ def enqueue(inputs: RasterInputs, viewport: Viewport, room: int) -> Drawing:
     scratch_bytes = library.extension.draw_scratch(depths.numel(), room)
     scratch = allocate(PAIRS, means, (scratch_bytes,), torch.uint8)
     out = {"offsets": offsets, "ids": ids, "needed": needed, "scratch": scratch}
+    # `draw` has the arguments of projection and blending, and its own.
     slots = slots | blended[1] | {f"out.{key}": address(x) for key, x in out.items()}
     library.call("draw", slots | {"out.room": room, "out.scratch_bytes": scratch_bytes}, means)
-    del out  # what torch.compile runs would free it before the call
+    del out  # used until here, because compiled code frees a tensor after its last use, and the call has its address
     return Drawing((*projection, projected), (*blending, blended), needed)
 
 

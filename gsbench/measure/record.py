@@ -316,10 +316,13 @@ def parsed(plain: Any, path: Path | str) -> Record:
 
 
 def find(root: Path, name: str = FILE_NAME) -> list[Path]:
-    """Return the sorted paths of all files of a name under `root`, without subfolders called "published"."""
+    """Return the sorted paths of all files of a name under `root`, without subfolders called "published".
+
+    A broken link or a folder of this name counts too, so that whoever reads it reports it.
+    """
     paths = []
     for folder, folders, names in os.walk(root):
-        if name in names or name in folders:  # a broken link counts too, so that it is reported
+        if name in names or name in folders:
             paths.append(Path(folder, name))
         folders[:] = [inner for inner in folders if inner != PUBLISHED]
     return sorted(paths)

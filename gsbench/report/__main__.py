@@ -103,16 +103,16 @@ def _report(results: Results, columns: Sequence[str], options: argparse.Namespac
     shown = output.shown_sections(results, columns, latex=options.latex)
     if options.latex:
         print(text.latex(shown))
-    elif not _answered_in_json(options, lambda: _numbers(results)):
+    elif not _answered_in_json(options, lambda: _content(results)):
         print(text.terminal(shown))
         if not options.select:
             print(f"Written: {', '.join(map(str, output.write(results, options.results, shown)))}")
 
 
-def _numbers(results: Results) -> dict[str, object]:
-    """Return all sections of a report and the facts of every run as plain values."""
-    left_out = ("gallery", "runs")  # images, and a table that `runs` below replaces
-    sections = [section for chapter in results.chapters() for section in built(chapter) if section.key not in left_out]
+def _content(results: Results) -> dict[str, object]:
+    """Return all sections, the facts of every run, and why records were left out, as plain values for JSON."""
+    skipped = ("gallery", "runs")  # images, and a table that `runs` below replaces
+    sections = [section for chapter in results.chapters() for section in built(chapter) if section.key not in skipped]
     runs = results.runs.drop(columns=["path", "record"]).to_dict("records")
     return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
 

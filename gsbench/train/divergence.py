@@ -29,7 +29,7 @@ class FiniteCheck:
         self.loss = math.nan  # loss of the last step that was looked at
         self.skip = torch.zeros((), device=device)
         self._names: list[str] = []  # the group of each parameter
-        # [parameters + 2]: 1 for each gradient, and then the loss, that was not finite in any step; the last loss
+        # [parameters + 2]: for each gradient, and then for the loss, 1 once it was not finite, else 0; the last loss
         self._now = torch.empty(0)
         self._steps: list[int] = []  # since the last look
         self._then = torch.empty(0)  # [every, parameters + 2]: `_now` after each of these steps

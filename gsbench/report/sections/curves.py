@@ -42,13 +42,14 @@ def mean_curves(chapter: Results) -> pd.DataFrame:
 
 
 def targets(chapter: Results) -> pd.DataFrame:
-    """Return the PSNR targets of every scene and the training seconds that each model needs to reach them.
+    """Return the PSNR targets of every scene and the training seconds that each series needs to reach them.
 
-    A model's seconds are the least after which the mean curve of one of its configurations has the target; infinite: it
-    never has. Nothing is interpolated between measurements.
+    A series is a model, with its gates. Its seconds are the least after which the mean curve of one of its
+    configurations reaches the target; infinite: it never does. Nothing is interpolated between measurements.
     """
     runs = chapter.finished.runs
     ends = runs.groupby(CONFIGURATION)[["train_s", "psnr_val_db"]].mean().dropna().reset_index()
+    # Ends count too: a configuration of runs of several lengths has no mean curve.
     reached = pd.concat([ends, mean_curves(chapter).merge(ends[CONFIGURATION])], ignore_index=True)
     rows = []
     for scene, ends_of_scene in ends.groupby("scene"):

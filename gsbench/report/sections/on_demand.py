@@ -80,10 +80,11 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
     names = [*SHOWN, "evaluated", "checked"]
     numbers = pd.DataFrame(rows, runs.index).reindex(columns=["gated_at_end", *TEXTS, *names])
     numbers = numbers.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))
-    numbers[["free", "asleep"]] *= 100
+    numbers[["free", "asleep"]] *= 100  # shares, in per cent
     numbers[LOSSES] *= -1  # as changes
     numbers["ms"] -= numbers.ms_before
     key = [runs[name] for name in ("scene", "model", "variant")]
+    # Views of one kind for all seeds of a configuration. A run that was not gated at its end has neither number.
     is_evaluated = (numbers.evaluated.notna() | ~numbers.gated_at_end).groupby(key).transform("all")
     numbers["dB"] = numbers.evaluated.where(is_evaluated, numbers.checked)
     numbers["measured on"] = numbers.split.where(is_evaluated, numbers.checked_on).where(numbers.gated_at_end)
