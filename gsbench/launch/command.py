@@ -202,7 +202,9 @@ def _check_distinct(runs: Sequence[RunConfig]) -> None:
     for run in runs:
         plain: Any = OmegaConf.to_container(_with_paths(run.config), resolve=True)
         groups = {group: choice for group, choice in run.choices.items() if names_variant(group)}
-        key = config_hash({"": [plain["results"], plain["experiment"], training_hash(plain), groups]})
+        # The hash of an initial PLY is of its content, which is read when the run begins.
+        where = plain["results"], plain["experiment"], plain["init"]["ply"]
+        key = config_hash({"": [*where, training_hash(plain), groups]})
         other = before.setdefault(key, run)
         if other is run:
             continue

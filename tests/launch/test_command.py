@@ -109,9 +109,10 @@ def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
 
 
 def test_a_sweep_of_different_runs_is_allowed() -> None:
-    """Catches a sweep over protocols or folders of results, which trains the same, that is refused as one run, and a
-    key that one of its runs does not read."""
-    for words in ("protocol=gsbench,published", "results=a,b", "effects.budget_db=1 effects.gate=end,off"):
+    """Catches a sweep over protocols, folders of results or initial PLYs that is refused as one run, and a key that one
+    of its runs does not read."""
+    several = ("protocol=gsbench,published", "results=a,b", "+init.ply=a,b", "effects.budget_db=1 effects.gate=end,off")
+    for words in several:
         runs = runs_of(parse(["+exp=mini", "-m", "scene=dust", *words.split()]))[0]
         check_runs([compose_run(run) for run in runs])
 

@@ -418,7 +418,8 @@ def test_a_checkpoint_is_the_model(variant: str, split: bool) -> None:
     state, means = model.pack(), model.pack()["splats.means"]
     damaged = (means[:-1], means[:, :2], means[0, 0], means.float(), means.to_sparse(), "means")
     foreign = [lively(name).pack() for name in MODELS if name != EVERY[variant][0]]
-    foreign += [lively(variant, sh_degree=2).pack(), lively(variant, agr=not model.agr).pack()]
+    shape = dict.fromkeys(key for key in EVERY[variant][1] if key.startswith("agr_"))  # is refused without AGR
+    foreign += [lively(variant, sh_degree=2).pack(), lively(variant, agr=not model.agr, **shape).pack()]
     foreign += [lively(variant, time_degree=1).pack()] if variant.startswith("4dgs") else []
     foreign += [state | {"splats.means": x} for x in damaged] + [state | {"splats.extra": means}, {}]
     for wrong in (*foreign, {key: x for key, x in state.items() if key != "splats.means"}):

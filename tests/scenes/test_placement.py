@@ -221,20 +221,24 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
     torch.testing.assert_close(means, trained["plain"].means, rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("near", [None, 1.0, 300.0, 600.0])
+@pytest.mark.parametrize("near", [None, 1.0, 300.0, 500.0, 600.0])
 def test_a_near_plane_is_in_the_users_units(near: float | None, tmp_path: Path) -> None:
     """Catches a near plane in units of the training, and a training, a measurement or a loaded run without it.
 
-    The cameras are at 400 from the square, whose half size is 150.
+    The cameras are at 400 from the square, whose half size is 150. Few of the initial points are farther than 500.
     """
     data = moved_square(tmp_path / "data", 100.0, (0.0, 0.0, 0.0))
     words = overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=5", f"data.near={near or 'null'}")
     record, folder = run_here(*words)
-    is_cut, run = near == 600, load_run(folder)
-    assert (record.metrics["psnr"] == record.metrics["psnr_background_only"]) == is_cut
+    if near == 600:
+        assert "lower data.near" in str(record.reason)
+        return
+    is_cut = near == 500
+    assert (record.metrics["psnr"] < record.metrics["psnr_background_only"] + 0.3) == is_cut  # else + 0.9
     assert record.metrics["psnr_float32"] < 0.01  # dB: the float64 image is cut too
+    run = load_run(folder)
     (image,) = video.frames(run, [(video.around(run, 0.0, 0.3), 0.5)])
-    assert (image == image[0, 0]).all() == is_cut
+    assert (image.mean() < 17) == is_cut  # 14, else 20; the background is black
 
 
 def test_points_that_no_camera_sees_are_refused(tmp_path: Path) -> None:
