@@ -5,6 +5,7 @@
 
 import argparse
 import copy
+import dataclasses
 import itertools
 import re
 from collections import Counter
@@ -25,7 +26,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from gsbench.config import CONF, PATHS, register_schema
+from gsbench.config import CONF, PATHS, Config, register_schema
 from gsbench.config_roles import config_hash, facts, key_of, names_variant, training_hash
 from gsbench.errors import InputError, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
@@ -200,10 +201,11 @@ def _check_distinct(runs: Sequence[RunConfig]) -> None:
     """
     before: dict[str, RunConfig] = {}
     for run in runs:
-        plain: Any = OmegaConf.to_container(_with_paths(run.config), resolve=True)
+        config = _with_paths(run.config)
+        plain: Any = OmegaConf.to_container(config, resolve=True)
         groups = {group: choice for group, choice in run.choices.items() if names_variant(group)}
         # The hash of an initial PLY is of its content, which is read when the run begins.
-        where = plain["results"], plain["experiment"], plain["init"]["ply"]
+        where = [OmegaConf.select(config, key) for key in ("results", "experiment", "init.ply")]
         key = config_hash({"": [*where, training_hash(plain), groups]})
         other = before.setdefault(key, run)
         if other is run:
@@ -272,9 +274,13 @@ def explain(error: Exception) -> str:
 
 def _compose(overrides: Sequence[str]) -> DictConfig:
     try:
-        return compose("config", list(overrides), return_hydra_config=True)
+        config = compose("config", list(overrides), return_hydra_config=True)
     except Exception as error:  # Hydra and OmegaConf raise errors of many types for a wrong word
         raise InputError(explain(error)) from None
+    for field in dataclasses.fields(Config):
+        if field.name not in config.keys():  # noqa: SIM118  a key that has no value yet is there
+            raise InputError(f"config key '{field.name}': expected a value, it was deleted: leave '~{field.name}' out")
+    return config
 
 
 def _values(override: Any) -> tuple[str, list[str]]:

@@ -83,6 +83,7 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ("+exp=mini -m seed=interval(0,3)", "expected quotes|expected values"),
         ("+exp=mini --config-name=x", "--config-name=x: expected -m"),
         ("+exp=mini --multi", "--multi: expected -m"),
+        ("+exp=mini ~data", "config key 'data': expected a value, it was deleted: leave '~data' out"),
         ("+exp=mini data.scenes=[new] scene=newer", "scene 'newer' is not known"),
         ("+exp=mini scene.name=suzanne", "one run in one folder: .* scene=moving-matte' and .*: add scene=custom"),
         ("+exp=mini -m scene=dust data.root=a,b", "one run in one folder: .*: leave one of them out"),
