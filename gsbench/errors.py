@@ -30,6 +30,11 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     return f"{guess}Valid: {', '.join(choices)}."
 
 
+def deleted_key(key: str) -> InputError:
+    """Return the error that a command line has deleted a config key, such as by "~init"."""
+    return InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
+
+
 def refuse_options(options: object, names: Iterable[str], task: str) -> None:
     """Raise InputError if an option of a command line is set that a task, such as "--page", does not read."""
     for name in names:

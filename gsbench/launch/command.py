@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, PATHS, Config, register_schema
 from gsbench.config_roles import config_hash, facts, key_of, names_variant, training_hash
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, deleted_key, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
 
@@ -279,7 +279,7 @@ def _compose(overrides: Sequence[str]) -> DictConfig:
         raise InputError(explain(error)) from None
     for field in dataclasses.fields(Config):
         if field.name not in config.keys():  # noqa: SIM118  a key that has no value yet is there
-            raise InputError(f"config key '{field.name}': expected a value, it was deleted: leave '~{field.name}' out")
+            raise deleted_key(field.name)
     return config
 
 

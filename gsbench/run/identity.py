@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import CONF, Config
 from gsbench.config_roles import OWN_NAMES, Plain, flat, names_variant, recorded, repeating, training_keys
-from gsbench.errors import InputError
+from gsbench.errors import InputError, deleted_key
 from gsbench.measure import record as records
 from gsbench.reading import read_file
 from gsbench.run.grammar import quoted_value
@@ -56,7 +56,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     """
     for key in fields(Config):
         if key.name not in composed:
-            raise _deleted(key.name)
+            raise deleted_key(key.name)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     for dotted, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
         if name == records.PUBLISHED:
@@ -73,10 +73,6 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     )
     plain = _storable(recorded(plain))
     return RunSpec(config, plain, folder, label, variant, repeating(overrides))
-
-
-def _deleted(key: str) -> InputError:
-    return InputError(f"config key '{key}': expected a value, it was deleted: leave '~{key}' out")
 
 
 def hash_of(ply: str) -> str:
@@ -111,7 +107,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     after = dict(flat(plain))
     for key in before:
         if key.startswith("model.") and key not in after:
-            raise _deleted(key)
+            raise deleted_key(key)
     changed = {key: value for key, value in training_keys(plain).items() if key not in before or value != before[key]}
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):

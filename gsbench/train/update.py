@@ -71,8 +71,8 @@ class Update:
             with stages("density"):
                 self.density.accumulate(step, views, results)
             with stages("optimizer"):
-                self.check.check(in_one([part.loss for part in results]), self.optimizer.groups)
-                drawn = in_one([part.drawn for part in results]).any(0) if self.optimizer.is_sparse else None
+                self.check.check(_joined([part.loss for part in results]), self.optimizer.groups)
+                drawn = _joined([part.drawn for part in results]).any(0) if self.optimizer.is_sparse else None
                 self.optimizer.update(drawn)
 
         gradients = [None if p.grad is None else p.grad.data_ptr() for p in self.optimizer.parameters]
@@ -87,6 +87,6 @@ class Update:
             self._recorded.repeat(self.stages)
 
 
-def in_one(parts: list[Tensor]) -> Tensor:
+def _joined(parts: list[Tensor]) -> Tensor:
     """Join tensors, without a copy if there is only one."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)
