@@ -66,6 +66,7 @@ class Key:
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"{name}: expected a finite number, got {value}")
         if isinstance(value, int | float) and self.low > -math.inf and not self.low <= value <= self.high:
+            # `range` does not name the limit ENDLESS, which a value may exceed.
             expected = self.range if value < self.low or self.high < ENDLESS else f"at most {self.high:.9g}"
             raise InputError(f"{name}: expected {expected}{self.unit and f' {self.unit}'}, got {value}")
 

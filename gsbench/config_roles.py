@@ -37,7 +37,7 @@ def training_keys(plain: Plain) -> Plain:
     """Return the keys of a config on which its training depends, as a flat dict."""
     whole = dict(flat(plain))
 
-    def is_set(key: str) -> bool:
+    def is_set(key: str) -> bool:  # to another value than null and `Key.absent`
         return whole.get(key, facts(key).absent) not in (None, facts(key).absent)
 
     return {

@@ -159,8 +159,8 @@ def _disk() -> Iterator[Check]:
 
 
 def _compiler() -> Iterator[Check]:
-    named = os.environ.get("CXX", "")
-    path = next(filter(None, map(shutil.which, filter(None, (named, *COMPILERS)))), None)
+    names = [name for name in (os.environ.get("CXX"), *COMPILERS) if name]
+    path = next((path for name in names if (path := shutil.which(name))), None)
     if path is None:
         yield Check("compiler", ABSENT, "none", "to build from source: apt-get install g++ python3-dev")
         return

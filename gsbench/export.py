@@ -23,7 +23,7 @@ from gsbench.view.video import check_file, check_parent
 
 PATHS = {"orbit": video.orbit, "spiral": video.spiral}
 WRITTEN = ("ply", "plys", "video", "images")  # options that name what is written
-READERS = {  # of an option: what is written by it
+READERS = {  # for each option, the outputs that read it
     "time": ("ply", "video", "images"),
     "direction": ("ply", "plys"),
     **dict.fromkeys(("fps", "seconds"), ("plys", "video", "images")),
@@ -267,17 +267,17 @@ def direction(text: str) -> torch.Tensor:
     return (vector / vector.norm()).float()
 
 
-def shots_of(export: Export, least: int | None = None) -> list[video.Shot]:
+def shots_of(export: Export, least_side: int | None = None) -> list[video.Shot]:
     """Return the camera and the time of each frame of a video, in the size of --width and --height.
 
-    If neither is named, frames have the size of the training's images; with `least` they are even and have at least so
-    many pixels on the shorter side.
+    If neither is given, frames have the size of the training's images; with `least_side` they are even and have at
+    least so many pixels on the shorter side.
 
     Raises:
         TooLargeError: a frame needs more memory than there is.
     """
     options = export.options
-    shots = [(sized(camera, options.width, options.height, least), time) for camera, time in path_of(export)]
+    shots = [(sized(camera, options.width, options.height, least_side), time) for camera, time in path_of(export)]
     pixels = options.supersample**2 * max(camera.width * camera.height for camera, _ in shots)
     require(
         BYTES_OF_PIXEL * pixels, f"frames of {pixels:,} rendered pixels", "lower --width, --height or --supersample"
@@ -285,16 +285,20 @@ def shots_of(export: Export, least: int | None = None) -> list[video.Shot]:
     return shots
 
 
-def sized(camera: Camera, width: int | None, height: int | None, least: int | None) -> Camera:
-    """Return a camera of the given size; a side that is None follows in proportion, and is even."""
-    if width is None and height is None and least is None:
+def sized(camera: Camera, width: int | None, height: int | None, least_side: int | None) -> Camera:
+    """Return a camera of the given size in pixels; a side that is None follows in proportion, and is even.
+
+    If both are None, the shorter side has at least `least_side` pixels, or else the camera stays as it is.
+    """
+    if width is None and height is None and least_side is None:
         return camera
     if width is not None:
         scale = width / camera.width
     elif height is not None:
         scale = height / camera.height
     else:
-        scale = max(1.0, (least or 0) / min(camera.width, camera.height))  # `least` is no None here
+        assert least_side is not None
+        scale = max(1.0, least_side / min(camera.width, camera.height))
     even = [2 * max(1, round(scale * side / 2)) for side in (camera.width, camera.height)]
     return video.resized(camera, width or even[0], height or even[1])
 

@@ -26,6 +26,7 @@ def as_json(result: Any) -> str:
     def converted(value: Any) -> Any:  # what msgspec does not know, such as a path or a float of numpy
         return float(value) if isinstance(value, float) else str(value)
 
+    # msgspec writes what json cannot, on one line; json breaks lines.
     return json.dumps(json.loads(msgspec.json.encode(result, enc_hook=converted)), indent=1)
 
 
@@ -121,7 +122,7 @@ def _check(plain: Any, parsed: Any, file: str, place: str, most: int) -> None:
     if isinstance(plain, dict):
         fields = {field.name for field in dataclasses.fields(parsed)} if dataclasses.is_dataclass(parsed) else None
         for key, value in plain.items():
-            _check(key, key, file, place, most)
+            _check(key, key, file, place, most)  # as a text
             if fields is not None and key not in fields:
                 raise InputError(f"{prefix}: unknown key {key[:80]!a}. {did_you_mean(key, fields)}")
             inner = parsed[key] if fields is None else getattr(parsed, key)

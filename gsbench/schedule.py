@@ -136,6 +136,6 @@ class Schedule:
 
     def measures(self, step: int) -> bool:
         """Return whether PSNR on val is measured after a step for the training curve; always after the last step."""
-        points = max(1, self.config.curve_points)
+        points = max(1, self.config.curve_points)  # of the curve, evenly spaced
         done, total = step + 1, self.config.iterations
-        return done == total or done * points // total != step * points // total
+        return done == total or done * points // total != step * points // total  # a point lies at or before `done`

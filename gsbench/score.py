@@ -261,7 +261,7 @@ def multiscale_ssim(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:  #
 
 def _windowed(image: NDArray[np.float64]) -> NDArray[np.float64]:  # [H, W, 3] -> [H - 10, W - 10, 3]
     """Return the means in the Gaussian windows of 11 pixels that lie inside an image."""
-    return gaussian_filter(image, sigma=(1.5, 1.5, 0), truncate=3.5)[5:-5, 5:-5]
+    return gaussian_filter(image, sigma=(1.5, 1.5, 0), truncate=3.5)[5:-5, 5:-5]  # the radius is 3.5 * 1.5, rounded
 
 
 def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:  # [H, W, 3]

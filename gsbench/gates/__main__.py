@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _whole(text: str) -> int:
-    """Convert an argument of the command line to an int; only the first 40 characters are read."""
+    """Convert an argument of the command line to an int, from 40 characters: longer numbers are too large anyway."""
     try:
         return int(text[:40])
     except ValueError:
@@ -51,14 +51,15 @@ def _whole(text: str) -> int:
 
 
 def _answer(options: argparse.Namespace) -> Answer:
-    """Check the options, do the task that they name, and return its result for JSON and as lines."""
-    if (options.scene is None) == (options.checkpoint is None):
+    """Check the options, test a scene or simplify a run's Gaussians, and return the result for JSON and as lines."""
+    if (options.scene is None) == (options.checkpoint is None):  # both or none
         raise InputError("expected one of SCENE_FOLDER and --checkpoint RUN_FOLDER")
     if options.checkpoint is not None:
         refuse_options(options, ("seed",), "--checkpoint")
     else:
         refuse_options(options, ("budget_db", "data_root", "model_module"), "SCENE_FOLDER")
-    seed, budget = options.seed or 0, BUDGET.default if options.budget_db is None else options.budget_db
+    seed = options.seed or 0
+    budget = BUDGET.default if options.budget_db is None else options.budget_db  # dB
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: expected 0 to 2^63 - 1, got {str(seed)[:30]}")
     BUDGET.check("--budget-db", budget)

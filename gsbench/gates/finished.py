@@ -35,13 +35,13 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     gate = typed_config(plain, path).effects.gate
     if gate != "off":
         raise InputError(f"{folder}: expected a run that was not gated at its end, got effects.gate={gate}")
-    plain["effects"] = {"gate": "end", "budget_db": budget_db}
+    plain["effects"] = {"gate": "end", "budget_db": budget_db}  # the other settings are of the training, which is over
     config = typed_config(plain, path)
     config.data.root = plain["data"]["root"] = data_root or trusted_root(config.data.root, folder)
     old = records.read(folder / records.FILE_NAME)
-    words = ["gate=end"] + ([] if budget_db == EffectsConfig().budget_db else [f"budget_db={budget_db}"])
-    variant = ",".join(([old.variant] if old.variant else []) + words)
-    new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name
+    changes = ["gate=end"] + ([] if budget_db == EffectsConfig().budget_db else [f"budget_db={budget_db}"])
+    variant = ",".join(([old.variant] if old.variant else []) + changes)
+    new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name  # SCENE/MODEL,VARIANT/SEED
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
     check_folder(new)
     execution = Execution(RunSpec(config, plain, new, old.model, variant, overrides))

@@ -86,11 +86,11 @@ def gate_within(
         if loss <= budget_db and len(gated):
             counts = gated.count_by_effects() | {"removed": len(model) - len(gated)}
             gate = Gate(
-                share,
-                _loss_db(choice.predicted),
-                loss,
-                counts,
-                _count_by_order(gated),
+                share=share,
+                predicted_db=_loss_db(choice.predicted),
+                measured_db=loss,
+                rows=counts,
+                orders=_count_by_order(gated),
                 bytes_before=model.stored_bytes(),
                 bytes=gated.stored_bytes(),
             )
@@ -116,7 +116,8 @@ def _count_by_order(model: GaussianModel) -> dict[str, int]:
 def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> ChosenSimplifications:
     """Choose a simplification for each Gaussian so that the predicted errors add up to at most a bound.
 
-    Bisection finds the smallest lambda for which the errors stay within the bound.
+    Bisection finds the smallest lambda for which the errors stay within the bound. A choice is one of G geometries
+    (present, conditioned, static, removed), and independently one of K orders of the colour.
 
     Args:
         sensitivity: the predicted error of each simplification of each Gaussian of the model.
@@ -125,33 +126,36 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     """
     now = effect_sets_of(model)
     live = _geometry_cost(model, now)
-    none = torch.zeros_like(live)
+    zeros = torch.zeros_like(live)
     ways, errors = sensitivity.simplifications, sensitivity.errors
-    geometry = {LIVE: none} | {way.name: errors[way.name] for way in ways if way.order is None}
-    costs = torch.stack([live if name == LIVE else torch.minimum(live, none + COSTS[name]) for name in geometry])
-    forms = torch.stack(list(geometry.values()))
-    removes = torch.tensor([name == REMOVED for name in geometry], device=live.device)[:, None]
+    errors_by_geometry = {LIVE: zeros} | {way.name: errors[way.name] for way in ways if way.order is None}
+    names = list(errors_by_geometry)
+    costs = torch.stack([live if name == LIVE else torch.minimum(live, zeros + COSTS[name]) for name in names])
+    geometry_errors = torch.stack(list(errors_by_geometry.values()))  # [G, N]; `costs` too
+    removes = torch.tensor([name == REMOVED for name in names], device=live.device)[:, None]
     assert now.orders is not None
     orders = torch.stack([now.orders] + [at_most(now.orders, way.order) for way in ways if way.order is not None])
-    hues = torch.stack([none] + [errors[way.name] for way in ways if way.order is not None])
-    shading = _color_cost(orders)
+    order_errors = torch.stack([zeros] + [errors[way.name] for way in ways if way.order is not None])  # [K, N]
+    order_costs = _color_cost(orders)
 
     def best(price: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the indices of each Gaussian's best form and colour order, and its error, if lambda is `price`."""
-        shade, hue = (shading + price * hues).min(0)
-        _, form = (costs + price * forms + torch.where(removes, 0.0, shade)).min(0)  # argmin takes 8 to 30 times longer
-        error = forms.gather(0, form[None])[0] + hues.gather(0, hue[None])[0] * ~removes[form, 0]
-        return form, hue, error
+        """Return the indices of each Gaussian's best geometry and order, and its error, if lambda is `price`."""
+        # min, as argmin takes 8 to 30 times longer
+        color_total, order = (order_costs + price * order_errors).min(0)  # [N]
+        # The colour of a removed Gaussian costs nothing and adds no error.
+        _, geometry = (costs + price * geometry_errors + torch.where(removes, 0.0, color_total)).min(0)
+        order_error = order_errors.gather(0, order[None])[0] * ~removes[geometry, 0]
+        return geometry, order, geometry_errors.gather(0, geometry[None])[0] + order_error
 
     low, high = -60.0, 60.0  # bounds of log2(lambda)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         within = float(best(2.0**middle)[2].sum()) <= budget * sensitivity.total
         low, high = (low, middle) if within else (middle, high)
-    form, hue, error = best(2.0**high)
-    chosen = {name: form == i for i, name in enumerate(geometry)}
+    geometry, order, error = best(2.0**high)
+    chosen = {name: geometry == i for i, name in enumerate(names)}
     predicted = float(error.sum()) / max(sensitivity.total, 1e-300)
-    return ChosenSimplifications(chosen, orders.gather(0, hue[None])[0], predicted)
+    return ChosenSimplifications(chosen, orders.gather(0, order[None])[0], predicted)
 
 
 def cost_of(model: GaussianModel) -> Tensor:
@@ -175,7 +179,7 @@ def _geometry_cost(model: GaussianModel, now: EffectSets) -> Tensor:
 
 
 def _color_cost(orders: Tensor) -> Tensor:
-    """Return the nanoseconds to evaluate colours with the SH degrees and frequencies in time that `orders` encodes."""
+    """Return the nanoseconds to evaluate colours of `orders` (see `ColorOrder`), in the same shape."""
     order = order_of(orders)
     return torch.tensor(COLORING, device=orders.device)[order.degree] * order.waves
 
@@ -211,19 +215,18 @@ def apply(
     now = effect_sets_of(model)
     assert now.orders is not None
     for way in simplifications:
-        if way.raw is None:
+        if way.raw is None:  # removed
             continue
-        chosen = (
-            choice.geometry[way.name]
-            if way.order is None
-            else ((choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order)))
-        )
+        if way.order is None:
+            chosen = choice.geometry[way.name]
+        else:  # several limits may give the chosen order, and then the same colour
+            chosen = (choice.orders != now.orders) & (choice.orders == at_most(now.orders, way.order))
         for key, value in way.raw.items():
             model.splats[key].data[chosen] = value[chosen]
     place = torch.arange(len(model), device=now.orders.device)
     static = (place >= now.conditioned) | choice.geometry.get(STATIC, torch.zeros_like(place, dtype=torch.bool))
     refined = (place < now.refined) & choice.geometry[LIVE]
-    kind = torch.where(refined, 0, torch.where(static, 2, 1))  # 1: conditioned
+    kind = torch.where(refined, 0, torch.where(static, 2, 1))  # 0: refined, 1: conditioned, 2: static
     # Gaussians are sorted by the effects that remain, then by the order of their colours, so that neighbours need the
     # same work. Otherwise their order does not change.
     rank = kind * (MOST_PACKED + 1) + MOST_PACKED - choice.orders
@@ -235,9 +238,10 @@ def apply(
     rows = order[~choice.geometry[REMOVED][order]]
     changed = (~choice.geometry[LIVE] | (choice.orders != now.orders))[rows]
     model.select(rows)
-    n_refined, n_conditioned = (int((kind[rows] <= most).sum()) for most in (0, 1))
-    active = now.intervals if intervals is None else intervals
-    active = None if active is None else active[rows[:n_refined]].contiguous()
-    model.effect_sets = EffectSets(n_refined, n_conditioned, choice.orders[rows].contiguous(), active)
+    n_refined, n_conditioned = (int((kind[rows] <= last).sum()) for last in (0, 1))
+    agr_times = now.intervals if intervals is None else intervals
+    # `now.intervals` has only the formerly refined Gaussians; those that still are refined are among them.
+    agr_times = None if agr_times is None else agr_times[rows[:n_refined]].contiguous()
+    model.effect_sets = EffectSets(n_refined, n_conditioned, choice.orders[rows].contiguous(), agr_times)
     model.fill(model.effect_sets)
     return rows, changed

@@ -74,7 +74,7 @@ class Gating(Hook):
         self.screen: TimeScreen | None = None  # by which model=auto chose the model
         scene = training.scene
         self.probed, self.checked, self.checked_on = scene.train, scene.val, "val"
-        if scene.val and self.config.scene.eval_split != "val":
+        if scene.val and self.config.scene.eval_split != "val":  # views of results must not decide
             return
         if len(scene.train) < FEW:
             self.checked, self.checked_on = scene.train, "the training views"
@@ -133,10 +133,10 @@ class Gating(Hook):
             most: the largest number of views from which errors are predicted.
         """
         started = time.perf_counter()
-        model, when = as_gated(self.model), "at the end" if step is None else f"at step {step}"
+        model = as_gated(self.model)
         # In training AGR changes Gaussians at all times, because the times at which they are visible still change.
         intervals = visible_times(model, self.probed) if step is None else None
-        hidden = None if intervals is None else intervals[:, 0].isinf()
+        hidden = None if intervals is None else intervals[:, 0].isinf()  # never visible
         sensitivity = probe(
             model,
             self.probed,
@@ -149,6 +149,7 @@ class Gating(Hook):
         gated = gate_within(model, sensitivity, budget_db, lambda x: self.renderer.psnr(x, self.checked), intervals)
         if gated is None:
             before = self.renderer.psnr(model, self.checked)
+            when = "at the end" if step is None else f"at step {step}"
             self.notes.append(
                 f"{when} no simplification cost at most {budget_db} dB on {self.checked_on}"
                 if decides(before)
@@ -198,12 +199,12 @@ class Gating(Hook):
     def _compare_models(
         self, model: GaussianModel, other: GaussianModel, views: list[View]
     ) -> tuple[float, list[float]]:
-        """Return by how many dB PSNR is lower with `other` than with `model`, and the median frame times, ms."""
+        """Return by how many dB PSNR is lower with `other` than with `model`, and both median frame times, ms."""
         count = max(self.config.protocol.renders, len(views))
-        frames = [lambda i, shown=shown: self.renderer.image(shown, views[i % len(views)]) for shown in (model, other)]
-        times = time_in_turns(frames, count, synchroniser(self.config.device))
+        draw = [lambda i, shown=shown: self.renderer.image(shown, views[i % len(views)]) for shown in (model, other)]
+        times = time_in_turns(draw, count, synchroniser(self.config.device))
         psnr = self.renderer.psnr
-        return psnr(model, views) - psnr(other, views), [frame.p50 for frame in times]
+        return psnr(model, views) - psnr(other, views), [of_model.p50 for of_model in times]
 
     def state_dict(self) -> dict[str, Any]:
         direction = asdict(self.direction) if self.direction else None
@@ -238,11 +239,11 @@ def without_direction(model: GaussianModel, views: Sequence[View]) -> GaussianMo
     weights = shares_of([model.slice(query).opacities for query in queries])
     frozen = model.frozen({name: value.detach() for name, value in model.splats.items()}, queries, weights)
     changed = copy.deepcopy(model)
-    name = "direction" if "direction" in frozen else STATIC
+    name = "direction" if "direction" in frozen else STATIC  # some models can only drop all variables at once
     for key, value in frozen[name].items():
         if key != "directions":  # these stay, because they are inputs of AGR
             changed.splats[key].data = value.clone()
-    if name == STATIC:
+    if name == STATIC:  # no Gaussian is refined or conditioned
         changed.effect_sets = effect_sets_of(model)._replace(refined=0, conditioned=0, intervals=None)
     return changed
 

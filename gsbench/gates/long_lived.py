@@ -47,11 +47,11 @@ class LongLived(Hook):
             self.make_static(self.longest)
 
     def make_static(self, longest: float) -> None:
-        """Make static what lives longer than `longest`, a standard deviation in time in clips."""
+        """Make the Gaussians static whose lifetime, a standard deviation in clips, is longer than `longest`."""
         model = as_gated(self.training.model)
-        lifetimes = model.lifetimes()
-        assert lifetimes is not None
-        is_long = lifetimes[1] > longest
+        times_and_lifetimes = model.lifetimes()
+        assert times_and_lifetimes is not None
+        is_long = times_and_lifetimes[1] > longest  # [N]
         views = evenly(self.training.scene.train, VIEWS_IN_TRAINING)
         queries = [CameraTime.of(view.camera, view.time) for view in views]
         ways = simplifications_of(model, queries, [model.slice(query) for query in queries])

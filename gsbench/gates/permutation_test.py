@@ -31,6 +31,9 @@ def follow_time(
 ) -> ResidualsTest:
     """Test whether the gradients of V views follow slow cosines of time (Freedman and Lane 1983).
 
+    Let P project onto what the cosines have beyond the camera, and R onto what the camera does not explain. The
+    statistic is |P R G|^2 / |R G|^2 for the gradients G, of which only G G^T = `products` is needed.
+
     Args:
         products: the scalar products of the gradients of all pairs of views.
         times: the times of the views.
@@ -42,16 +45,20 @@ def follow_time(
     of_camera = _range(camera)
     unexplained = waves - of_camera @ (of_camera.T @ waves)
     free = float(np.square(unexplained).sum() / max(np.square(waves).sum(), 1e-300))
-    slow = _range(unexplained)
-    residual = np.eye(len(times)) - of_camera @ of_camera.T
-    gram = residual @ products @ residual
-    total = float(np.trace(gram))
+    slow = _range(unexplained)  # [V, S]
+    residual = np.eye(len(times)) - of_camera @ of_camera.T  # [V, V] R
+    gram = residual @ products @ residual  # R G (R G)^T
+    total = float(np.trace(gram))  # |R G|^2
     random = np.random.default_rng(seed)
 
     def share(rows: NDArray[np.int64]) -> float:
-        """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera."""
+        """Return the share of the gradients that cosines of time, permuted by `rows`, explain beyond the camera.
+
+        Instead of the residuals R G, the cosines and the camera are permuted. What the permuted camera explains is
+        subtracted from |R G|^2; without a permutation it is zero.
+        """
         permuted = np.concatenate([slow, of_camera], 1)[rows]
-        energies = np.einsum("vk,vk->k", permuted, gram @ permuted)
+        energies = np.einsum("vk,vk->k", permuted, gram @ permuted)  # |u^T R G|^2 for each column u
         left = total - energies[slow.shape[1] :].sum()
         return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0
 
@@ -85,12 +92,13 @@ def compare(
 def _permutation(views: int, groups: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
     """Draw a random permutation of views; with `groups`, views are permuted only within each group."""
     order = np.arange(views)
-    for group in groups or [range(views)]:
+    for group in groups or [range(views)]:  # no groups: None or an empty list
         order[list(group)] = random.permutation(list(group))
     return order
 
 
 def _range(columns: Array) -> Array:
     """Return an orthonormal basis [V, R] of the column space of a matrix [V, B]."""
-    left, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, values > 1e-6 * max(values.max(initial=0.0), 1e-300)])
+    left, singular_values, _ = np.linalg.svd(columns, full_matrices=False)
+    # What is smaller than 1e-6 of the largest counts as zero.
+    return np.asarray(left[:, singular_values > 1e-6 * max(singular_values.max(initial=0.0), 1e-300)])

@@ -25,7 +25,7 @@ COLOURS = {
     "static": (0x5C, 0x60, 0x66),
 }
 LEAST_WIDTH, MOST_WIDTH = 300, 640  # pixels; smaller images are enlarged by an integer factor, larger ones reduced
-LINE = 22  # pixels of a line of text
+LINE, BASELINE, MARGIN = 22, 16, 6  # pixels: height of a line of text, its baseline from above, space before a text
 
 
 @torch.no_grad()
@@ -48,20 +48,19 @@ def draw(
         InputError: the model depends on time and `time` is None.
     """
     gaussians = model.slice(CameraTime.of(camera, time))
-    legends = (
-        (effect_set_colors(model), torch.ones_like(background)),
-        (cost_colors(model, most_cost(model)), torch.zeros_like(background)),
-    )
-    drawn = [
+    most = most_cost(model)  # nanoseconds
+    white, black = torch.ones_like(background), torch.zeros_like(background)  # black: no cost
+    replaced = ((effect_set_colors(model), white), (cost_colors(model, most), black))  # colours [N, 3] and background
+    outputs = [
         render_slice(model, gaussians, camera, background, antialias),
         *(
             rasterize_slice(gaussians._replace(colors=colors), camera, behind, model.backend, antialias)
-            for colors, behind in legends
+            for colors, behind in replaced
         ),
     ]
-    panels = [to_bytes(output.image[0].cpu().numpy()) for output in drawn]
-    panels[2] = inferno(panels[2][..., 0] / 255)
-    return _arrange(panels, model.count_by_effects(), most_cost(model))
+    panels = [to_bytes(output.image[0].cpu().numpy()) for output in outputs]
+    panels[2] = inferno(panels[2][..., 0] / 255)  # grey levels as colours from black to yellow
+    return _arrange(panels, model.count_by_effects(), most)
 
 
 def effect_set_colors(model: GaussianModel) -> Tensor:
@@ -81,19 +80,22 @@ def kinds_of(model: GaussianModel) -> Tensor:
 
 
 def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixels:
-    """Put the three panels side by side, with titles above and the legend of the Gaussians' colours below."""
+    """Put the three panels side by side, with titles above and the legend of the Gaussians' colours below.
+
+    `counts` has the number of Gaussians by effect set, and `most` is the cost in nanoseconds of the brightest pixels.
+    """
     height, width = panels[0].shape[:2]
-    factor = max(1, -(-LEAST_WIDTH // width))
+    factor = max(1, -(-LEAST_WIDTH // width))  # rounded up
     if width > MOST_WIDTH:
         size = (MOST_WIDTH, max(1, round(height * MOST_WIDTH / width)))
         panels = [np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8) for panel in panels]
-    row, step = in_a_row(panels, factor), panels[0].shape[1] * factor + GAP
+    row, step = in_a_row(panels, factor), panels[0].shape[1] * factor + GAP  # pixels from panel to panel
     titles, legend = (np.full((LINE, row.shape[1], 3), 255, np.uint8) for _ in range(2))
     by_set = f"{sum(counts.values()):,} Gaussians by effect set"
     for i, title in enumerate(("image", by_set, f"cost of what a pixel shows, 0 to {most:.0f} ns")):
-        write_text(titles, title, i * step + 6, 16)
+        write_text(titles, title, i * step + MARGIN, BASELINE)
     for i, (name, count) in enumerate((name, count) for name, count in counts.items() if count):
-        left = i * step + 6
-        legend[5:17, left : left + 12] = COLOURS[name]
-        write_text(legend, f"{EFFECT_SETS[name]}: {count:,}", left + 18, 16)
+        left = i * step + MARGIN
+        legend[5:17, left : left + 12] = COLOURS[name]  # a square of 12 pixels
+        write_text(legend, f"{EFFECT_SETS[name]}: {count:,}", left + 12 + MARGIN, BASELINE)
     return np.concatenate([titles, row, legend])

@@ -98,13 +98,16 @@ def _screen_fixed(scene: Scene, viewpoints: Viewpoints, seed: int) -> TimeScreen
 
 
 def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str) -> TimeScreen:
-    """Test for change with time by the residuals of a static 3DGS, fitted to views without a common camera position."""
+    """Test for change with time by the residuals of a static 3DGS, fitted to views without a common camera position.
+
+    If some of these views are from held cameras, only those are used.
+    """
     indices = [v for group in viewpoints.held for v in group] or viewpoints.other
     views = [smaller(scene.train[v]) for v in indices]
     times = np.array([view.time for view in views], dtype=np.float64)
-    ends = np.cumsum([len(group) for group in viewpoints.held])
+    ends = np.cumsum([len(group) for group in viewpoints.held])  # views of a held camera are next to each other
     held = [list(range(end - len(group), end)) for end, group in zip(ends, viewpoints.held, strict=True)]
-    camera = _indicators(held) if held else camera_basis(views)
+    camera = _indicators(held) if held else camera_basis(views)  # the influence that the test removes
     test = follow_time(gradient_products(views, scene, seed, backend), times, camera, seed, held)
     if test.free < LEAST_FREE:
         reason = (
@@ -135,9 +138,10 @@ def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:
 
     One test has the views from repeated camera positions, the other has all other views. The combined p-value is q (1 -
     ln q), where q is the product of the two p-values (Fisher). z-scores are added and divided by sqrt 2 (Stouffer).
+    The answer is `off` only if both tests say so, because each sees only a part of the views.
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
-    if OFF == fixed.decision == loose.decision:
+    if OFF == fixed.decision == loose.decision:  # `fixed` has no p-value then
         return _answer(OFF, reason, loose.p, loose.z, loose.free)
     is_blind = loose.free is not None and loose.free < LEAST_FREE  # time and camera position are too correlated
     usable = [fixed] if is_blind else [fixed, loose]
@@ -145,7 +149,7 @@ def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:
     if not tested:
         return _answer(UNDECIDED, reason, free=loose.free)
     if len(tested) == 1:
-        ((p, z),) = tested
+        p, z = tested[0]
     else:
         q = math.prod(p for p, _ in tested)
         p, z = q * (1 - math.log(q)), sum(z for _, z in tested) / math.sqrt(2)

@@ -213,12 +213,12 @@ def visible_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N,
     """Return the first and the last time at which each Gaussian is visible in a training view, in [0, 1].
 
     A Gaussian is visible in a view if its opacity at this time and direction is at least 1/255, with or without AGR.
-    The interval is extended on both sides by the largest gap between the times of neighbouring views. It is (inf, -inf)
-    for a Gaussian that is never visible.
+    The interval is extended on both sides by the largest gap between the times of neighbouring views, as no view shows
+    when in this gap a Gaussian appears. It is (inf, -inf) for a Gaussian that is never visible.
     """
     unrefined = dict(model.splats.items())
 
-    def shown(view: View) -> Tensor:
+    def shown(view: View) -> Tensor:  # [N] bool
         query = CameraTime.of(view.camera, view.time)
         opacities = model.slice_geometry(model.refined(query), query).opacities
         if model.refines:

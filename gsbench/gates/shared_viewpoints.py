@@ -61,21 +61,22 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
     """
     cameras = [view.camera for view in views]
     viewmats = np.stack([camera.viewmat.cpu().double().numpy() for camera in cameras])
-    K = np.stack([camera.K.cpu().double().numpy()[:2].ravel() for camera in cameras])
+    K = np.stack([camera.K.cpu().double().numpy()[:2].ravel() for camera in cameras])  # [V, 6]
     sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
     side = sizes.max(1, keepdims=True)
     focal = (K[:, :1] / side).mean()
     centers = np.stack([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
     meeting = center_of(views)
     distance = extent if meeting is None else float(np.linalg.norm(centers - meeting.numpy(), axis=1).mean())
-    turns = viewmats[:, :3, :3].reshape(-1, 9) / math.sqrt(2)
+    turns = viewmats[:, :3, :3].reshape(-1, 9) / math.sqrt(2)  # they differ by the angle: |R - R'| is sqrt 2 times it
+    # Sizes are in pixels: cameras whose images have other sizes are never in one group.
     return np.concatenate([focal * turns, focal * centers / max(distance, 1e-12), K / side, sizes], 1)
 
 
-def _groups(numbers: list[int], poses: Array, tolerance: float) -> list[list[int]]:
+def _groups(indices: list[int], poses: Array, tolerance: float) -> list[list[int]]:
     """Group views so that the distance of each pose vector to the first one of its group is at most `tolerance`."""
     groups: list[list[int]] = []
-    left = np.array(numbers, dtype=np.int64)
+    left = np.array(indices, dtype=np.int64)
     while len(left):
         near = np.linalg.norm(poses[left] - poses[left[0]], axis=1) <= tolerance
         groups.append(left[near].tolist())

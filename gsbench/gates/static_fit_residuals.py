@@ -57,11 +57,11 @@ def gradient_products(views: Sequence[View], scene: Scene, seed: int, backend: s
     for _ in range(STEPS):
         chosen = torch.randint(len(views), (BATCH,), generator=random).tolist()
         by_view = list(side_by_side(gradients_of, [views[i] for i in chosen], workers))
-        for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):
+        for parameter, gradients in zip(fitted, zip(*by_view, strict=True), strict=True):  # one gradient of each view
             parameter.grad = torch.stack(gradients).mean(0)
         adam.step()
     of_means = [by_parameter[0].flatten() for by_parameter in side_by_side(gradients_of, views, workers)]
-    matrix = torch.stack(of_means).double().cpu().numpy()
+    matrix = torch.stack(of_means).double().cpu().numpy()  # [V, 3 POINTS]
     return np.asarray(matrix @ matrix.T)
 
 
@@ -95,7 +95,11 @@ def scene_points(views: Sequence[View], scene: Scene, random: torch.Generator) -
 
 
 def center_of(views: Sequence[View]) -> Tensor | None:
-    """Return the point [3] nearest to all optical axes; None if the axes do not nearly meet in front of the cameras."""
+    """Return the point [3] nearest to all optical axes; None if the axes do not nearly meet in front of the cameras.
+
+    The sum of squared distances |A_v (x - c_v)|^2, where A_v = I - a_v a_v^T for the axis a_v through the camera's
+    centre c_v, is smallest where the sum of A_v (x - c_v) is zero.
+    """
     centers = torch.stack([view.camera.center for view in views]).cpu().double()
     axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
@@ -115,7 +119,7 @@ def camera_basis(views: Sequence[View]) -> Array:
     """
     center = center_of(views)
     centers = torch.stack([view.camera.center for view in views]).cpu()
-    if center is None:  # cameras side by side: seen from so far in front of them that all lie close together
+    if center is None:  # cameras side by side: a point in front of them, 3 times as far away as they are spread
         axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu()
         spread = (centers - centers.mean(0)).norm(dim=-1).mean()
         center = centers.mean(0) + 3 * spread * axes.mean(0)

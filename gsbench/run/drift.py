@@ -37,9 +37,11 @@ def of_films(model: GaussianModel, films: Sequence[Still], antialias: bool, unit
         antialias: as in `gsbench.raster.rasterize`.
         unit: the unit of the model's coordinates in the user's (`Placement.unit`).
     """
+    if not films:
+        return dict.fromkeys(NAMES)
     paths = [_path(model, film, torch.from_numpy(still), antialias).tolist() for film, still in films]
-    lengths = ((unit * length, pixels) for length, pixels in paths)
-    return dict(zip(NAMES, map(fmean, zip(*lengths, strict=True)), strict=True)) if paths else dict.fromkeys(NAMES)
+    means = fmean(unit * length for length, _ in paths), fmean(pixels for _, pixels in paths)
+    return dict(zip(NAMES, means, strict=True))
 
 
 def _path(model: GaussianModel, film: Sequence[View], still: Tensor, antialias: bool) -> Tensor:
@@ -48,7 +50,7 @@ def _path(model: GaussianModel, film: Sequence[View], still: Tensor, antialias: 
     black = torch.zeros_like(camera.K[0])
     path = torch.zeros(2, dtype=torch.float64)
     slices = (model.slice(CameraTime.of(camera, view.time)) for view in film)
-    for now, after in itertools.pairwise(slices):
+    for now, after in itertools.pairwise(slices):  # of frames t and t + 1
         moved = (after.means - now.means).norm(dim=-1)
         shifted = (_pixels(camera, after.means) - _pixels(camera, now.means)).norm(dim=-1)
         lengths = torch.stack([moved, shifted, torch.ones_like(moved)], 1)  # [N, 3] in place of colours

@@ -97,16 +97,16 @@ class Execution:
         start = trained_start(config)
         self.scene = scene = load_scene(config)
         if is_auto(self.spec.config) and not scene.has_time:
-            self.chosen = ChosenModel(config := with_candidate(self.spec.config, "static"))
-            self.model = build(config)
+            config = with_candidate(self.spec.config, "static")
+            self.chosen, self.model = ChosenModel(config), build(config)
         elif config.effects.compare:
             check_candidates(self.spec.config, scene)
         check_scene(self.model, scene, config)
         if start is not None:
             self.start = gaussians_to_standard(start, scene.placement)
             check_start(self.start, scene)
-        evaluated_views(scene, config.scene.eval_split)
-        records.check(self.describe("failed", "not run"), "planned record")
+        evaluated_views(scene, config.scene.eval_split)  # raises an error if there are none
+        records.check(self.describe("failed", "not run"), "planned record")  # that names and settings can be written
         return self.model, scene
 
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
@@ -119,7 +119,7 @@ class Execution:
             self.chosen = choose_model(spec, scene)
             self.model = model = build(self.chosen.config)
         screen, device = self.chosen.screen, spec.config.device
-        if self.chosen.compares or lengths_of(spec.config) is not None:
+        if self.chosen.compares or lengths_of(spec.config) is not None:  # these add the costs of the screen themselves
             reset_peak_memory(device)
             choose = best_of if self.chosen.compares else best_length
             trainer = choose(spec, scene, self.start, self.chosen)
@@ -228,7 +228,7 @@ def execute(spec: RunSpec) -> Record | None:
         progress.release_claim(spec.folder, process, is_stopped=True)
         raise
     finally:
-        progress.release_claim(spec.folder, process)
+        progress.release_claim(spec.folder, process)  # does nothing if it is released
         if execution.log is not None:
             execution.log.end(record)
     return record
@@ -258,7 +258,7 @@ def _record_of(execution: Execution) -> Record:
         earlier = finished(spec, scene)
         record = earlier or execution.measure(execution.fit(model, scene))
     except Exception as error:
-        spare.clear()
+        spare.clear()  # memory for the record
         earlier, record = None, _ended_badly(execution, error)
     if earlier is not None:
         print(

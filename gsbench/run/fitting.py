@@ -107,7 +107,7 @@ def fit(
                 report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
             return request.signal is None and trainer.step != until
 
-        if trainer.step != until:
+        if trainer.step != until:  # a checkpoint may be there already
             trainer.run(lambda state: save(state, spec, trainer.scene, plain), spec.name, goes_on)
             report(trainer.step, sum(trainer.stages.seconds.values()), trainer.curve.last)
     if request.signal is not None:  # asked here, so that a signal after the last step is not lost
@@ -153,13 +153,16 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
     share = share_of_points_seen(points, cameras)
     where = f"{data.initial_points} initial points in a cube of half width {data.initial_half_width:g}"
     if share < LEAST_SEEN:
-        away = sum(bool(camera.viewmat[2, 3] < 0) for camera in cameras)  # the depth of the origin
-        axes = "; {} of {} cameras look away from it: are their axes right (in transforms*.json x right, y up, z back)?"
+        away = sum(bool(camera.viewmat[2, 3] < 0) for camera in cameras)  # the depth of the origin, the cube's centre
+        axes = (
+            f"; {away} of {len(cameras)} cameras look away from it: are their axes right (in transforms*.json x "
+            f"right, y up, z back)?"
+        )
         near = "" if data.near is None else f"lower data.near={data.near:g}, or "
         raise InputError(
             f"{scene.name}: expected {where}, of which cameras see at least {LEAST_SEEN:.0%}, they see "
             f"{share:.1%}: {near}set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
-            f"at), or null for points that all cameras see{axes.format(away, len(cameras)) if away else ''}"
+            f"at), or null for points that all cameras see{axes if away else ''}"
         )
     print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
     return points

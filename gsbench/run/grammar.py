@@ -20,17 +20,19 @@ def check_override(word: str) -> None:
     The message has the override as it is to be typed in a shell, with quotes around the value.
     """
     key, _, text = word.partition("=")
-    kind, read = facts(key.lstrip("+")).kind, _read(word)
+    kind = facts(key.lstrip("+")).kind  # the type of the key's values
+    read = _read(word)
     if isinstance(read, HydraException):
-        if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:
+        if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:  # with any value, it is no override
             raise InputError(f"{word!r:.300}: expected KEY=VALUE, such as model=7dgs or +exp=mini")
         raise InputError(
             f"{key}: expected quotes around {text}, as some of its characters have another meaning for "
             f"Hydra: type {typed(key, text, several=kind not in _TEXTS)}"
         )
+    # A sweep a,b has several values, and so has a list [a,b], unless the key has a text, such as "[a,b]".
     several = isinstance(read, ChoiceSweep) or (isinstance(read, list) and kind not in _TEXTS)
     values = list(read.list) if isinstance(read, ChoiceSweep) else read if several else [read]
-    texts = _parts(text) if several else [text]
+    texts = _parts(text) if several else [text]  # as they were typed
     if kind in (*_TEXTS, list[str]) and any(
         isinstance(value, int | float | list | dict) and str(value) != part
         for value, part in zip(values, texts, strict=False)

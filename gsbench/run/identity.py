@@ -64,7 +64,7 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     plain: Plain = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     if not config.results:
         raise InputError("results: expected a folder, got '': results=. is this one")
-    if config.init.ply is not None:
+    if config.init.ply is not None:  # a training is told from others by the content of the file, not by its path
         config.init.ply_sha256 = plain["init"]["ply_sha256"] = config.init.ply_sha256 or hash_of(config.init.ply)
     label = label_of(config)
     variant = name_variant(plain, choices) if choices else ""
@@ -109,6 +109,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
         if key.startswith("model.") and key not in after:
             raise deleted_key(key)
     changed = {key: value for key, value in training_keys(plain).items() if key not in before or value != before[key]}
+    # Keys without their first group, or without "model.options": densify.every of train.densify.every.
     shorts = [key.removeprefix("model.options.").partition(".")[2] or key.rpartition(".")[2] for key in changed]
     for (key, value), short in zip(changed.items(), shorts, strict=True):
         words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")

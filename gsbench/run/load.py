@@ -46,16 +46,16 @@ class SceneDescription:
         """Return the description of a loaded scene."""
         camera = scene.train[0].camera
         return cls(
-            scene.name,
-            scene.fingerprint,
-            scene.extent,
-            list(scene.background),
-            scene.has_time,
-            camera.width,
-            camera.height,
-            list(scene.up),
-            list(scene.placement.center),
-            scene.placement.unit,
+            name=scene.name,
+            fingerprint=scene.fingerprint,
+            extent=scene.extent,
+            background=list(scene.background),
+            has_time=scene.has_time,
+            width=camera.width,
+            height=camera.height,
+            up=list(scene.up),
+            center=list(scene.placement.center),
+            unit=scene.placement.unit,
         )
 
     @property
@@ -211,9 +211,8 @@ def _without_interpolations(value: Any) -> Any:
     """Return plain values; raise ValueError if a text has `${`, as in ${oc.env:NAME}, which would be resolved."""
     if isinstance(value, str) and "${" in value:
         raise ValueError(f"expected resolved values, got {value!r:.80}")
-    for key, member in (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    ):
+    members = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, member in members:
         _without_interpolations(key)
         _without_interpolations(member)
     return value

@@ -228,10 +228,9 @@ class RunLog:
         self.written = len(points)
         with contextlib.suppress(OSError):  # a full disk ends the run at its checkpoint, which says so
             write_atomically(self.path, "".join(map(_text, lines)).encode(), lasting=False)
-        settings, continued = dict(flat(spec.plain)), trainer.step if spec.config.resume else 0
-        self.tracker = Guarded(
-            spec.config.log, Subject(spec.folder, spec.name, spec.config.experiment, settings, continued)
-        )
+        continued = trainer.step if spec.config.resume else 0
+        subject = Subject(spec.folder, spec.name, spec.config.experiment, dict(flat(spec.plain)), continued)
+        self.tracker = Guarded(spec.config.log, subject)
         for point, line in zip(points, lines, strict=True):
             if point not in earlier_lines:  # measured before the run had a log, while models or lengths were compared
                 self._send(point, line)
@@ -262,9 +261,10 @@ class RunLog:
     def end(self, record: Record | None) -> None:
         """Send the results of the record and end the tracking; None if a signal has stopped the run."""
         if record and record.metrics and record.cost:
-            costs = {name: getattr(record.cost, name) for name in ("train_s", "fps", "num_gaussians", "bytes")}
+            names = ("train_s", "fps", "num_gaussians", "bytes")
             numbers = {f"{self.split}/{name}": value for name, value in record.metrics.items()}
-            self.tracker.add(self.trainer.step, _finite({**numbers, **{f"cost/{k}": v for k, v in costs.items()}}))
+            numbers |= {f"cost/{name}": getattr(record.cost, name) for name in names}
+            self.tracker.add(self.trainer.step, _finite(numbers))
         self.tracker.end(record.status if record else "stopped")
 
 

@@ -64,8 +64,11 @@ def measure_images(
     background: tuple[float, float, float],
     config: Config,
 ) -> MeasuredImages:
-    """Measure the renders of the evaluated views, of which one at a time is in memory, by the protocol of a config."""
-    shown: Pairs = []
+    """Measure the renders of the evaluated views, of which one at a time is in memory, by the protocol of a config.
+
+    `evaluate` asks for one (name, render, ground truth) after the other; regions and flicker look at each on its way.
+    """
+    shown: Pairs = []  # filled meanwhile
     regions = RegionScores(views, config.protocol.quantise)
     flicker = FlickerScores(views, regions.regions["moving"].of_any_size)
     pairs = _beside_truth(views, renders, config.protocol.pictures, shown)
@@ -76,13 +79,13 @@ def measure_images(
         weights=lpips_weights(config),
     )
     return MeasuredImages(
-        quality.metrics | regions.metrics() | flicker.metrics(),
-        quality.missing | regions.missing() | flicker.missing(),
-        regions.with_scores(quality.per_view),
-        regions.of_record() | flicker.of_record(),
-        {"pictures.png": strip(shown)} | flicker.pictures() if shown else {},
-        flicker.still,
-        flicker.missing_because,
+        metrics=quality.metrics | regions.metrics() | flicker.metrics(),
+        missing=quality.missing | regions.missing() | flicker.missing(),
+        per_view=regions.with_scores(quality.per_view),
+        regions=regions.of_record() | flicker.of_record(),
+        images={"pictures.png": strip(shown)} | flicker.pictures() if shown else {},
+        still=flicker.still,
+        no_film=flicker.missing_because,
     )
 
 
@@ -138,7 +141,7 @@ def _beside_truth(
     views: Sequence[View], renders: Iterable[Tensor], pictures: int, shown: Pairs
 ) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Yield (name, render, ground truth) of each evaluated view, and append a few of these image pairs to `shown`."""
-    chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]
+    chosen = range(0, len(views), max(1, len(views) // max(1, pictures)))[:pictures]  # evenly spaced
     # one view at a time, because fifty views of 2048 x 1088 take 3 GB
     for i, (view, render) in enumerate(zip(views, renders, strict=True)):
         truth = view.image

@@ -110,7 +110,7 @@ def born(pid: int) -> int | None:
     The start time distinguishes the process from a later one with the same id.
     """
     try:
-        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()  # the name may have blanks
     except OSError:
         return None
     return None if after_name[0] == "Z" else int(after_name[19])  # field 22 of proc(5); a zombie has ended
@@ -200,14 +200,14 @@ def _content(path: Path) -> bytes | None:
     Raises:
         OSError: it cannot be read, which does not make it a damaged one.
     """
-    for last in (*[False] * (READS - 1), True):
+    for attempt in range(1, READS + 1):
         try:
             with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would be waited for
                 return file.read(LARGEST)
         except FileNotFoundError:
             return None
         except OSError as error:
-            if error.errno != errno.ESTALE or last:
+            if error.errno != errno.ESTALE or attempt == READS:
                 raise
             time.sleep(PAUSE)
     raise AssertionError("the last attempt returns or raises")

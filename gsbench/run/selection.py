@@ -107,7 +107,8 @@ class Candidates:
             InputError: the checkpoint is gone or damaged.
         """
         run, trainer = self._run(chosen.candidate.name), self.trainer(chosen.candidate.name)
-        state = fitting.saved_state(replace(run, config=replace(run.config, resume=True)), self.scene)
+        resumed = replace(run, config=replace(run.config, resume=True))  # its checkpoint is of this command
+        state = fitting.saved_state(resumed, self.scene)
         if state is None:
             raise InputError(f"{run.folder}: expected the checkpoint of the best candidate, it is gone: run again")
         trainer.load_state_dict(state)
@@ -133,7 +134,7 @@ class Candidates:
         """
         spec, run, trainer = self.spec, self._run(name), self.trainer(name)
         done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
-        error = frame_ms = None
+        error = frame_ms = None  # frame_ms stays None if the training failed or was too slow
         try:
             fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
             fitting.fit(
@@ -304,7 +305,7 @@ def _trained_models(trainings: Candidates, model: ChosenModel) -> Trainer:
     results: list[Result] = []
     for name, config in trainings.settings.items():
         until = Schedule(config.train, config.model.sh_degree, config.agr).compares_after
-        steps = (len(trainings.settings) - 1) * until + config.train.iterations
+        steps = (len(trainings.settings) - 1) * until + config.train.iterations  # one of them is trained to the end
         results.append(trainings.train(name, until, results, steps))
     chosen = best(results)
     comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
@@ -329,7 +330,7 @@ def lengths(config: Config) -> dict[str, Config]:
     """
     train, count = config.train, lengths_of(config)
     assert count is not None
-    alone: dict[str, Any] = {"lengths": None}
+    alone: dict[str, Any] = {"lengths": None}  # a dict, as mypy does not know the keys of hooks
     trains = [replace(train, iterations=train.iterations >> k, **alone) for k in reversed(range(count))]
     return {length_name(shorter.iterations): replace(config, train=shorter) for shorter in trains}
 

@@ -126,9 +126,9 @@ def _check_coarse(coarse: list[list[int]]) -> None:
     An example is [[4, 3000], [2, 15000]]: factors decrease and steps increase.
     """
     are_pairs = all(len(pair) == 2 for pair in coarse)
-    factors, steps = ([pair[at] for pair in coarse] if are_pairs else [] for at in (0, 1))
-    fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))
-    rise = all(a < b for a, b in itertools.pairwise([0, *steps]))
+    factors, steps = ([pair[i] for pair in coarse] if are_pairs else [] for i in (0, 1))
+    fall = all(a > b for a, b in itertools.pairwise([*factors, 1]))  # the last factor is above 1
+    rise = all(a < b for a, b in itertools.pairwise([0, *steps]))  # the first step is above 0
     if not are_pairs or not fall or not rise:
         raise InputError(
             f"train.coarse: expected pairs (factor above 1, step of the recipe until which images are so "

@@ -59,7 +59,7 @@ def build_with_placeholders(config: Config, extent: float) -> GaussianModel:
 
     `extent` is the radius of the scene, world units. It raises the same errors as `build`.
     """
-    model, points = build(config), torch.eye(4, 3)
+    model, points = build(config), torch.eye(4, 3)  # also their colours
     model.initialise(Points(points, points), extent, generator(config.seed))
     return model
 
@@ -100,7 +100,7 @@ def scene_folder(config: Config) -> Path:
     for folder in folders:
         if folder.is_dir():
             return folder
-    for root in _roots_nearby(data_root(data.root), names):
+    for root in _roots_nearby(data_root(data.root), names):  # the first is named
         raise InputError(
             f"data.root={data.root}: expected the folder that holds {' or '.join(map(repr, names))}: "
             f"type {typed('data.root', str(root), several=False)}",
@@ -119,7 +119,7 @@ def _roots_nearby(root: Path, names: Sequence[str]) -> Iterator[Path]:
     """Yield folders that hold a scene, if `root` is one or two folders above such a folder, or is the scene's own."""
     if root.is_dir() and root.absolute().name in names:
         yield root.absolute().parent
-    for name in names:
+    for name in names:  # which may have folders, such as "scenes/trex"
         for pattern in (f"*/{name}", f"*/*/{name}"):
             yield from (path.parents[name.count("/")] for path in sorted(root.glob(pattern)) if path.is_dir())
 

@@ -58,7 +58,7 @@ class Request:
 
     def _ask(self, signal_number: int, frame: FrameType | None) -> None:
         if self.signal is None:
-            _is_new()
+            _is_new()  # remembers the time
             self.signal = signal_number
         elif time.monotonic() - _asked >= SAME_REQUEST:  # the earlier handler usually ends the process
             before = self._before.get(signal_number)

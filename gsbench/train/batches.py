@@ -55,7 +55,7 @@ def generator(seed: int, *purpose: int) -> torch.Generator:
     (step, DRAWS, view) with `gsbench.train.regularisers.DRAWS`: penalties.
     """
     mixed = 0
-    for number in (seed, *purpose):
+    for number in (seed, *purpose):  # a step of Knuth's linear congruential generator MMIX for each number
         mixed = (mixed * 6364136223846793005 + number + 1442695040888963407) % (1 << 63)
     return torch.Generator().manual_seed(mixed)
 

@@ -41,7 +41,7 @@ def save(path: Path, content: Checkpoint) -> None:
     """Write a checkpoint atomically: another process that reads `path` gets the old file or the new file."""
 
     def write(file: io.BufferedRandom) -> None:
-        file.write(MAGIC + b"0" * DIGEST + b"\n")
+        file.write(MAGIC + b"0" * DIGEST + b"\n")  # room for the SHA-256 of what follows
         stream = _WithFirstError(file)
         torch.save({f.name: getattr(content, f.name) for f in fields(content)}, cast(IO[bytes], stream))
         if stream.error is not None:
@@ -79,7 +79,7 @@ class _WithFirstError:
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
-    """Read the state of a training with these hashes of its settings and data; None if the file has none of it.
+    """Read the state of a training with these hashes of its settings and data; None if `path` has no such state.
 
     Raises:
         InputError: the file is not a checkpoint, or it is damaged.
@@ -133,8 +133,9 @@ def check_plain(value: object, most: int) -> None:
         RecursionError: a container contains itself.
     """
     if isinstance(value, Tensor):
-        kind = "a sparse one" if value.layout != torch.strided else f"one on '{value.device.type}'"
-        if value.layout != torch.strided or value.device.type == "meta" or value.is_quantized:
+        is_sparse = value.layout != torch.strided
+        if is_sparse or value.device.type == "meta" or value.is_quantized:
+            kind = "a sparse one" if is_sparse else f"one on '{value.device.type}'"
             raise InputError(f"checkpoint: expected dense tensors, got {kind}")
         if value.requires_grad:
             raise InputError("checkpoint: expected tensors of values, got one that requires a gradient")

@@ -29,10 +29,10 @@ class FiniteCheck:
         self.loss = math.nan  # loss of the last step that was looked at
         self.skip = torch.zeros((), device=device)
         self._names: list[str] = []  # the group of each parameter
-        # [parameters + 2]: for each gradient, and then for the loss, 1 once it was not finite, else 0; the last loss
-        self._now = torch.empty(0)
+        # [parameters + 2]: for each gradient and for the loss, 1 once it was not finite, else 0; then the last loss
+        self._result = torch.empty(0)
         self._steps: list[int] = []  # since the last look
-        self._then = torch.empty(0)  # [every, parameters + 2]: `_now` after each of these steps
+        self._results = torch.empty(0)  # [every, parameters + 2]: `_result` after each of these steps
 
     @torch.no_grad()
     def check(self, losses: Tensor, groups: dict[str, list[nn.Parameter]]) -> None:
@@ -41,13 +41,13 @@ class FiniteCheck:
         This can be recorded and repeated in other steps.
         """
         gradients = [p.grad for group in groups.values() for p in group]
-        if len(self._now) != len(gradients) + 2:
+        if len(self._result) != len(gradients) + 2:
             self._names = [name for name, group in groups.items() for _ in group]
-            self._now = losses.new_zeros(len(gradients) + 2)
-            self._then = self._now.new_empty(self.every, len(self._now))
-        loss = self._now[-1]
+            self._result = losses.new_zeros(len(gradients) + 2)
+            self._results = self._result.new_empty(self.every, len(self._result))
+        loss = self._result[-1]
         torch.sum(losses, 0, out=loss)
-        _flag([*gradients, loss], self._now[:-1], self.skip)
+        _flag([*gradients, loss], self._result[:-1], self.skip)
 
     def end(self, step: int) -> None:
         """Look at the result of the checks if it is time, after each step that was checked.
@@ -55,7 +55,7 @@ class FiniteCheck:
         Raises:
             DivergedError: as `look`.
         """
-        self._then[len(self._steps)].copy_(self._now)
+        self._results[len(self._steps)].copy_(self._result)
         self._steps.append(step)
         if len(self._steps) == self.every:
             self.look()
@@ -66,11 +66,11 @@ class FiniteCheck:
         Raises:
             DivergedError: a check failed; the message names the step and the parameter.
         """
-        for step, (*flags, loss) in zip(self._steps, self._then.tolist(), strict=False):
+        for step, (*flags, loss) in zip(self._steps, self._results.tolist(), strict=False):  # the last rows may be old
             self.loss = loss
             if any(flags):
                 bad = flags.index(1)
-                if bad == len(self._names):
+                if bad == len(self._names):  # the flag after those of the gradients
                     raise DivergedError(f"step {step}: the loss is {loss}")
                 raise DivergedError(f"step {step}: the gradient of '{self._names[bad]}' is not finite (loss {loss})")
         self._steps.clear()
@@ -92,8 +92,9 @@ def explain(model: GaussianModel) -> str:
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
-        bad = ~parameter.grad.reshape(len(parameter), math.prod(parameter.shape[1:])).isfinite().all(1)
+        rows = parameter.grad.reshape(len(parameter), math.prod(parameter.shape[1:]))  # also if it has one dimension
+        bad = ~rows.isfinite().all(1)
         if bad.any():
             return f"the first is Gaussian {int(bad.nonzero()[0])} of {len(bad)} in '{name}' ({int(bad.sum())} in all)"
     where = "AGR's networks or lambda" if model.refinement is not None else "the learning rates"
-    return f"no Gaussian's gradient is: look at {where}"
+    return f"no Gaussian's gradient is: look at {where}"  # completes the message of a DivergedError

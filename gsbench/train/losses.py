@@ -39,7 +39,7 @@ def structural_similarity(a: Tensor, b: Tensor) -> Tensor:
     moments = _blur(torch.cat([a, b, a * a, b * b, a * b]))
     mean_a, mean_b, aa, bb, ab = moments.split(len(a))
     variances, covariance = aa - mean_a**2 + bb - mean_b**2, ab - mean_a * mean_b
-    C1, C2 = 0.01**2, 0.03**2
+    C1, C2 = 0.01**2, 0.03**2  # (Wang et al. 2004, section III-B) for colours in [0, 1]
     similarity = (2 * mean_a * mean_b + C1) * (2 * covariance + C2)
     return (similarity / ((mean_a**2 + mean_b**2 + C1) * (variances + C2))).mean()
 
@@ -56,6 +56,7 @@ def _blur(planes: Tensor) -> Tensor:  # [P, H, W]
 
 @functools.cache
 def _band(size: int, device: torch.device, dtype: torch.dtype) -> Tensor:  # [size, size], symmetric
+    """Return the matrix whose product with a column of pixels is its convolution with the Gaussian window."""
     offset = torch.arange(size, device=device)[:, None] - torch.arange(size, device=device)
     window = torch.exp(-((torch.arange(WINDOW, device=device, dtype=dtype) - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     weight = torch.exp(-(offset.to(dtype) ** 2) / (2 * SIGMA**2)) / window.sum()

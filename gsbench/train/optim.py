@@ -69,8 +69,8 @@ class Optimizer:
         """torch's Adam with the same moments, of what is not updated by rows; its import takes a second."""
         rest = [(name, [p for p in group if id(p) not in self._by_rows]) for name, group in self.groups.items()]
         groups = [{"params": parameters, "name": name} for name, parameters in rest]
-        adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPS, fused=True)
-        adam.state = self.moments
+        adam = torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPS, fused=True)  # `update` sets the rates
+        adam.state = self.moments  # shared: densification and `load_state_dict` change it in place
         return adam
 
     @cached_property
@@ -131,9 +131,9 @@ class Optimizer:
         return state
 
     def _update_all(self, drawn: Tensor | None) -> None:
-        """Update all parameters by one call of the kernel."""
-        each = zip(self.groups.values(), self._rates_in_memory.unbind(), strict=True)
-        rated = [(p, rate) for group, rate in each for p in group if p.grad is not None]
+        """Update all parameters that have a gradient by one call of the kernel."""
+        groups = zip(self.groups.values(), self._rates_in_memory.unbind(), strict=True)
+        rated = [(p, rate) for group, rate in groups for p in group if p.grad is not None]
         parameters, rates = [p for p, _ in rated], [rate for _, rate in rated]
         gradients = [p.grad for p in parameters if p.grad is not None]
         states = [self._state_of(p) for p in parameters]
@@ -234,17 +234,20 @@ def rate_at(rate: LearningRate, step: int, train: TrainConfig, extent: float) ->
 
 
 def adam_reference(
-    parameter: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    drawn: Tensor,
+    parameter: Tensor,  # [N, ..]
+    gradient: Tensor,  # [N, ..]
+    mean: Tensor,  # [N, ..] first moment
+    square: Tensor,  # [N, ..] second moment
+    drawn: Tensor,  # [N] bool
     rate: float,
     betas: Sequence[float],
     eps: float,
-    step: Tensor,
+    step: Tensor,  # [] the number of steps with this one
 ) -> None:
-    """Do an Adam step in torch on the Gaussians `drawn` [N] bool only; the kernel of `adam_all` does the same."""
+    """Do an Adam step in torch on the Gaussians `drawn` only; the kernel of `adam_all` does the same.
+
+    Kingma and Ba 2015, algorithm 1, with both bias corrections.
+    """
     rows = drawn.nonzero()[:, 0]
     g = gradient[rows]
     m = mean[rows].lerp(g, 1 - betas[0])

@@ -111,9 +111,9 @@ class Strain(Penalty):
         assert self.neighbours is not None
         assert query.time is not None
         draws = generator(self.seed, self.step, DRAWS, index)
-        drawn = 2 * float(torch.rand((), generator=draws)) - 1
-        share = (1 - LEAST_SHARE) * drawn + (LEAST_SHARE if drawn > 0 else -LEAST_SHARE)
-        later = CameraTime(query.center, query.time + share / self.frames)
+        drawn = 2 * float(torch.rand((), generator=draws)) - 1  # in [-1, 1]
+        u = (1 - LEAST_SHARE) * drawn + (LEAST_SHARE if drawn > 0 else -LEAST_SHARE)  # LEAST_SHARE <= |u| <= 1
+        later = CameraTime(query.center, query.time + u / self.frames)
         assert later.time is not None
         sample = self.rows[torch.randperm(len(self.rows), generator=draws)[:SAMPLES].to(self.rows.device)]
         pairs = self.neighbours[sample].long().T.contiguous()  # [k, B]
@@ -156,9 +156,9 @@ class Strain(Penalty):
         if len(rows) <= NEIGHBOURS:
             return neighbours
         positions = means[rows].double().cpu().numpy()
-        nearest = torch.from_numpy(cKDTree(positions).query(positions, k=NEIGHBOURS + 1)[1])
+        nearest = torch.from_numpy(cKDTree(positions).query(positions, k=NEIGHBOURS + 1)[1])  # with itself
         itself = nearest == torch.arange(len(rows))[:, None]
-        itself[~itself.any(-1), -1] = True  # more than k others are in the same place
+        itself[~itself.any(-1), -1] = True  # more than k others are in the same place: the last of them is left out
         neighbours[rows] = rows[nearest[~itself].unflatten(0, (-1, NEIGHBOURS)).to(rows.device)].int()
         return neighbours
 
@@ -166,8 +166,8 @@ class Strain(Penalty):
         """Return the conditional means [N, 3] and, without gradients, the opacity factors in [0, 1], [N]."""
         raw = self.model.refined(query)
         geometry = self.model.slice_geometry(raw, query)
-        largest = torch.sigmoid(raw["opacities"].detach()).clamp(min=torch.finfo(geometry.means.dtype).tiny)
-        return geometry.means, geometry.opacities.detach() / largest
+        unfaded = torch.sigmoid(raw["opacities"].detach()).clamp(min=torch.finfo(geometry.means.dtype).tiny)
+        return geometry.means, geometry.opacities.detach() / unfaded
 
 
 def _differences(

@@ -58,6 +58,7 @@ class Rows:
         intervals = None if self.model.effect_sets is not None else self.model.visible_intervals()
         if intervals is not None:
             first, last = intervals.unbind(1)
+            # By the bin of the first time, and within a bin by the last time: last / 2 is below 1.
             self.select(((first * START_BINS).floor() + last / 2).argsort(stable=True))
 
     def forget(self, name: str) -> None:

@@ -137,7 +137,7 @@ class TrainingParts:
                 hook.load_state_dict(saved)
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state["effort"])
-            counts = self.gradients.replay.counts
+            counts = self.gradients.replay.counts  # changed in place
             counts |= {name: whole_number(f"replay: {name}", state["replay"][name], self.step) for name in counts}
             self.curve.load_state_dict(state["curve"])
             self.exact = set(parse(list[str], state["exact"], "checkpoint: exact"))

@@ -172,7 +172,7 @@ def test_more_intersections_than_there_is_room_for(
         fitted = end(start("3dgs", "train.batch_size=2", scene=near_and_far()))
         for fitted.step in range(90, 99):
             fitted.train_step()
-        losses.append(fitted.finite_check._then[:9, -1].tolist())
+        losses.append(fitted.finite_check._results[:9, -1].tolist())
     assert losses[0] == (losses[1] if cuda_device == "cpu" else pytest.approx(losses[1], rel=1e-3))
     assert repeats["done"] > 0
     assert repeats["outdated"] > 0

@@ -46,7 +46,7 @@ class WeighedImage:
         sums: dict[int, Tensor] = {}
         factors = pixels[None, ..., None].expand_as(self._output).contiguous()
         self._tape.backward(self._output, factors, [self._colors], sums)
-        return sums.get(id(self._colors), torch.zeros_like(self._colors))[:, 0]
+        return sums.get(id(self._colors), torch.zeros_like(self._colors))[:, 0]  # each channel has the same weights
 
 
 def heaviest(weights: Tensor, share: float) -> Tensor:

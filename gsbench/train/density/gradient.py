@@ -32,7 +32,7 @@ class GradientRule(DensificationRule):
     @torch.no_grad()
     def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
         """Add the norms of the gradients of the 2D means in some views, in units of half the image, and count views."""
-        scale = views * width / 2, views * height / 2
+        scale = views * width / 2, views * height / 2  # times views: the loss is a mean over the batch
         if self.model.backend.serves(self.gradient) and library_of(self.gradient.device.type).has("add_density"):
             add_density(drawn, g_means2d, scale, self.gradient, self.times_visible, self.unseen)
             return
@@ -104,15 +104,16 @@ class GradientDensification(GradientRule):
         split = wanted & (~small | model.long_in_time())
         clone = wanted & ~split
 
+        # Gaussians that are not split come first, then the clones, then the children in place of their parents.
         unsplit, cloned = (~split).nonzero()[:, 0], clone.nonzero()[:, 0]
         parents = split.nonzero()[:, 0].repeat_interleave(CHILDREN)
-        chosen = torch.cat([unsplit, cloned, parents])
-        self.rows.select(chosen, fresh=torch.arange(len(chosen), device=chosen.device) >= len(unsplit))
+        before = torch.cat([unsplit, cloned, parents])
+        self.rows.select(before, fresh=torch.arange(len(before), device=before.device) >= len(unsplit))
         added = torch.arange(len(unsplit), len(model), device=parents.device)
         clones, children = added.split([len(cloned), len(parents)])
         model.clone_rows(clones, generator)
         model.split_rows(children, generator)
-        return chosen, refused
+        return before, refused
 
     def _unseen(self) -> Tensor:
         """Return which Gaussians no view of an epoch saw, [N] bool.
@@ -139,7 +140,7 @@ class GradientDensification(GradientRule):
         if allowed is not None:
             wanted &= allowed
         rows = wanted.nonzero()[:, 0]
-        room = max(0, most - len(self.model))
+        room = max(0, most - len(self.model))  # a clone and a split each add one Gaussian
         if len(rows) > room:
             refused = gradient[rows].argsort(descending=True, stable=True)[room:]
             wanted[rows[refused]] = False

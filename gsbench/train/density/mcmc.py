@@ -25,9 +25,9 @@ class MCMCDensification(DensificationRule):
     - Then 5 % more Gaussians are added in the same way, up to `train.densify.max_gaussians`.
     - The n Gaussians that are now at one place get opacities and sizes such that together they look like the single
       Gaussian that was there before.
-    - After every step each mean moves by normal noise with the covariance of its Gaussian. The noise is multiplied by
-      `train.densify.noise`, by the learning rate of means and by sigmoid(-100 (opacity - 0.005)), so only transparent
-      Gaussians move.
+    - After every step each mean moves by Sigma eta, for the covariance Sigma of its Gaussian and a normal eta. This is
+      multiplied by `train.densify.noise`, by the learning rate of means and by sigmoid(-100 (opacity - 0.005)), so only
+      transparent Gaussians move.
     """
 
     @torch.no_grad()
@@ -36,7 +36,7 @@ class MCMCDensification(DensificationRule):
         N = len(self.model)
         opacities = opacities_of(self.model)
         dead = opacities <= self.min_opacity
-        if dead.all():
+        if dead.all():  # no source is left
             return 0
         copy_drawn(self.rows, opacities.masked_fill(dead, 0), dead.nonzero()[:, 0], generator, self.min_opacity)
         added = max(0, min(most, int(N * (1 + GROWTH))) - N)
@@ -55,7 +55,7 @@ class MCMCDensification(DensificationRule):
         opacities = opacities_of(self.model)
         noise = torch.randn(len(opacities), 3, 1, generator=generator).to(opacities)
         rows = (opacities < STILL_FROM).nonzero()[:, 0]
-        spread = self.model.spread(rows)
+        spread = self.model.spread(rows)  # [M, 3, 3] L, where Sigma = L L^T
         weight = torch.sigmoid(-100 * (opacities[rows] - 0.005)) * (self.config.noise * rate)
         self.model.splats["means"].data[rows] += weight[:, None] * (spread @ (spread.mT @ noise[rows]))[..., 0]
 
@@ -81,13 +81,14 @@ def copy_drawn(rows: Rows, weights: Tensor, places: Tensor, generator: torch.Gen
     model = rows.model
     order = torch.arange(max(len(model), int(places.max()) + 1), device=sources.device)
     order[places] = sources
-    chosen, copies = sources.unique(return_counts=True)
-    opacities, shrink = relocated(opacities_of(model)[chosen], (copies + 1).clamp(max=MOST_COPIES))
+    distinct, copies = sources.unique(return_counts=True)
+    # First the sources get the opacity and the size of all Gaussians that are then at their place, with themselves.
+    opacities, shrink = relocated(opacities_of(model)[distinct], (copies + 1).clamp(max=MOST_COPIES))
     opacities = opacities.clamp(least_opacity, LARGEST_OPACITY)
-    model.splats["opacities"].data[chosen] = torch.logit(opacities).to(model.splats["opacities"].dtype)
-    model.shrink_rows(chosen, shrink)
+    model.splats["opacities"].data[distinct] = torch.logit(opacities).to(model.splats["opacities"].dtype)
+    model.shrink_rows(distinct, shrink)
     fresh = torch.zeros(len(order), dtype=torch.bool, device=order.device)
-    fresh[places] = fresh[chosen] = True
+    fresh[places] = fresh[distinct] = True
     rows.select(order, fresh)
 
 

@@ -30,6 +30,7 @@ class Best(Hook):
         self.scores = Scores()
 
     def after_measuring(self, finished: int, psnr: float) -> float:
+        """Measure the evaluated split, and keep the scores that are the best so far; return `psnr` as it is."""
         scores, leaks = self.scores, self.training.config.protocol.best_on_test
         is_best = psnr >= rank(scores.val)  # a NaN is never the best
         if leaks or is_best:

@@ -82,6 +82,7 @@ def choices_in(state: dict[str, Any]) -> ChosenOnVal:
 
 
 def _parsed(state: object) -> ChosenOnVal:
+    """Convert a `state_dict` of Choices, in which a choice that was not asked for is None."""
     from gsbench.measure.record import LengthChoice, ModelComparison
     from gsbench.reading import parse
 

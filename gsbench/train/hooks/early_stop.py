@@ -81,6 +81,7 @@ class EarlyStop(Hook):
         return finished - max(self._best[0], self.training.schedule.densify_stop) >= self.wait
 
     def at_end(self) -> None:
+        """Restore the Gaussians of the best iteration, unless it is the last; measurements of later ones stay."""
         if self.wait is None or self._best is None:
             return
         from gsbench.measure.record import Stop
@@ -94,7 +95,7 @@ class EarlyStop(Hook):
                 f"to {equal[-1].iteration}: it cannot decide, and the last of them is kept"
             )
         if self._kept is not None:
-            best_state, self._kept = self._kept, None
+            best_state, self._kept = self._kept, None  # not in the state that is loaded and saved now
             now = training.state_dict()
             training.load_state_dict(now | best_state | {"hooks": now["hooks"] | best_state["hooks"]})
             training.report(
