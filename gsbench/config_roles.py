@@ -106,6 +106,7 @@ def _decided(keys: Plain) -> Plain:
 
 
 def _differences(before: Plain, after: Plain) -> list[str]:
+    """Describe the keys whose values differ in two flat configs, in which a key that is not set is missing."""
     # Hashes are compared, not values: 1, 1.0 and True are equal to Python, but they are other settings. []: not set.
     before, after = _decided(before), _decided(after)
     return [

@@ -31,6 +31,8 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     if not path.exists():
         raise InputError(f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none")
     former = checkpoint.read(path)
+
+    # The settings and the name of the new run: those of the old one, and the gate.
     plain: Plain = copy.deepcopy(former.config)
     gate = typed_config(plain, path).effects.gate
     if gate != "off":
@@ -44,6 +46,7 @@ def gate_finished(folder: Path, budget_db: float, data_root: str | None = None) 
     new = folder.parent.parent / records.model_folder(old.model, variant) / folder.name  # SCENE/MODEL,VARIANT/SEED
     overrides = sorted([*old.overrides, "effects.gate=end", f"effects.budget_db={budget_db}"])
     check_folder(new)
+
     execution = Execution(RunSpec(config, plain, new, old.model, variant, overrides))
     try:
         model, scene = execution.prepare()

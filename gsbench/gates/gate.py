@@ -38,7 +38,8 @@ MOST_PREDICTED = 2.0  # the predicted loss of PSNR is at most this times the all
 class ChosenSimplifications:
     """The simplification that was chosen for each Gaussian."""
 
-    geometry: dict[str, Tensor]  # for each simplification by name: which Gaussians it is chosen for, [N] bool
+    # [N] bool: for which Gaussians each simplification is chosen, by its name; LIVE: for which none, or a colour's only
+    geometry: dict[str, Tensor]
     orders: Tensor  # [N] int32: SH degree and frequencies of each colour, as in `ColorOrder`
     predicted: float  # predicted squared error that is added, as a share of the model's squared error
 
@@ -130,6 +131,7 @@ def choose(sensitivity: Sensitivity, model: GaussianModel, budget: float) -> Cho
     ways, errors = sensitivity.simplifications, sensitivity.errors
     errors_by_geometry = {LIVE: zeros} | {way.name: errors[way.name] for way in ways if way.order is None}
     names = list(errors_by_geometry)
+    # A Gaussian that is cheaper already stays so: a static one does not become conditioned.
     costs = torch.stack([live if name == LIVE else torch.minimum(live, zeros + COSTS[name]) for name in names])
     geometry_errors = torch.stack(list(errors_by_geometry.values()))  # [G, N]; `costs` too
     removes = torch.tensor([name == REMOVED for name in names], device=live.device)[:, None]

@@ -58,7 +58,7 @@ def _of_gate(gate: Gate) -> str:
     by_effects = ", ".join(f"{gate.rows[name]} {words}" for name, words in EFFECT_SETS.items() if gate.rows.get(name))
     text = f"gate {when}: {left} of {left + gate.rows.get('removed', 0)} Gaussians are left"
     text += f" ({by_effects})" if by_effects else ""
-    text += f"; PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB"
+    text += f"; PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB"  # a loss as a negative change
     if gate.eval_loss_db is not None:
         text += f", on the evaluated views {-gate.eval_loss_db:+.3f} dB"
     if gate.frame_ms_before and gate.frame_ms:

@@ -88,7 +88,8 @@ def _screen_fixed(scene: Scene, viewpoints: Viewpoints, seed: int) -> TimeScreen
     where = f"the images of each of {count} camera positions" if count > 1 else "the images of the camera's position"
     if not result.changed:
         return _answer(OFF, f"{where} differ by exposure and noise only")
-    blocks = f"{f'{result.changed:.0%}' if result.changed >= 0.01 else 'less than 1%'} of their blocks"
+    share = f"{result.changed:.0%}" if result.changed >= 0.01 else "less than 1%"
+    blocks = f"{share} of their blocks"
     if result.p is None:
         return _answer(UNDECIDED, f"{where} differ in {blocks}, but are too few to test for a change over time")
     if result.p <= LEVEL:

@@ -163,10 +163,10 @@ class ProbedView:
         The first lines of this module have the formulas for colours, removals and motions.
         """
         model, live = self.model, self.live
-        if simplification.raw is None:
+        if simplification.raw is None:  # removed
             return _growth_of(self.removed)
         raw = dict(model.splats.items()) | simplification.raw
-        if simplification.order is not None:
+        if simplification.order is not None:  # only the colour changes
             colors = model.shade(raw, live.means, live.opacities, self.query)
             return _growth_of((self.products[..., COLOR] * (colors - live.colors)).sum(-1))
         simplified = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
@@ -188,6 +188,7 @@ class ProbedView:
         products = thin_products * scale[:, None]  # as if `changed` was in the image, instead of `thin`
         # A derivative by an opacity does not grow with this opacity.
         products[..., OPACITY] = thin_products[..., OPACITY] / shown
+        # <x, vector>, [K, n]: x = (J + J') delta / 2 if the Gaussian is near; if it is far, what appears there
         moved = ((self.products[:, :n] + products) * (_matrix_of(changed) - self.matrix[:n])).sum(-1) / 2
         added = products[..., OPACITY] * changed.opacities
         return overlap * _growth_of(moved) + (1 - overlap) * _growth_of(self.removed[:, :n], added)

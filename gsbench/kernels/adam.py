@@ -36,22 +36,23 @@ def adam_all(
     if not parameters:
         return
     like, device = parameters[0], parameters[0].device
-    updated = list(zip(parameters, [None] * len(parameters) if drawn is None else drawn, strict=True))
+    updated = list(zip(parameters, [None] * len(parameters) if drawn is None else drawn, strict=True))  # with its rows
     gradients = in_rows(list(gradients))
     for name, listed in {"parameter": parameters, "gradient": gradients, "mean": means, "square": squares}.items():
         for x, parameter in zip(listed, parameters, strict=True):
-            if not (x.shape == parameter.shape and _is_in_rows(x, torch.float32, device)):
+            if not (x.shape == parameter.shape and _is_readable(x, torch.float32, device)):
                 raise _refusal(f"adam_all: {name}", x, torch.float32, parameter.shape, device)
     for x in [*steps, *rates, *([] if skip is None else [skip])]:
-        if x.dim() or not _is_in_rows(x, torch.float32, device):
+        if x.dim() or not _is_readable(x, torch.float32, device):
             raise _refusal("adam_all: step, rate or skip", x, torch.float32, (), device)
     for parameter, rows in updated:
-        if rows is not None and not (rows.shape == parameter.shape[:1] and _is_in_rows(rows, torch.bool, device)):
+        if rows is not None and not (rows.shape == parameter.shape[:1] and _is_readable(rows, torch.bool, device)):
             raise _refusal("adam_all: drawn", rows, torch.bool, parameter.shape[:1], device)
     for part in _parts(len(parameters)):
         slots: Slots = {
             "count": len(parameters[part]),
             "numbers": tuple([x.numel() for x in parameters[part]]),
+            # numbers in a row; 0: all rows are updated
             "widths": tuple([0 if rows is None else x.numel() // max(1, len(rows)) for x, rows in updated[part]]),
             "drawn": tuple([address(rows) for _, rows in updated[part]]),
             "gradients": addresses(gradients[part]),
@@ -80,17 +81,17 @@ def flag_arrays(
         InputError: arrays are not float32 on one device, or there is not one flag for each.
     """
     device = skip.device
-    rows = in_rows([skip.new_empty(0) if x is None else x for x in arrays])
-    for x in [*rows, skip]:
-        if not _is_in_rows(x, torch.float32, device):
+    contiguous = in_rows([skip.new_empty(0) if x is None else x for x in arrays])
+    for x in [*contiguous, skip]:
+        if not _is_readable(x, torch.float32, device):
             raise _refusal("flag_arrays: arrays", x, torch.float32, x.shape, device)
-    if not (flags.shape == (len(rows),) and _is_in_rows(flags, torch.float32, device)):
-        raise _refusal("flag_arrays: flags", flags, torch.float32, (len(rows),), device)
-    for part in _parts(len(rows)):
+    if not (flags.shape == (len(arrays),) and _is_readable(flags, torch.float32, device)):
+        raise _refusal("flag_arrays: flags", flags, torch.float32, (len(arrays),), device)
+    for part in _parts(len(arrays)):
         slots: Slots = {
-            "count": len(rows[part]),
-            "numbers": tuple([x.numel() for x in rows[part]]),
-            "arrays": addresses(rows[part]),
+            "count": len(contiguous[part]),
+            "numbers": tuple([x.numel() for x in contiguous[part]]),
+            "arrays": addresses(contiguous[part]),
             "out.flags": address(flags[part]),
             "out.skip": address(skip),
         }
@@ -102,7 +103,7 @@ def _parts(count: int) -> list[slice]:
     return [slice(first, min(first + MAX_ADAM, count)) for first in range(0, count, MAX_ADAM)]
 
 
-def _is_in_rows(x: Tensor, dtype: torch.dtype, device: torch.device) -> bool:
+def _is_readable(x: Tensor, dtype: torch.dtype, device: torch.device) -> bool:
     """Return whether a kernel can read a tensor; a training asks this of a hundred tensors in each step."""
     return x.dtype == dtype and x.device == device and x.is_contiguous()
 

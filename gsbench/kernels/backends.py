@@ -64,7 +64,7 @@ def resolve(name: str, device: str = "cpu") -> Backend:
     if name == "cuda" and not cuda.available():
         why = "no CUDA device was found" if cuda.built() else "it is not built here"
         raise InputError(f"raster backend 'cuda': {why}; use raster.backend=auto or reference", docs="gpu.md#building")
-    if name in AUTO.devices and device in AUTO.devices and name != device:
+    if name in AUTO.devices and device in AUTO.devices and name != device:  # torch renders on any other device
         raise InputError(
             f"raster backend '{name}' does not render on device '{device}': use device={name}, "
             "or raster.backend=auto or reference"

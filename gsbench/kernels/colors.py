@@ -22,7 +22,7 @@ def _sizes(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int
             f"show_colors: expected degree 0 to 3 and 1 to {MAX_WAVES} frequencies, got "
             f"degree={degree!r:.40} and waves={waves!r:.40}"
         )
-    stored = shN.shape[1] + 1 if shN.dim() == 3 else 0
+    stored = shN.shape[1] + 1 if shN.dim() == 3 else 0  # with sh0; 0 of another shape, which is refused below
     if stored % waves or stored // waves < (degree + 1) ** 2:
         raise InputError(
             f"show_colors: expected (degree + 1)^2 coefficients for each frequency, got degree={degree}, "

@@ -29,12 +29,12 @@ SIZE: dict[str, type] = SPACE | {"t": int}
 
 def _sizes(_: dict[str, Tensor], numbers: dict[str, Any]) -> dict[str, int]:
     """Return the numbers of nodes in all planes of all levels, and of features."""
-    channels, levels, x, y, z, t = (numbers.get(name, 2) for name in SIZE)
+    channels, levels, x, y, z, t = (numbers.get(name, 2) for name in SIZE)  # t is missing in `sample_planes`
     if not (1 <= levels <= 8 and min(x, y, z, t) >= 2 and max(x, y, z, t) <= 4096):
         raise InputError(f"planes: expected 1 to 8 levels of 2 to 4096 nodes, got {levels} of {x, y, z, t}")
-    return {
-        "in_space": sum(x * y + x * z + y * z << 2 * level for level in range(levels)),
-        "in_time": sum(t * (x + y + z) << level for level in range(levels)),
+    return {  # x, y and z are 2^level times those of the first level
+        "in_space": sum((x * y + x * z + y * z) << 2 * level for level in range(levels)),
+        "in_time": sum((t * (x + y + z)) << level for level in range(levels)),
         "F": levels * channels,
     }
 

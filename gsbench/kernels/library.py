@@ -1,6 +1,6 @@
 """Call compiled kernels on the CPU or on a GPU, with arguments given by name."""
 
-import functools
+import math
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -118,7 +118,7 @@ def allocate(what: str, like: Tensor, shape: tuple[int, ...], dtype: torch.dtype
     try:
         return like.new_empty(shape, dtype=dtype)
     except torch.OutOfMemoryError as error:
-        size = dtype.itemsize * functools.reduce(lambda a, b: a * b, shape, 1)
+        size = dtype.itemsize * math.prod(shape)  # bytes
         reason = " ".join(str(error).split())
         raise torch.OutOfMemoryError(
             f"{what} need {size / 2**20:.1f} MiB on {like.device}: lower the image's size, the cameras drawn at once "

@@ -37,7 +37,7 @@ class _Similarity(Operation):
         image, target = in_rows(tensors)
         C, height, width = slots["C"], slots["height"], slots["width"]
         library = library_of(image.device.type)
-        parts = image.new_empty(C, library.similarity_parts(height, width))
+        parts = image.new_empty(C, library.similarity_parts(height, width))  # sums, whose total is the loss
         gradient = allocate("the gradient of the loss", image, (slots["numbers"],))
         scratch = None
         if library.needs_scratch and slots["with_gradient"]:
@@ -55,7 +55,7 @@ class _Similarity(Operation):
         return [parts.sum(1) if parts.shape[1] > 1 else parts[:, 0], gradient], slots
 
     def prepare(self, tensors: Tensors, numbers: Sequence[Any], outputs: Sequence[Tensor] = ()) -> Slots:
-        return {}
+        return {}  # `backward` calls no kernel
 
     def backward(
         self,
@@ -66,7 +66,7 @@ class _Similarity(Operation):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
-        by_loss, image = upstream[0], tensors[0]
+        by_loss, image = upstream[0], tensors[0]  # [C], [C, H, W, 3]
         return [None if by_loss is None else by_loss.view(-1, 1, 1, 1) * outputs[1].view_as(image), None]
 
 

@@ -162,8 +162,8 @@ class Operation:
     def record(self, tensors: Tensors, numbers: tuple[Any, ...], results: Results | None = None) -> Tensors:
         """Return the outputs of a call, recorded for the backward pass.
 
-        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`. torch.compile
-        and dispatch modes see the registered operator, which computes them again.
+        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`. torch.compile,
+        and dispatch modes where there are gradients, get the registered operator, which runs the kernel in any case.
         """
         if (recording := getattr(active, "tape", None)) is not None:
             return recording.record(self, tensors, numbers, results)
@@ -173,6 +173,7 @@ class Operation:
             return traced
         if differentiated:
             return list(_Eager.apply(self, numbers, results, *tensors))
+        # Nothing is to be differentiated. The kernel runs at once, in a dispatch mode too: `Recording` notes its call.
         return (results or self.run(tensors, numbers))[0]
 
     def _in_order(self, arguments: tuple[Any, ...], by_name: dict[str, Any]) -> tuple[Any, ...]:
@@ -252,14 +253,15 @@ class Operation:
         """
         like = tensors[0]
         library = library_of(like.device.type)
-        kept: list[Tensor | None] = []  # tensors that must not be freed before the kernel has run
+        # The gradients by the outputs, as a kernel reads them; they must not be freed before it has run.
+        kept: list[Tensor | None] = []
         for name, g, x in zip(self._grad_out, upstream, outputs, strict=True):
             if g is None and name in self._needed:
                 g = torch.zeros_like(x)
             kept.append(None if g is None else g if g.is_contiguous() else g.contiguous())
             slots[name] = address(kept[-1])
         gradients: list[Tensor | None] = []
-        zeroed: list[Tensor] = []
+        zeroed: list[Tensor] = []  # what must be zero before the kernel runs
         for i, (key, x) in enumerate(zip(self._grad, tensors, strict=True)):
             if key is None:
                 gradients.append(None)
@@ -302,7 +304,7 @@ class Operation:
         slots = self._known.get(call)  # training calls an operation with few different shapes
         if slots is None:
             slots = self._match(tensors, numbers)
-            for length in self._lists.values():
+            for length in self._lists.values():  # calls with lists of other lengths share the entry
                 del slots[length]
             if len(self._known) >= MOST_KNOWN:
                 self._known.clear()
@@ -310,8 +312,9 @@ class Operation:
         return slots
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+        """Do what `match` does, without its cache."""
         slots: Slots = dict(zip(self.numbers, numbers, strict=True))
-        listed = list(zip(self.inputs.items(), self._shapes, tensors, strict=True))
+        listed = list(zip(self.inputs.items(), self._shapes, tensors, strict=True))  # ((key, Input), shape, tensor)
         present = [part for i, part in enumerate(listed) if not self._is_left_out(i, part[2])]
         names = {key for (key, _), _, _ in present}
         for group in {x.left_out_with for x in self.inputs.values()} - {None}:
@@ -328,7 +331,7 @@ class Operation:
             if expected and isinstance(first := expected[0], str) and first.startswith("?"):  # it may be left out
                 expected = expected[1:] if len(actual) < len(expected) else [first[1:], *expected[1:]]
             fits = len(actual) == len(expected)
-            for size, length in zip(expected, actual, strict=False):
+            for size, length in zip(expected, actual, strict=False):  # the first length of a named size defines it
                 fits = fits and length == (slots.setdefault(size, length) if isinstance(size, str) else size)
             if not fits:
                 known = [slots.get(size, size) if isinstance(size, str) else size for size in expected]
@@ -384,9 +387,9 @@ class _Eager(torch.autograd.Function):
         operation, wanted = ctx.operation, ctx.needs_input_grad[3:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
         gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
-        # Unlike the registered operator, it makes no zeros that nobody asked for.
+        # Zeros are made only for inputs that need a gradient; the registered operator makes them for all.
         return (
-            *[None] * 3,
+            *[None] * 3,  # for operation, numbers and results
             *[
                 (torch.zeros_like(x) if g is None else g) if asked else None
                 for x, g, asked in zip(tensors, gradients, wanted, strict=True)
@@ -464,7 +467,7 @@ def _register(operation: Operation) -> Callable[..., Any]:
         filled = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
         return _apart(filled, upstream)
 
-    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:  # inputs: the list of tensors, then numbers
         ctx.tensors = len(inputs[0])
         ctx.wanted = [x.requires_grad for x in inputs[0]]
         ctx.save_for_backward(*inputs[0], *output)

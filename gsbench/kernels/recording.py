@@ -56,8 +56,9 @@ def paused() -> Iterator[None]:
 def read(numbers: Tensor, holds: Callable[[list[int]], bool], is_late: bool = False) -> list[int]:
     """Return the values of an integer tensor [n].
 
-    An active recording reads the tensor again in every repetition, which fails unless `holds(values)` is true. Where
-    the calls that follow do no harm with any values, it is read late (`is_late`), after all calls: by `check`.
+    An active recording reads the tensor again in every repetition, and raises OutdatedError unless `holds(values)` is
+    true. Where the calls that follow do no harm with any values, it is read late (`is_late`), after all calls: by
+    `check`.
     """
     recording = current()
     return numbers.tolist() if recording is None else recording.read(numbers, holds, is_late)
@@ -100,7 +101,7 @@ class Recording(TorchDispatchMode):
         """Run a torch operation and record it."""
         kwargs = kwargs or {}
         result = operation(*args, **kwargs)
-        if isinstance(result, Tensor) and not (operation.is_view or operation._schema.is_mutable):
+        if isinstance(result, Tensor) and not (operation.is_view or operation._schema.is_mutable):  # in new memory
             self._bytes += result.nbytes
         if self._bytes > MOST_BYTES or _varies(operation, args):
             self.is_repeatable = False
@@ -115,7 +116,7 @@ class Recording(TorchDispatchMode):
             self._calls.append(result.zero_)
         elif operation in _COPY:
             self._calls.append(partial(result.copy_, args[0]))
-        elif not operation.is_view and operation not in _ALLOCATE:
+        elif not operation.is_view and operation not in _ALLOCATE:  # these two compute nothing
             self._calls.append(_over(result, operation, args, kwargs))
         return result
 
@@ -210,6 +211,7 @@ def _variant_over(operation: Any) -> tuple[Any, list[str]] | None:
 
 
 def _copy_over(result: Any, operation: Callable[[], Any]) -> None:
+    """Call an operation, and copy its result over an earlier one, a tensor or several tensors."""
     new = operation()
     if isinstance(result, Tensor):
         result.copy_(new)

@@ -66,14 +66,15 @@ class _Inputs(NamedTuple):
     def layers(self) -> dict[str, Tensor]:
         """Return the weights of the MLPs in the form that the kernels of the CPU take.
 
-        The encoded time gamma(t) is merged into the biases of the first layers, and the scales `units` into the
-        weights, because both are equal for all Gaussians.
+        The encoded time gamma(t) is merged into the biases of the first layers, and the scales u (`units`) into the
+        weights, because both are equal for all Gaussians. With W_in = [A B] for features f and gamma:
+        W_in [f / u, gamma] + b = (A / u) f + (B gamma + b), and u (W_out h + b) = (u W_out) h + u b.
         """
-        read = self.weight_in.shape[1] - self.gamma.shape[0]
+        features = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
         weights = {
-            "weight_in": weight_in[:, :read] / self.units[:read],
-            "bias_in": F.linear(self.gamma, weight_in[:, read:], self.bias_in.detach()),
+            "weight_in": weight_in[:, :features] / self.units[:features],
+            "bias_in": F.linear(self.gamma, weight_in[:, features:], self.bias_in.detach()),
             "weight_out": self.weight_out.detach() * self.units[:, None],
             "bias_out": self.bias_out.detach() * self.units,
         }
@@ -81,10 +82,10 @@ class _Inputs(NamedTuple):
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
         """Return the gradients of the original weights from those of the weights that `layers` returns."""
-        read = g["weight_in"].shape[1]
+        features = g["weight_in"].shape[1]
         g_in = g["bias_in"].new_empty(self.weight_in.shape)
-        torch.div(g["weight_in"], self.units[:read], out=g_in[:, :read])
-        torch.outer(g["bias_in"], self.gamma.detach(), out=g_in[:, read:])
+        torch.div(g["weight_in"], self.units[:features], out=g_in[:, :features])
+        torch.outer(g["bias_in"], self.gamma.detach(), out=g_in[:, features:])
         return [g_in, g["bias_in"], g["weight_out"] * self.units[:, None], g["bias_out"] * self.units]
 
 
@@ -104,7 +105,7 @@ class _Refine(Operation):
         return tensors, (refined,)
 
     def differentiable(self, tensors: Tensors) -> list[bool]:
-        return [True] * (len(tensors) - 4) + [False] * 4
+        return [True] * (len(tensors) - 4) + [False] * 4  # not: units, gamma, intervals, time
 
     def carries_gradient(self, outputs: Tensors) -> list[bool]:
         return [True] * len(outputs)
@@ -127,11 +128,12 @@ class _Refine(Operation):
     ) -> list[Tensor | None]:
         values, weights = slots["rows"], slots["weights"]
         like, networks, inputs = values[0], slots["networks"], _Inputs.of(tensors)
-        library, features = library_of(like.device.type), networks - 1
+        library = library_of(like.device.type)
         dense = [torch.zeros_like(x) if g is None else g.contiguous() for g, x in zip(upstream, outputs, strict=True)]
-        # An array that no MLP reads has the gradient that is given, which is added up over views.
-        summed = values if inputs.views else values[:features]
-        g_values = [allocate("gradients of AGR's features", x, x.shape) for x in summed]
+        # MLPs read the first networks - 1 arrays. The gradient by any other is that by its output, which needs a kernel
+        # only to be added up over views.
+        computed = values if inputs.views else values[: networks - 1]
+        g_values = [allocate("gradients of AGR's features", x, x.shape) for x in computed]
         g_weights = {key: torch.empty_like(x) for key, x in weights.items()}
         scratch = biases = None
         if library.needs_scratch:
@@ -173,29 +175,30 @@ class _Refine(Operation):
         return slots | {key: x.data_ptr() for key, x in weights.items()}
 
     def _match(self, tensors: Tensors, numbers: Sequence[Any]) -> Slots:
+        """Return the sizes of a call; raise InputError if tensors are not as `refine` says."""
         inputs = _Inputs.of(tensors)
         listed = inputs.named()
         for name, x in listed:
             check_tensor(x, f"refine: {name}", (torch.float32,))
             if x.dim() == 0 and name != "time":
                 raise InputError(f"refine: {name}: expected at least one dimension, got none")
-        moved = [x.shape[-1] for x in inputs.values]
+        value_widths = [x.shape[-1] for x in inputs.values]
         networks, rest = divmod(len(inputs.weight_in), HIDDEN)
         last = networks - 1
-        if rest or not 1 <= last < len(moved):
+        if rest or not 1 <= last < len(value_widths):
             raise InputError(
                 f"refine: expected {HIDDEN} rows of weight_in for each feature and {HIDDEN} for all other "
-                f"values, got {len(inputs.weight_in)} for {len(moved)} values"
+                f"values, got {len(inputs.weight_in)} for {len(value_widths)} values"
             )
-        if networks > MAX_NETWORKS or len(moved) > MAX_VALUES:
+        if networks > MAX_NETWORKS or len(value_widths) > MAX_VALUES:
             raise InputError(
                 f"refine: expected at most {MAX_NETWORKS} perceptrons and {MAX_VALUES} arrays of values, "
-                f"got {networks} and {len(moved)}"
+                f"got {networks} and {len(value_widths)}"
             )
-        widths = [*moved[:last], sum(moved[last:])]
+        widths = [*value_widths[:last], sum(value_widths[last:])]  # of the outputs of each MLP
         like, features, outputs, hidden = inputs.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
         rows = first_rows("refine: rows", numbers[0], like)
-        shapes: list[tuple[int, ...]] = [(len(like), c) for c in moved]
+        shapes: list[tuple[int, ...]] = [(len(like), width) for width in value_widths]
         views = () if inputs.views is None else (inputs.views,)
         if views and not library_of(like.device.type).takes_views:
             raise InputError(f"refine: expected one view on {like.device}, got {inputs.views} in one call")
@@ -216,10 +219,10 @@ class _Refine(Operation):
             "refined": rows,
             "features": features,
             "networks": networks,
-            "arrays": len(moved),
+            "arrays": len(value_widths),
             "outputs": outputs,
             "widths": tuple(widths),
-            "value_widths": tuple(moved),
+            "value_widths": tuple(value_widths),
         }
 
     def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:

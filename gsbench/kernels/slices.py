@@ -40,8 +40,8 @@ def _views(name: str, inputs: dict[str, Input], tensors: dict[str, Tensor]) -> S
     Raises:
         InputError: only some of the centres and times, or of the parameters, are those of several views.
     """
-    dims = {key: len(x.shape.split()) - 1 for key, x in inputs.items() if "?views" in x.shape}
-    of_view = {key: count for key, count in dims.items() if inputs[key].gradient is Gradient.REFUSED}
+    dims = {key: len(x.shape.split()) - 1 for key, x in inputs.items() if "?views" in x.shape}  # without views
+    of_view = {key: count for key, count in dims.items() if inputs[key].gradient is Gradient.REFUSED}  # see `_of_view`
     raw = {key: count for key, count in dims.items() if key not in of_view}
     many = has_leading(name, tensors, of_view)
     raw_per_view = has_leading(name, tensors, raw)
@@ -96,7 +96,7 @@ slice_static = Operation(  # 3DGS: F = R diag(exp scales)
 
 def _cholesky_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
     """Return the numbers of rows and of entries of a Cholesky factor over position, direction and time."""
-    k = 3 * ("directions" in tensors) + ("times" in tensors)
+    k = 3 * ("directions" in tensors) + ("times" in tensors)  # dimensions beside position
     if k == 0:
         raise InputError("slice_triangular: expected directions, times or both, got neither")
     return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
@@ -161,7 +161,8 @@ _UNIVERSAL = {
 
 def _universal_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
     """Return the numbers of parameters over position, direction and, if it is observed, time."""
-    k = 3 + ("times" in tensors)
+    k = 3 + ("times" in tensors)  # dimensions beside position
+    # Entries: between the k and position, and between any two of the k.
     sizes = {"rows": 3 + k, "entries": 3 * k + k * (k - 1) // 2, "exponents": 1 + k}
     return sizes | _views("slice_universal", _UNIVERSAL, tensors)
 
@@ -190,7 +191,7 @@ slice_direct = _conditional_slice(  # dGS
 
 def _direct_beta_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
     """Return the numbers of parameters over direction and, if it is observed, time."""
-    k = 3 + ("times" in tensors)
+    k = 3 + ("times" in tensors)  # dimensions beside position
     return {"precisions": 3 + k, "couplings": 3 * k, "exponents": 1 + k}
 
 

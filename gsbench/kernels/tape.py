@@ -155,12 +155,12 @@ class _Gradients:
         upstream = [self.by_id.get(id(x)) for x in call.outputs]
         if all(g is None for g in upstream):
             return
-        if call.operation is None:
-            size = len(call.tensors) // len(call.outputs)
-            parts: list[Tensor | None] = []
+        if call.operation is None:  # `collect` or `stack`
+            size = len(call.tensors) // len(call.outputs)  # inputs of an output
+            by_inputs: list[Tensor | None] = []
             for g in upstream:
-                parts += [g] if size == 1 else [None] * size if g is None else g.unbind()
-            each = zip(call.tensors, parts, call.wanted, strict=True)
+                by_inputs += [g] if size == 1 else [None] * size if g is None else g.unbind()
+            each = zip(call.tensors, by_inputs, call.wanted, strict=True)
             there = [(x, g) for x, g, wanted in each if g is not None and wanted]
             self.propagate(*zip(*there, strict=True))
             return

@@ -75,6 +75,7 @@ def check_arguments(inputs: RasterInputs, viewport: Viewport) -> None:
         raise InputError(f"colors, viewmats: expected at least one channel and one camera, got D={D}, C={C}")
     if means.device.type == "cpu":
         size = f"{C} images of {viewport.width}x{viewport.height} with {D} channels and {N} Gaussians"
+        # image and alpha, and about 30 numbers of each Gaussian
         require(means.element_size() * (C * viewport.width * viewport.height * (D + 1) + C * N * 30), size, LOWER)
     if len(_known) >= MOST_KNOWN:
         _known.clear()

@@ -39,6 +39,7 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
     if device == "cpu":
         if N >= MAX_GAUSSIANS:
             raise InputError(f"raster backend 'cpu': expected fewer than {MAX_GAUSSIANS} Gaussians, got {N}")
+        # float32 of each pixel: image, alpha, their gradients, transmittance and stop; and about 20 of each splat
         numbers = C * count_tiles(viewport.width, viewport.height) * TILE_PIXELS * (2 * inputs.colors.shape[-1] + 4)
         size = f"{C} images of {viewport.width}x{viewport.height} with {N} Gaussians"
         require(4 * (numbers + C * N * 20), size, LOWER)

@@ -45,6 +45,7 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
     if colors.dim() == 2:
         colors = colors.expand(C, *colors.shape)
     shared = means, factors, opacities, beta_exponents
+    # for each camera these four, without the dimension of cameras
     sets = [shared] * C if means.dim() == 2 else zip(*([None] * C if x is None else x for x in shared), strict=True)
     splats = [
         project(mean, factor, opacity, viewmat, K, viewport, exponent)
@@ -177,8 +178,8 @@ def blend(
         table = torch.cat([table, splats.beta_exponents[:, None]], -1)
     table = torch.cat([table, table.new_zeros(1, table.shape[1])])
 
-    lengths = torch.bincount(tiles, minlength=across * down)
-    starts = lengths.cumsum(0) - lengths
+    lengths = torch.bincount(tiles, minlength=across * down)  # [across * down] Gaussians of each tile
+    starts = lengths.cumsum(0) - lengths  # where the list of each tile begins in `gaussians`
     by_length = torch.argsort(lengths, descending=True, stable=True)
     longest = lengths[by_length].tolist()
     pieces, first = [], 0
@@ -186,7 +187,7 @@ def blend(
         last = min(len(longest), first + max(1, CHUNK // (longest[first] * TILE * TILE)))
         chosen = by_length[first:last]
         nth = torch.arange(longest[first], device=tiles.device)
-        padding = nth >= lengths[chosen, None]
+        padding = nth >= lengths[chosen, None]  # [chosen tiles, longest list]
         index = gaussians[(starts[chosen, None] + nth).clamp(max=len(gaussians) - 1)]
         index = index.masked_fill(padding, len(table) - 1)
         # index_select, not table[index]: the backward pass of the latter adds rows in random order.
@@ -208,10 +209,12 @@ def _blend_tiles(
     left: Tensor,  # [T] pixels
     top: Tensor,  # [T] pixels
 ) -> Tensor:  # [T, TILE * TILE, D + 1]: colour and alpha
-    offsets = torch.arange(TILE, device=rows.device) + 0.5
+    """Blend K Gaussians in all pixels of T tiles, by the rules of `gsbench.raster.rasterize`."""
+    offsets = torch.arange(TILE, device=rows.device) + 0.5  # pixel centres
     dx = (left[:, None, None] + offsets) - rows[..., 0:1]  # [T, K, TILE]
     dy = (top[:, None, None] + offsets) - rows[..., 1:2]
     a, b, c, opacity = rows[..., 2:6, None].unbind(-2)
+    # |U d|^2 of each pixel (y, x), [T, K, TILE, TILE]
     r2 = ((b * dy)[..., :, None] + (a * dx)[..., None, :]).square() + (c * dy).square()[..., :, None]
     exponent = rows[..., 6 + D :, None]  # [T, K, 0 or 1, 1]
     profile = _beta(r2, exponent) if exponent.shape[-2] else torch.exp(-0.5 * r2)

@@ -71,7 +71,7 @@ class Candidates:
         return fitting.trainer_of(build(config), self.scene, config, self.start)
 
     def chosen(self, chosen_in: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
-        """Return the trainer of the candidate that the run's own checkpoint names, or else of the one to `choose` now.
+        """Return the trainer of the candidate that the run's own checkpoint names; if it names none, that of `choose`.
 
         The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `chosen_in`
         returns the name of the chosen candidate in the state of a checkpoint.
