@@ -56,6 +56,7 @@ def run_command(words: list[str]) -> int:
 
 
 def _run(parsed: command.Command) -> int:
+    """Do the runs of a command line, or let Hydra answer its question about the config; return the exit status."""
     if parsed.asks:
         register_schema()
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors

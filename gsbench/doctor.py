@@ -122,6 +122,7 @@ def _version(package: str) -> str | None:
 
 
 def _machine() -> Iterator[Check]:
+    """Name the processor, and check the number of threads and the free memory."""
     import torch
 
     from gsbench.process.memory import available
@@ -148,6 +149,7 @@ def _machine() -> Iterator[Check]:
 
 
 def _disk() -> Iterator[Check]:
+    """Check the free space where results are written by default."""
     free = shutil.disk_usage(Path.cwd()).free
     enough = free >= LEAST_DISK
     yield Check(
@@ -159,6 +161,7 @@ def _disk() -> Iterator[Check]:
 
 
 def _compiler() -> Iterator[Check]:
+    """Name the C++ compiler with which a build would start: that of CXX, or the first of COMPILERS."""
     names = [name for name in (os.environ.get("CXX"), *COMPILERS) if name]
     path = next((path for name in names if (path := shutil.which(name))), None)
     if path is None:
@@ -169,6 +172,7 @@ def _compiler() -> Iterator[Check]:
 
 
 def _kernels() -> Iterator[Check]:
+    """Check that the CPU kernels are built and draw the image of the reference."""
     from gsbench import kernels
 
     if not kernels.available():
@@ -206,6 +210,7 @@ def _difference() -> float:
 
 
 def _gpu() -> Iterator[Check]:
+    """Check that torch sees the GPU of an installed driver, and that its kernels are built."""
     import torch
 
     from gsbench.kernels import cuda
@@ -234,6 +239,7 @@ def _gpu() -> Iterator[Check]:
 
 
 def _weights() -> Iterator[Check]:
+    """Say for each network of LPIPS whether its weights are here."""
     from gsbench.measure.perceptual import BACKBONES, is_here
 
     for backbone, chosen in BACKBONES.items():
@@ -247,6 +253,7 @@ def _weights() -> Iterator[Check]:
 
 
 def _data() -> Iterator[Check]:
+    """Name the data sets that are in `data`, and how to get the others."""
     from gsbench.fetch.sources import sources
 
     archives = [source for source in sources(Path("data")).values() if source.is_archive]

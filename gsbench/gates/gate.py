@@ -84,7 +84,7 @@ def gate_within(
         choice = choose(sensitivity, gated, share)
         rows, changed = apply(gated, sensitivity.simplifications, choice, intervals)
         loss = before - measure(gated)
-        if loss <= budget_db and len(gated):
+        if loss <= budget_db and len(gated):  # not all are removed
             counts = gated.count_by_effects() | {"removed": len(model) - len(gated)}
             gate = Gate(
                 share=share,

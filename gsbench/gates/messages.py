@@ -30,6 +30,7 @@ def of_lengths(choice: LengthChoice) -> str:
 
 
 def _table(candidates: list[Candidate]) -> str:
+    """Return the PSNR, the costs and, if it cannot be chosen, the reason of each candidate, as lines of text."""
     width = max(len(x.name) for x in candidates)
     lines = [f"{'':{width}}  PSNR on val, dB  training, s  ms a frame"]
     for x in candidates:

@@ -219,7 +219,8 @@ def visible_times(model: GaussianModel, views: Sequence[View]) -> Tensor:  # [N,
     """
     unrefined = dict(model.splats.items())
 
-    def shown(view: View) -> Tensor:  # [N] bool
+    def shown(view: View) -> Tensor:
+        """Return which Gaussians are visible in a view, [N] bool."""
         query = CameraTime.of(view.camera, view.time)
         opacities = model.slice_geometry(model.refined(query), query).opacities
         if model.refines:

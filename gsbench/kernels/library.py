@@ -51,6 +51,7 @@ class Library:
             active.add(run)
 
     def _run(self, device: torch.device, name: str, *values: Any) -> None:
+        """Call the function of the extension; the ValueError that it may raise becomes an InputError."""
         try:
             getattr(self.extension, name)(*values)
         except ValueError as error:

@@ -33,6 +33,7 @@ class _Similarity(Operation):
         )
 
     def run(self, tensors: Tensors, numbers: Sequence[Any]) -> tuple[Tensors, Slots]:
+        """Return the loss of each image [C], and its gradient by the image, which is empty unless `with_gradient`."""
         slots = self.match(tensors, numbers).copy()
         image, target = in_rows(tensors)
         C, height, width = slots["C"], slots["height"], slots["width"]
@@ -66,6 +67,7 @@ class _Similarity(Operation):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
+        """Multiply the gradients that `run` has computed by those by the losses; there is none by the target."""
         by_loss, image = upstream[0], tensors[0]  # [C], [C, H, W, 3]
         return [None if by_loss is None else by_loss.view(-1, 1, 1, 1) * outputs[1].view_as(image), None]
 

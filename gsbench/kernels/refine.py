@@ -126,6 +126,7 @@ class _Refine(Operation):
         wanted: Sequence[bool],
         sums: dict[int, Tensor] | None = None,
     ) -> list[Tensor | None]:
+        """Run the backward kernel, as `Operation.backward`; return gradients of the values and the MLPs' weights."""
         values, weights = slots["rows"], slots["weights"]
         like, networks, inputs = values[0], slots["networks"], _Inputs.of(tensors)
         library = library_of(like.device.type)

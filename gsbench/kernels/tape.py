@@ -134,6 +134,7 @@ class _Gradients:
             return
         outputs = [y for call in self.calls for y in call.outputs]
         starts = {id(x) for x in tensors}
+        # Autograd stops at the sources and at outputs of recorded calls; a tape may run backwards again (retain_graph).
         ends = [y for y in (*self.sources.values(), *outputs) if y.requires_grad and id(y) not in starts]
         by_ends = torch.autograd.grad(tensors, ends, gradients, allow_unused=True, retain_graph=True)
         # torch may return two gradients that share memory, or one of a transposed layout.
@@ -164,8 +165,9 @@ class _Gradients:
             there = [(x, g) for x, g, wanted in each if g is not None and wanted]
             self.propagate(*zip(*there, strict=True))
             return
-        # If only this operation reads an input, this is its whole gradient, which may be added to that of other views.
-        # If others behind it do, it is added to theirs.
+        # A gradient that is declared ADDED goes to memory that may have others. If later calls have read the input too,
+        # these are theirs. If no other call reads it, it is the whole gradient of this tape, and is added at once to
+        # `self.sums`, where those of other views are.
         whole, sums = {}, {}
         for i in call.operation.adds:
             key = id(call.tensors[i])

@@ -186,6 +186,7 @@ class Guarded:
         self.tracker = None
 
     def _guard(self, call: Callable[[], None]) -> None:
+        """Call a function; if it raises an error, print this and use the tracker no more."""
         try:
             call()
         except Exception as error:

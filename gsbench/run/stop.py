@@ -57,10 +57,11 @@ class Request:
         self._before: dict[int, Any] = {}
 
     def _ask(self, signal_number: int, frame: FrameType | None) -> None:
+        """Handle a signal: the first is noted, one of a second request is left to the handler from before."""
         if self.signal is None:
             _is_new()  # remembers the time
             self.signal = signal_number
-        elif time.monotonic() - _asked >= SAME_REQUEST:  # the earlier handler usually ends the process
+        elif time.monotonic() - _asked >= SAME_REQUEST:  # that handler usually ends the process
             before = self._before.get(signal_number)
             if callable(before):
                 before(signal_number, frame)

@@ -71,6 +71,7 @@ class _WithFirstError:
         self._attempt(self.file.flush)
 
     def _attempt(self, action: Callable[[], object]) -> None:
+        """Do an action unless an earlier one has failed; keep its error."""
         try:
             if self.error is None:
                 action()

@@ -46,6 +46,7 @@ class CameraColors(Hook):
         super().__init__(training)
         is_on = cast(CameraColorsKey, training.config.train).camera_colors
         cameras = by_camera(training.scene.train) if is_on else []
+        # the number of each view's camera, by the view's name
         self.camera_of = {view.name: i for i, camera in enumerate(cameras) for view in camera}
         # [C, 4, 3]: the rows of M, and b below them
         self.maps = nn.Parameter(training.renderer.background.new_zeros(len(cameras), 4, 3))

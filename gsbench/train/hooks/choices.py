@@ -45,6 +45,7 @@ class Choices(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
+        """Raise InputError if the iterations cannot be halved so often, or if models are compared too."""
         lengths, iterations = lengths_of(config), config.train.iterations
         if lengths is None:
             return

@@ -66,6 +66,7 @@ class EarlyStop(Hook):
             check_choice_on_val("patience", "iteration", scene, config)
 
     def after_measuring(self, finished: int, psnr: float) -> float:
+        """Keep the state of the Gaussians if none before had a higher PSNR on val; return `psnr` as it is."""
         training, self._last = self.training, finished
         iterations = training.config.train.iterations
         if self.wait is None or not training.schedule.is_complete(finished - 1):
