@@ -92,9 +92,12 @@ class Gating(Hook):
         if config.effects.gate != "off":
             as_gated(model)
 
+    def acts(self, step: int) -> bool:
+        return self.config.effects.gate == "both" and self.training.schedule.gates(step)
+
     def after_density(self, step: int) -> None:
         """Simplify Gaussians once after densification, if `effects.gate=both`, unless the model has few Gaussians."""
-        if self.config.effects.gate != "both" or not self.training.schedule.gates(step):
+        if not self.acts(step):
             return
         with self.training.stages("gate"):
             if len(self.model) < LEAST_IN_TRAINING:

@@ -39,9 +39,13 @@ class LongLived(Hook):
         if config.effects.static_above is not None:
             as_gated(model)
 
+    def acts(self, step: int) -> bool:
+        """Return whether Gaussians become static after a step, see `Hook.acts`."""
+        return self.longest is not None and self.training.schedule.gates(step)
+
     def after_density(self, step: int) -> None:
         """Make long-lived Gaussians static once, at the step at which gates act."""
-        if self.longest is None or not self.training.schedule.gates(step):
+        if self.longest is None or not self.acts(step):
             return
         with self.training.stages("gate"):
             self.make_static(self.longest)

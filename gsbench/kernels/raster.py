@@ -245,7 +245,8 @@ class Drawing(NamedTuple):
 def enqueue(inputs: RasterInputs, viewport: Viewport, room: int) -> Drawing:
     """Draw images on a GPU by one call, without waiting for the GPU.
 
-    Memory is allocated for `room` tile intersections. If the images need more, further ones are left out of them.
+    Memory is allocated for `room` tile intersections. If the images need more, or a value is out of range, each image
+    has a NaN.
     """
     means, factors, opacities, colors, viewmats, Ks, background, beta_exponents = inputs
     library, size = library_of(means.device.type), viewport[:2]
@@ -273,6 +274,8 @@ _rooms: dict[Hashable, int] = {}  # for how many tile intersections the last cal
 def draw_on_gpu(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int, int]:
     """Draw images on a GPU, with memory for all tile intersections. The CPU waits for the images.
 
+    A repetition does not wait: an image has a NaN if it needs more memory than the recording has.
+
     Also return the number of tile intersections, and a number that is not zero if an input is invalid.
 
     Raises:
@@ -281,12 +284,8 @@ def draw_on_gpu(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int,
     if recording.current() is None:
         return _draw_unrecorded(inputs, viewport)
     with recording.paused():  # a repetition has one call, with memory for more than this image needs
-        _, pairs, _ = _draw_unrecorded(inputs, viewport)
-    room = int(ROOM * pairs)
-    drawing = enqueue(inputs, viewport, room)
-    # A repetition of four views waits for the GPU only once: the call leaves out intersections beyond its memory.
-    pairs, flagged = recording.read(drawing.needed, lambda x: x[1] == 0 and x[0] <= room, is_late=True)
-    return drawing, pairs, flagged
+        _, pairs, flagged = _draw_unrecorded(inputs, viewport)
+    return enqueue(inputs, viewport, int(ROOM * pairs)), pairs, flagged
 
 
 def _draw_unrecorded(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing, int, int]:
@@ -323,6 +322,7 @@ def add_density(
     gradient: Tensor,  # [N] the sum of its norms, added to
     times_visible: Tensor,  # [N] the number of cameras in which a Gaussian is drawn, added to
     unseen: Tensor | None,  # [N] int32: cameras since a Gaussian was last drawn, updated
+    skip: Tensor,  # []: nothing is added unless it is 0
 ) -> None:
     """Add up on a GPU, in one kernel, what density control needs of a view; in torch it is ten operations."""
     drawn, g_means2d = in_rows([drawn, g_means2d])
@@ -333,6 +333,7 @@ def add_density(
         "g_means2d": address(g_means2d),
         "scale_x": scale[0],
         "scale_y": scale[1],
+        "skip": address(skip),
         "out.gradient": address(gradient),
         "out.times_visible": address(times_visible),
         "out.unseen": address(unseen),

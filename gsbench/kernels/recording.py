@@ -53,15 +53,14 @@ def paused() -> Iterator[None]:
         _in_charge.recording = recording
 
 
-def read(numbers: Tensor, holds: Callable[[list[int]], bool], is_late: bool = False) -> list[int]:
+def read(numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
     """Return the values of an integer tensor [n].
 
     An active recording reads the tensor again in every repetition, and raises OutdatedError unless `holds(values)` is
-    true. Where the calls that follow do no harm with any values, it is read late (`is_late`), after all calls: by
-    `check`.
+    true.
     """
     recording = current()
-    return numbers.tolist() if recording is None else recording.read(numbers, holds, is_late)
+    return numbers.tolist() if recording is None else recording.read(numbers, holds)
 
 
 class Recording(TorchDispatchMode):
@@ -79,7 +78,6 @@ class Recording(TorchDispatchMode):
         """Create a recording without calls."""
         super().__init__()
         self._calls: list[Callable[[], Any]] = []
-        self._late: list[Callable[[], Any]] = []  # reads after all calls
         self._kept: list[Any] = []  # so that no two results of the block share memory by chance
         self._bytes = 0  # of the results
         # False if an operation of the block gives other results each time, or if the results are too large.
@@ -124,9 +122,9 @@ class Recording(TorchDispatchMode):
         """Record a call, such as that of a kernel, that is no torch operation and writes to the same memory again."""
         self._calls.append(call)
 
-    def read(self, numbers: Tensor, holds: Callable[[list[int]], bool], is_late: bool) -> list[int]:
+    def read(self, numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
         """Read a tensor, as the function `read` describes."""
-        (self._late if is_late else self._calls).append(partial(_check, numbers, holds))
+        self._calls.append(partial(_check, numbers, holds))
         with _disable_current_modes():  # a repetition need not copy what it reads from a GPU twice
             values: list[int] = numbers.tolist()
         return values
@@ -147,15 +145,6 @@ class Recording(TorchDispatchMode):
             OutdatedError: a number that the block read has a value for which other calls are needed.
         """
         for call in self._calls:
-            call()
-
-    def check(self) -> None:
-        """Read what a repetition reads late; on a GPU this waits for its calls.
-
-        Raises:
-            OutdatedError: as `repeat`; the results of this repetition are wrong.
-        """
-        for call in self._late:
             call()
 
 

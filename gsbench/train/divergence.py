@@ -20,13 +20,15 @@ class FiniteCheck:
     """Check the loss and the gradients of every step for NaN and infinity.
 
     From the first bad step on, the tensor `skip` [] is 1, and Adam reads it. So nothing is updated until the CPU looks:
-    on a GPU every LOOK_EVERY steps, because it then waits, and on a CPU after each step.
+    on a GPU every LOOK_EVERY steps and before what cannot be skipped, because it then waits, and on a CPU after each
+    step.
     """
 
     def __init__(self, device: str) -> None:
         """Prepare the checks of a training on `device`, such as "cpu", "cuda" or "cuda:1"."""
         self.every = LOOK_EVERY if device.startswith("cuda") else 1
-        self.loss = math.nan  # loss of the last step that was looked at
+        self.loss = math.nan  # loss of the last good step that was looked at
+        self.bad: int | None = None  # the first bad step, once the CPU has looked
         self.skip = torch.zeros((), device=device)
         self._names: list[str] = []  # the group of each parameter
         # [parameters + 2]: for each gradient and for the loss, 1 once it was not finite, else 0; then the last loss
@@ -67,12 +69,20 @@ class FiniteCheck:
             DivergedError: a check failed; the message names the step and the parameter.
         """
         for step, (*flags, loss) in zip(self._steps, self._results.tolist(), strict=False):  # the last rows may be old
-            self.loss = loss
             if any(flags):
+                self.bad = step
                 bad = flags.index(1)
                 if bad == len(self._names):  # the flag after those of the gradients
                     raise DivergedError(f"step {step}: the loss is {loss}")
                 raise DivergedError(f"step {step}: the gradient of '{self._names[bad]}' is not finite (loss {loss})")
+            self.loss = loss
+        self._steps.clear()
+
+    def forget(self) -> None:
+        """Start again after a bad step, as if it had not been done."""
+        self.bad = None
+        self.skip.zero_()
+        self._result.zero_()
         self._steps.clear()
 
 

@@ -4,6 +4,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -38,10 +39,14 @@ class Trainer(TrainingParts):
             total=train.iterations, initial=self.step, desc=label, unit="it", mininterval=every, maxinterval=every
         ) as bar:
             while self.step < train.iterations:
-                with self.effort, self.stages.running():
-                    camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
-                    with fitting_threads(len(self.model), camera.width * camera.height // factor**2):
-                        self.train_step()
+                try:
+                    with self.effort, self.stages.running():
+                        camera, factor = self.scene.train[0].camera, self.schedule.resolution(self.step)
+                        with fitting_threads(len(self.model), camera.width * camera.height // factor**2):
+                            self.train_step()
+                except DivergedError as error:
+                    self._go_back(error)
+                    continue
                 measured = self.schedule.measures(self.step)
                 if measured:
                     self._measure()
@@ -49,7 +54,7 @@ class Trainer(TrainingParts):
                     with self.effort, self.stages("density"):
                         self.density.rule.reset_opacities()
                 self.step += 1
-                bar.update()
+                bar.update(self.step - bar.n)
                 # The bar shows the seconds of the last measurement: the clock itself waits for a GPU when it is read.
                 loss = f"loss {self.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
@@ -58,16 +63,23 @@ class Trainer(TrainingParts):
                 if not goes_on():
                     break
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:
+                    self._settle()
                     save(self.state_dict())
                     saved = time.monotonic()
+        self._settle()
         if self.step == train.iterations:
             for hook in self.hooks:
                 hook.at_end()
         save(self.state_dict())
 
     def train_step(self) -> None:
-        """Do one training step on a batch of views: gradients, parameters, density, and hooks in between."""
+        """Do one training step on a batch of views: gradients, parameters, density, and hooks in between.
+
+        Raises:
+            DivergedError: this step was bad, or an earlier one. From the first bad one on nothing was changed.
+        """
         step, stages = self.step, self.stages
+        self.counts_before.append((step, dict(self.replay.counts)))
         self.model.set_active(self.schedule.active(step))
         views = self.batches.at(step, self.schedule.resolution(step))
         with stages("loss"):
@@ -78,11 +90,15 @@ class Trainer(TrainingParts):
         except DivergedError as error:
             raise DivergedError(f"step {step}: {error}") from None
         if self.schedule.densifies(step):
+            self.finite_check.look()
             with stages("density"):
-                self.density.before_round(views, results)
+                if all(part.loss.isfinite().all() for part in results):  # otherwise `update` finds the step bad
+                    self.density.before_round(views, results)
         with torch.no_grad():
             factors = {name: x for hook in self.hooks for name, x in hook.rate_factors(step).items()}
             self.update(step, views, results, factors)
+            if self._acts(step):
+                self.finite_check.look()
             with stages("optimizer"):
                 for hook in self.hooks:
                     hook.after_update(step)
@@ -92,6 +108,42 @@ class Trainer(TrainingParts):
                 hook.after_density(step)
             for hook in self.hooks:
                 hook.after_step(step)
+
+    def _acts(self, step: int) -> bool:
+        """Return whether this step ends with work that cannot be undone, so that all steps must be good."""
+        schedule = self.schedule
+        return (
+            schedule.measures(step)
+            or schedule.resets(step)
+            or self.density.acts(step)
+            or any(hook.acts(step) for hook in self.hooks)
+        )
+
+    def _settle(self) -> None:
+        """Look whether all steps so far were good; otherwise go back."""
+        try:
+            self.finite_check.look()
+        except DivergedError as error:
+            self._go_back(error)
+
+    def _go_back(self, error: DivergedError) -> None:
+        """Go back to the first bad step, to do it once more call by call, because a recording may be to blame.
+
+        A repeated step fails if its images need more memory than those of the recorded step.
+
+        Raises:
+            DivergedError: no recording is to blame.
+        """
+        with suppress(DivergedError):
+            self.finite_check.look()
+        bad = self.finite_check.bad
+        if bad is None or bad == self.done_again or not self.replay.counts["replayed"]:
+            raise error
+        self.step = self.done_again = bad
+        self.replay.counts |= dict(self.counts_before)[bad]
+        self.replay.forget()
+        self.finite_check.forget()
+        self.update.forget()
 
     def _measure(self) -> None:
         """Measure PSNR on val and add it to the training curve. This time does not count as training time."""

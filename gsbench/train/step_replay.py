@@ -95,11 +95,6 @@ class Recorded(Generic[Result]):
                 recording.repeat()
         return self.result
 
-    def check(self) -> None:
-        """Raise OutdatedError if the repetition met other numbers than its calls can work with."""
-        for _, recording in self._recordings:
-            recording.check()
-
 
 class _RecordedPart(Recorded[Result]):
     """The recorded work on one part, and the copy of the views that it reads."""
@@ -121,8 +116,11 @@ class StepReplay(Generic[Result]):
     """
 
     def __init__(self) -> None:
-        """Start without a recording."""
         self.counts = {"launched": 0, "replayed": 0, "recordings": 0}
+        self.forget()
+
+    def forget(self) -> None:
+        """Launch the next step call by call, and record the one after it."""
         self._signature: Hashable = None
         self._recorded: list[_RecordedPart[Result]] = []  # one for each part of a batch
         self._is_repeatable = True
@@ -155,8 +153,6 @@ class StepReplay(Generic[Result]):
         if recorded := self._recorded:
             with suppress(OutdatedError):  # then the work is recorded anew
                 results = of_all(lambda index, stages: recorded[index].repeat_on(observed[index], stages))
-                for part in recorded:
-                    part.check()
                 self.counts["replayed"] += 1
                 return results
         self.counts["launched"] += 1

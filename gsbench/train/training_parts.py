@@ -1,6 +1,7 @@
 """Hold the parts of a training (model, optimizer, density control, hooks, clocks) and their state for a checkpoint."""
 
 import sys
+from collections import deque
 from typing import Any, TypeVar
 
 from torch import Tensor
@@ -18,7 +19,7 @@ from gsbench.schedule import Schedule
 from gsbench.train.batches import Batches
 from gsbench.train.checkpoint import whole_number
 from gsbench.train.density.control import DensityControl
-from gsbench.train.divergence import FiniteCheck
+from gsbench.train.divergence import LOOK_EVERY, FiniteCheck
 from gsbench.train.hooks import Hook, hook_types
 from gsbench.train.optim import Optimizer
 from gsbench.train.renderer import Renderer
@@ -46,6 +47,9 @@ class TrainingParts:
         self.views = views
         self.config = config
         self.step = 0
+        self.done_again: int | None = None  # the last step to which the training went back, since it was bad
+        # The counts of `StepReplay` before the steps at which the CPU has not looked yet, and their steps.
+        self.counts_before: deque[tuple[int, dict[str, int]]] = deque(maxlen=LOOK_EVERY)
         self.renderer = Renderer(scene.train[0].image.new_tensor(scene.background), config.raster.antialias)
         self.schedule = Schedule(config.train, config.model.sh_degree, config.agr, model.warm_up)
         self.optimizer = Optimizer(model, config.model, config.train, scene.extent, config.optim)
@@ -58,8 +62,8 @@ class TrainingParts:
             model, self.renderer.background, config.train.ssim_weight, config.raster.antialias, self.stages
         )
         self.finite_check = FiniteCheck(config.device)
-        replay = self.gradients.replay
-        self.update = Update(self.optimizer, self.finite_check, self.density, self.rows, replay, self.stages)
+        self.replay = self.gradients.replay
+        self.update = Update(self.optimizer, self.finite_check, self.density, self.rows, self.replay, self.stages)
         self.curve = Curve()
         self.exact: set[str] = set()  # names of views that a measurement found exact (gsbench.measure.exact_views)
         self.hooks: list[Hook] = [hook(self) for hook in hook_types()]
@@ -105,7 +109,7 @@ class TrainingParts:
             "hooks": {hook.name: hook.state_dict() for hook in self.hooks},
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
-            "replay": dict(self.gradients.replay.counts),
+            "replay": dict(self.replay.counts),
             "curve": self.curve.state_dict(),
             "exact": sorted(self.exact),
         }
@@ -137,7 +141,7 @@ class TrainingParts:
                 hook.load_state_dict(saved)
             self.stages.load_state_dict(state["stages"])
             self.effort.load_state_dict(state["effort"])
-            counts = self.gradients.replay.counts  # changed in place
+            counts = self.replay.counts  # changed in place
             counts |= {name: whole_number(f"replay: {name}", state["replay"][name], self.step) for name in counts}
             self.curve.load_state_dict(state["curve"])
             self.exact = set(parse(list[str], state["exact"], "checkpoint: exact"))

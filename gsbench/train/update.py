@@ -68,12 +68,12 @@ class Update:
     @torch.no_grad()
     def _do(self, step: int, views: Sequence[View], results: Sequence[PartResult]) -> None:
         def work(stages: Stages) -> None:
-            with stages("density"):
-                self.density.accumulate(step, views, results)
             with stages("optimizer"):
                 self.check.check(_joined([part.loss for part in results]), self.optimizer.groups)
                 drawn = _joined([part.drawn for part in results]).any(0) if self.optimizer.is_sparse else None
                 self.optimizer.update(drawn)
+            with stages("density"):
+                self.density.accumulate(step, views, results, self.check.skip)
 
         gradients = [None if p.grad is None else p.grad.data_ptr() for p in self.optimizer.parameters]
         signature = self.replay.recording, self.density.accumulates(step), tuple(gradients)

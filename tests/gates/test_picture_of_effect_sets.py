@@ -58,6 +58,8 @@ def test_each_class_has_its_colour() -> None:
     model = one_of_each()
     image = picture.draw(model, CAMERA, 0.5, torch.zeros(3))
     assert picture.kinds_of(model).tolist() == [0, 1, 1, 2, 2]
+    drawn = 255 * picture.effect_set_colors(model)
+    assert drawn.round(decimals=3).tolist() == [list(picture.COLOURS[NAMES[kind]]) for kind in picture.kinds_of(model)]
     assert dict(zip(NAMES, torch.bincount(picture.kinds_of(model)).tolist(), strict=True)) == model.count_by_effects()
     assert np.abs(np.array(panel(image, 0)) - 127.5).max() < 3
     colours = [picture.COLOURS[NAMES[kind]] for kind in picture.kinds_of(model)]

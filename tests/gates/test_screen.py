@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.screen import LEAST_FREE, screen_time
 from gsbench.measure.record import Candidate, Direction, Gate, ModelComparison, OnDemand, TimeScreen
 from gsbench.models.gaussian_batch import Gaussians3D
-from gsbench.scenes.scene import Camera, Scene, View
+from gsbench.scenes.scene import Camera, Points, Scene, View
 
 EMBEDDED = Path(__file__).resolve().parents[2] / "gsbench/scenes/sample"
 SHUFFLED = torch.randperm(48, generator=torch.Generator().manual_seed(5)) / 47
@@ -125,6 +126,16 @@ def test_the_centre_is_where_optical_axes_nearly_meet(miss: float, depth: float,
     center = static_fit_residuals.center_of(views)
     assert (center is not None) == meets
     assert center is None or torch.allclose(center, torch.zeros(3), atol=1e-6)
+
+
+def test_initial_points_of_a_fit_follow_the_seed() -> None:
+    """Catches a random subset that is another one each time, and colours of other points."""
+    means = torch.rand(2 * static_fit_residuals.POINTS, 3)
+    scene = SimpleNamespace(points=Points(means, 1 - means))
+    first, second = (static_fit_residuals.scene_points([], scene, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert len(first.means) == static_fit_residuals.POINTS
+    assert torch.equal(first.means, second.means)
+    assert torch.equal(first.colors, 1 - first.means)
 
 
 def test_imports_are_no_seconds_of_the_screen() -> None:

@@ -122,6 +122,15 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(plan.find(tmp_path / "mini")) == 2
 
 
+def test_plans_are_read_oldest_first(tmp_path: Path) -> None:
+    """Catches plans in the order of the file system: the status of a run is that of its last sweep."""
+    names = [f"2026-01-{day:02}" for day in (3, 11, 9, 2, 8, 4, 27)]
+    for name in names:
+        (tmp_path / plan.FOLDER / name).mkdir(parents=True)
+        (tmp_path / plan.FOLDER / name / plan.FILE_NAME).touch()
+    assert [path.parent.name for path in plan.find(tmp_path)] == sorted(names)
+
+
 @pytest.mark.parametrize(
     ("error", "reason", "is_refused", "traces"),
     [

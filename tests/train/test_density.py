@@ -36,7 +36,7 @@ def control_of(count: int, threshold: float = 1.0) -> tuple[GaussianModel, Optim
 def look(control: GradientDensification, gradients: torch.Tensor, drawn: list[int] | None = None) -> None:
     """Let a view of 100 x 50 pixels have gradients of 2D means, [N, 2], and see the Gaussians `drawn`, or all."""
     is_drawn = torch.ones(1, len(gradients)) if drawn is None else torch.tensor([drawn])
-    control.accumulate(is_drawn.bool(), gradients[None], width=100, height=50, views=1)
+    control.accumulate(is_drawn.bool(), gradients[None], width=100, height=50, views=1, skip=torch.zeros(()))
 
 
 def densified(control: GradientDensification, most: int = 100, has_reset: bool = False) -> tuple[list[float], int]:

@@ -45,7 +45,7 @@ def test_dead_gaussians_move_to_opaque_ones_and_to_large_gradients(name: str) ->
     rule = RelocationDensification(Rows(model, moments), DensifyConfig(), 0.005, 10)
     gradients = torch.zeros(1, 40, 2, dtype=torch.float64)
     gradients[0, 20:22], gradients[0, 30:] = 1.0, 0.1  # of two faint Gaussians, and of the dead
-    rule.accumulate(torch.ones(1, 40, dtype=torch.bool), gradients, width=100, height=50, views=2)
+    rule.accumulate(torch.ones(1, 40, dtype=torch.bool), gradients, width=100, height=50, views=2, skip=torch.zeros(()))
     torch.testing.assert_close(rule.mean_gradient()[20], torch.tensor(100.0).hypot(torch.tensor(50.0)).double())
     assert rule.densify(generator(1), has_reset=True, most=100) == 0
     assert not rule.gradient.any()
@@ -67,7 +67,8 @@ def test_nothing_moves_without_the_living_or_the_dead() -> None:
         model = started(build("3dgs"), 10)
         model.splats["opacities"].data.fill_(opacity)
         rule = RelocationDensification(Rows(model, Moments()), DensifyConfig(), 0.005, 10)
-        rule.accumulate(torch.ones(1, 10, dtype=torch.bool), torch.ones(1, 10, 2), width=8, height=8, views=1)
+        drawn, skip = torch.ones(1, 10, dtype=torch.bool), torch.zeros(())
+        rule.accumulate(drawn, torch.ones(1, 10, 2), width=8, height=8, views=1, skip=skip)
         means = model.splats["means"].detach().clone()
         rule.densify(generator(1), has_reset=False, most=100)
         assert torch.equal(model.splats["means"], means)

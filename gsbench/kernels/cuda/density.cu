@@ -8,7 +8,7 @@ namespace {
 
 __global__ void density_kernel(DensityArgs a, DensityState state) {
     const int64_t i = global_thread();
-    if (i >= a.N) return;
+    if (i >= a.N || *a.skip != 0.0f) return;
     float gradient = 0.0f;
     int drawn = 0;
     for (int64_t c = 0; c < a.C; ++c) {

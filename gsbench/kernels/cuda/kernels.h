@@ -32,8 +32,9 @@ struct DensityArgs {
     const bool* drawn;       // [C, N]: which Gaussians are not culled
     const float* g_means2d;  // [C, N, 2], per pixel
     float scale_x, scale_y;  // from one over pixels to units of half the image
+    const float* skip;       // [1]: nothing is added unless it is 0
 };
-GSB_FIELDS(DensityArgs, INPUTS, N, C, drawn, g_means2d, scale_x, scale_y)
+GSB_FIELDS(DensityArgs, INPUTS, N, C, drawn, g_means2d, scale_x, scale_y, skip)
 
 // The arrays are [N] and changed.
 struct DensityState {
@@ -45,7 +46,7 @@ GSB_FIELDS(DensityState, OUTPUTS, gradient, times_visible, unseen)
 }  // namespace gsb
 
 // `draw` checks values, projects, lists the splats of each tile and blends; the inputs of blending are outputs of the
-// earlier kernels. `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
+// earlier kernels. If a value is bad, or `room` too small, each image gets a NaN, so that its loss is NaN. `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
 // same.
 #define GSB_CUDA_KERNELS(kernel)                                                                   \
     GSB_KERNELS(kernel)                                                                            \

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from gsbench.config import Config
@@ -54,12 +55,15 @@ class DensityControl:
         self.limit = gaussian_limit(train.densify.max_gaussians, scene.train, len(rows))
         self._is_full = False  # whether the limit was reached
 
-    def accumulate(self, step: int, views: Sequence[View], results: Sequence[PartResult]) -> None:
-        """Accumulate the gradients of a step, if they count; this can be recorded and repeated in other steps."""
+    def accumulate(self, step: int, views: Sequence[View], results: Sequence[PartResult], skip: Tensor) -> None:
+        """Accumulate the gradients of a step, if they count; this can be recorded and repeated in other steps.
+
+        `skip` [] is not 0 if the step is bad.
+        """
         if self.accumulates(step):
             for part in results:
                 camera = views[part.views[0]].camera
-                self.rule.accumulate(part.drawn, part.g_means2d, camera.width, camera.height, len(views))
+                self.rule.accumulate(part.drawn, part.g_means2d, camera.width, camera.height, len(views), skip)
 
     def accumulates(self, step: int) -> bool:
         """Return whether the gradients of a step count: while Gaussians are densified."""
@@ -69,6 +73,10 @@ class DensityControl:
         """Prepare the model, before its update, for a round of densification at the end of the step."""
         centers = torch.stack([views[i].camera.center for part in results for i in part.views])
         self.rows.model.before_density(centers, torch.cat([part.drawn for part in results]))
+
+    def acts(self, step: int) -> bool:
+        """Return whether `after_update` changes anything at a step."""
+        return self.rule.adds_noise or self.schedule.densifies(step) or self.schedule.thins(step)
 
     def after_update(self, step: int, optimizer: Optimizer) -> None:
         """Add noise, densify, thin and sort the Gaussians as the schedule says."""

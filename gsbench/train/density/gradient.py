@@ -30,11 +30,11 @@ class GradientRule(DensificationRule):
         self.times_visible = torch.zeros_like(like)  # [N] number of views in which the Gaussian was visible
 
     @torch.no_grad()
-    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int) -> None:
+    def accumulate(self, drawn: Tensor, g_means2d: Tensor, width: int, height: int, views: int, skip: Tensor) -> None:
         """Add the norms of the gradients of the 2D means in some views, in units of half the image, and count views."""
         scale = views * width / 2, views * height / 2  # times views: the loss is a mean over the batch
         if self.model.backend.serves(self.gradient) and library_of(self.gradient.device.type).has("add_density"):
-            add_density(drawn, g_means2d, scale, self.gradient, self.times_visible, self.unseen)
+            add_density(drawn, g_means2d, scale, self.gradient, self.times_visible, self.unseen, skip)
             return
         x, y = g_means2d.unbind(-1)
         self.gradient += torch.hypot(x * scale[0], y * scale[1]).sum(0)

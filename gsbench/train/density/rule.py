@@ -67,6 +67,7 @@ class DensificationRule(ABC):
         width: int,  # of the image, pixels
         height: int,
         views: int,  # in the batch
+        skip: Tensor,  # []: not 0 if the step is bad; then CUDA kernels must change nothing
     ) -> None:
         """Accumulate the gradients of the 2D means in C views of a batch; by default they are not used.
 

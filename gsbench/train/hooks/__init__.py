@@ -120,6 +120,15 @@ class Hook:
         """Return factors of the learning rates of a step, by parameter group."""
         return {}
 
+    def acts(self, step: int) -> bool:
+        """Return whether an `after_` method changes anything at a step, except what a second call would not change.
+
+        The training then waits for a GPU first, because it goes back if the step was bad. By default this is true for
+        each step if there is such a method.
+        """
+        methods = ("after_update", "after_density", "after_step")
+        return any(getattr(type(self), name) is not getattr(Hook, name) for name in methods)
+
     def after_update(self, step: int) -> None:
         """Act after the optimizer has updated the parameters; gradients are off here and in all that follows."""
 

@@ -58,11 +58,14 @@ class Average(Hook):
                 f"for which steps are given, got {step}"
             )
 
+    def acts(self, step: int) -> bool:
+        return self.start is not None and step >= self.start and (step - self.start) % EVERY == 0
+
     def after_step(self, step: int) -> None:
         """Add the parameters to the means; only every tenth step is used."""
         import torch
 
-        if self.start is None or step < self.start or (step - self.start) % EVERY:
+        if not self.acts(step):
             return
         parameters = [p.detach() for p in self.training.model.parameters()]
         if not self.count:

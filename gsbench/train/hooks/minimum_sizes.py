@@ -40,6 +40,11 @@ class MinimumScale(Hook):
             pixel = pixel.minimum((means - center).norm(dim=-1) / focal)
         self.least = LEAST_PIXELS * pixel
 
+    def acts(self, step: int) -> bool:
+        """Return whether minimum scales are computed after a step, or hold for the first time."""
+        every = self.training.schedule.densify_every
+        return (step + 1) % every == 0 or step % every == 0
+
     def after_update(self, step: int) -> None:
         self.training.model.hold_sizes(self.least)
 
@@ -78,6 +83,10 @@ class MinimumLifetime(Hook):
         times = torch.tensor(sorted({view.time for view in views if view.time is not None}), dtype=torch.float64)
         has_gaps = "time" in training.model.observes and len(times) > 1
         self.least = LEAST_GAPS * float(times.diff().median()) if has_gaps else None
+
+    def acts(self, step: int) -> bool:
+        """Return False: the minimum is always the same, so lifetimes that were held once stay as they are."""
+        return False
 
     def after_update(self, step: int) -> None:
         if self.least is not None:
