@@ -139,9 +139,12 @@ def prepare(options: argparse.Namespace) -> Export:
     if options.plys and "time" not in run.model.observes and not run.model.refines:
         name = run.config.model.name
         raise InputError(f"--plys: expected a model that changes with time, {name} does not: use --ply")
-    is_filmed = options.video or options.images
-    needs_data = options.camera is not None or (is_filmed and options.path == "test")
-    return Export(run, scene_of(run, options.data_root) if needs_data else None, options)
+    return Export(run, scene_of(run, options.data_root) if needs_data(options) else None, options)
+
+
+def needs_data(options: argparse.Namespace) -> bool:
+    """Return whether the export needs cameras of the data set."""
+    return options.camera is not None or (options.path == "test" and bool(options.video or options.images))
 
 
 def check_read(options: argparse.Namespace) -> None:
@@ -152,6 +155,8 @@ def check_read(options: argparse.Namespace) -> None:
         if getattr(options, name) is not None and not any(getattr(options, reader) for reader in readers):
             beside = " beside --path test" if readers != READERS[name] else ""
             raise InputError(f"--{name}: expected --{' or --'.join(readers)}{beside}, which reads it: leave it out")
+    if options.data_root is not None and not needs_data(options):
+        raise InputError("--data-root: expected --camera or --path test, which need data: leave it out")
     for name, value in DEFAULTS.items():
         if getattr(options, name) is None:
             setattr(options, name, value)

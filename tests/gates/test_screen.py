@@ -128,6 +128,14 @@ def test_the_centre_is_where_optical_axes_nearly_meet(miss: float, depth: float,
     assert center is None or torch.allclose(center, torch.zeros(3), atol=1e-6)
 
 
+def test_small_columns_count_as_large_ones() -> None:
+    """Catches a threshold that is not relative to the largest singular value."""
+    columns = torch.randn(8, 3, generator=torch.Generator().manual_seed(1)).double().numpy()
+    columns = np.concatenate([columns, columns[:, :1]], axis=1)
+    assert {permutation_test._range(scale * columns).shape for scale in (1e-9, 1.0, 1e9)} == {(8, 3)}
+    assert permutation_test._range(0 * columns).shape == (8, 0)
+
+
 def test_initial_points_of_a_fit_follow_the_seed() -> None:
     """Catches a random subset that is another one each time, and colours of other points."""
     means = torch.rand(2 * static_fit_residuals.POINTS, 3)

@@ -394,6 +394,7 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
         (("--plys", "full", *ALONG), "full has files"),
         (("--plys", "full/file", *ALONG), "is a file: name another"),
         ((*PLY, "--seconds", "2"), "--seconds: expected --plys or --video or --images, which reads it"),
+        ((*VIDEO, "--data-root", "."), "--data-root: expected --camera or --path test"),
         ((*PLY, "--path", "orbit"), "--path: expected --video or --images"),
         ((*VIDEO, *ALONG), "--direction: expected --ply or --plys"),
         (("--images", "a", "--path", "test", "--fps", "8"), "--fps: expected --plys or --video beside --path test"),
