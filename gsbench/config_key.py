@@ -128,7 +128,7 @@ def _root(config: type) -> Key:
 def _members(group: Key) -> dict[str, Key]:
     """Return what a group of keys declares, by name; {} for a key with a value."""
     kind = group.kind
-    if get_origin(kind) is dict and dataclasses.is_dataclass(get_args(kind)[1]):
+    if get_origin(kind) is dict and dataclasses.is_dataclass(get_args(kind)[1]):  # groups by free names
         return {ANY_NAME: Key(role=group.role, needs=group.needs, kind=get_args(kind)[1])}
     if not dataclasses.is_dataclass(kind):
         return {}

@@ -60,7 +60,8 @@ class Schedule:
         self.densify_stop = self.scaled(densify.stop)
         window, rounds = self.densify_stop - self.densify_start, densify.rounds or MOST_ROUNDS
         self.densify_every = max(densify.every, math.ceil(window / rounds))
-        # The numbers of finished steps after which opacities are reset; half an interval of densification follows each.
+        # The numbers of finished steps after which opacities are reset, the last half an interval before densification
+        # ends, or earlier.
         self.reset_every, self.resets_after = math.inf, range(0)
         if densify.reset_every is not None:
             every = self.reset_every = max(self.scaled(densify.reset_every), STEPS_BETWEEN_RESETS)

@@ -171,10 +171,18 @@ def _costs(options: argparse.Namespace) -> Cost:
     """
     stated = {name: getattr(options, name) for name in ("train_seconds", "fps", "gaussians", "megabytes")}
     for name, value in stated.items():
-        if value is not None and not 0 < value < 1e15:
+        if value is not None and not 0 < value < 1e15:  # NaN, infinity and typing errors are refused too
             raise InputError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
     size = None if options.megabytes is None else round(options.megabytes * 1e6)
-    return Cost(options.train_seconds, {}, None, options.fps, options.gaussians, size, None)
+    return Cost(
+        train_s=options.train_seconds,
+        stage_s={},
+        render_ms=None,
+        fps=options.fps,
+        num_gaussians=options.gaussians,
+        bytes=size,
+        peak_memory=None,
+    )
 
 
 def _matching(renders: CheckedRenders, views: Sequence[View]) -> str:
@@ -202,15 +210,16 @@ def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, f
     """
     films = [[view.name for view in film] for film in films_of(views)]
     is_filmed = set(itertools.chain(*films))
-    values, frames = [], {}
+    by_view: list[dict[str, float]] = []
+    frames = {}  # grey render and truth of each filmed view, by name
     for view, image in zip(views, renders.images(), strict=True):
         truth = view.image
         if min(truth.shape[:2]) >= SSIM_LEAST_SIDE:
-            values.append(of_other_papers(image, truth))
+            by_view.append(of_other_papers(image, truth))
         if view.name in is_filmed:
             frames[view.name] = grey_of(image), grey_of(truth)
-    names = [name for name in values[0] if all(name in of_view for of_view in values)] if values else []
-    means = {name: fmean(of_view[name] for of_view in values) for name in names}
+    names = [name for name in by_view[0] if all(name in scores for scores in by_view)] if by_view else []
+    means = {name: fmean(scores[name] for scores in by_view) for name in names}
     flows = [tof(*zip(*(frames[name] for name in film), strict=True)) for film in films]
     known = [flow for flow in flows if flow is not None]
     return means | ({"tof_farneback": fmean(known)} if known else {})

@@ -42,7 +42,7 @@ DESCRIBED = {  # config groups, and how they are chosen
 def text(words: Sequence[str]) -> str:
     """Return the help of `python -m gsbench`, with the user's choices if the words name a --config-dir.
 
-    A config key, or the first part of some, is explained instead: `--help train.densify`.
+    With words that are config keys or groups of keys, such as `--help train.densify`, return what these keys mean.
     """
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--config-dir", "-cd", type=Path)

@@ -170,7 +170,7 @@ class ProbedView:
             colors = model.shade(raw, live.means, live.opacities, self.query)
             return _growth_of((self.products[..., COLOR] * (colors - live.colors)).sum(-1))
         simplified = model.colored(model.slice_geometry(raw, self.query), raw, self.query)
-        changed = Gaussians3D(*(x[: simplification.rows] for x in tensors_of(simplified)))
+        changed = Gaussians3D(*(x[: simplification.rows] for x in tensors_of(simplified)))  # others stay the same
         return F.pad(self._growth_of_motion(changed), (0, len(live.means) - simplification.rows))
 
     def _growth_of_motion(self, changed: Gaussians3D) -> Tensor:

@@ -50,11 +50,11 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
         for group in _groups(loose, poses, NEAR)
         if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span
     ]
-    held = near if 2 * sum(map(len, near)) > len(loose) else []
+    held = near if 2 * sum(map(len, near)) > len(loose) else []  # a minority stays with the others
     return Viewpoints(fixed, held, sorted(set(loose).difference(*held)))
 
 
-def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
+def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 20]
     """Return a vector for each camera, such that vectors differ by about the shift between the images of the cameras.
 
     The unit of the shift is the longer side of the image.
@@ -70,7 +70,7 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 18]
     distance = extent if meeting is None else float(np.linalg.norm(centers - meeting.numpy(), axis=1).mean())
     turns = viewmats[:, :3, :3].reshape(-1, 9) / math.sqrt(2)  # they differ by the angle: |R - R'| is sqrt 2 times it
     # Sizes are in pixels: cameras whose images have other sizes are never in one group.
-    return np.concatenate([focal * turns, focal * centers / max(distance, 1e-12), K / side, sizes], 1)
+    return np.concatenate([focal * turns, focal * centers / max(distance, 1e-12), K / side, sizes], 1)  # 9 + 3 + 6 + 2
 
 
 def _groups(indices: list[int], poses: Array, tolerance: float) -> list[list[int]]:

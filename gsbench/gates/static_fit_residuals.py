@@ -36,8 +36,8 @@ def gradient_products(views: Sequence[View], scene: Scene, seed: int, backend: s
     """Fit a static 3DGS to V views for STEPS steps, and return the scalar products of the views' gradients, [V, V].
 
     The gradient of a view is that of its squared error with respect to the means of the Gaussians, after the fit. If
-    the scene moves, it says where each Gaussian should be at the view's time, so that gradients of views at close times
-    are alike; `gsbench.gates.permutation_test` tests this, and needs no more of the gradients than their products.
+    the scene moves, a view's gradient says where each Gaussian should be at its time, so that gradients of views at
+    close times are alike. `gsbench.gates.permutation_test` tests this, and needs only the products of the gradients.
     """
     random = torch.Generator().manual_seed(seed)
     points = scene_points(views, scene, random)

@@ -117,6 +117,7 @@ class Operation:
         self.name = name
         self.inputs, self.outputs = inputs, outputs
         self.numbers, self.defaults = numbers or {}, defaults or {}
+        # What is declared of each input, by its number or as a set of numbers, and of each output.
         kinds = [x.gradient for x in inputs.values()]
         self.adds = {i for i, kind in enumerate(kinds) if kind is Gradient.ADDED}
         self._differentiable = [kind not in (Gradient.NONE, Gradient.REFUSED) for kind in kinds]

@@ -189,7 +189,10 @@ def _over(result: Any, operation: Any, args: Any, kwargs: Any) -> Callable[[], A
 
 @functools.cache
 def _variant_over(operation: Any) -> tuple[Any, list[str]] | None:
-    """Return torch's variant of an operation that writes over tensors, and the names of these; None: it has none."""
+    """Return torch's variant of an operation that writes over tensors, and the names of these; None: it has none.
+
+    For add.Tensor this is add.out, with the name "out".
+    """
     arguments = [(x.name, str(x.type)) for x in operation._schema.arguments]
     for name in operation.overloadpacket.overloads():
         variant = getattr(operation.overloadpacket, name)

@@ -157,7 +157,7 @@ class _Refine(Operation):
         values, units, gamma = in_rows(inputs.values), None, None
         if library_of(values[0].device.type).takes_views:
             weights, (units, gamma) = inputs.weights(), in_rows([inputs.units, inputs.gamma])
-        else:
+        else:  # units and gamma are merged into the weights
             weights = inputs.layers()
         intervals, time = inputs.intervals, inputs.time
         if intervals is not None and time is not None:
@@ -199,6 +199,7 @@ class _Refine(Operation):
         widths = [*value_widths[:last], sum(value_widths[last:])]  # of the outputs of each MLP
         like, features, outputs, hidden = inputs.values[0], sum(widths[:last]), sum(widths), HIDDEN * networks
         rows = first_rows("refine: rows", numbers[0], like)
+        # The shapes of `listed`, in the order of `_Inputs`.
         shapes: list[tuple[int, ...]] = [(len(like), width) for width in value_widths]
         views = () if inputs.views is None else (inputs.views,)
         if views and not library_of(like.device.type).takes_views:

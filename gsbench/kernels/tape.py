@@ -125,7 +125,7 @@ class _Gradients:
         self.sources = {id(x): x for x in sources}
         self.sums = sums
         self.by_id: dict[int, Tensor] = {}  # the gradient of each tensor
-        self.uses = Counter([id(x) for call in calls for x in call.tensors])
+        self.uses = Counter([id(x) for call in calls for x in call.tensors])  # how often calls read each tensor
 
     def propagate(self, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> None:
         """Add gradients to those of tensors; if these have a `grad_fn`, backpropagate them through autograd."""

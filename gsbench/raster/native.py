@@ -57,7 +57,7 @@ def draw(inputs: RasterInputs, viewport: Viewport) -> RasterOutput:
         splats = project(inputs, viewport)
         bins = bin_tiles(splats, viewport)
         pairs = len(bins.ids)
-        if recording.read(flags, lambda values: values == [0])[0]:
+        if recording.read(flags, lambda values: values == [0])[0]:  # not zero: a bad value, as above
             check_values(inputs)
         image, alpha = blend(splats, inputs.colors, inputs.background, bins, viewport)
     return RasterOutput(image, alpha, RasterInfo(splats.half_sizes, splats.means2d, splats.depths, pairs))

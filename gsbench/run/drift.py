@@ -55,7 +55,7 @@ def _path(model: GaussianModel, film: Sequence[View], still: Tensor, antialias: 
         shifted = (_pixels(camera, after.means) - _pixels(camera, now.means)).norm(dim=-1)
         lengths = torch.stack([moved, shifted, torch.ones_like(moved)], 1)  # [N, 3] in place of colours
         image = rasterize_slice(now._replace(colors=lengths), camera, black, model.backend, antialias).image[0]
-        weighted = image.cpu()[still].double().sum(0)  # both lengths, and the weights themselves
+        weighted = image.cpu()[still].double().sum(0)  # [3] sums over S: weights times both lengths, and weights alone
         path += weighted[:2] / weighted[2].clamp_min(torch.finfo(weighted.dtype).tiny)  # no weight: no path
     return path
 

@@ -77,7 +77,7 @@ class Execution:
         """Store the run; no file is read and no setting is checked yet."""
         self.spec = spec
         before_scene = with_candidate(spec.config, "moving") if is_auto(spec.config) else spec.config
-        self.chosen = ChosenModel(before_scene)
+        self.chosen = ChosenModel(before_scene)  # for model=auto, `prepare` and `fit` may choose another
         self.model: GaussianModel | None = None
         self.scene: Scene | None = None
         self.start: TrainedGaussians | None = None  # trained Gaussians to start from; None to start from points
@@ -145,7 +145,7 @@ class Execution:
         measured = measuring.measure(trainer, self.chosen.config, with_effect_sets="on_demand" in results)
         self._images = measured.images
         record = self.describe("ok", None)
-        fields = {name: value for name, value in results.items() if hasattr(record, name)}
+        fields = {name: value for name, value in results.items() if hasattr(record, name)}  # `parts` has the others
         of_other_hooks = {name: value for name, value in results.items() if name not in fields}
         exact_views = trainer.exact.union(*(view.exact for view in measured.per_view))  # the render equals the image
         return replace(

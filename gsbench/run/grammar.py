@@ -35,7 +35,7 @@ def check_override(word: str) -> None:
     texts = _parts(text) if several else [text]  # as they were typed
     if kind in (*_TEXTS, list[str]) and any(
         isinstance(value, int | float | list | dict) and str(value) != part
-        for value, part in zip(values, texts, strict=False)
+        for value, part in zip(values, texts, strict=False)  # a comma in quotes makes more parts than values
     ):
         raise InputError(
             f"{key}: expected a text, Hydra reads {text} as {', '.join(map(str, values))}: type "

@@ -47,7 +47,7 @@ def plain(spec: RunSpec, config: Config) -> dict[str, Any]:
     """
     train = {"iterations": config.train.iterations, "lengths": lengths_of(config)}
     model = OmegaConf.to_container(OmegaConf.structured(config.model), resolve=True)
-    groups = {"train": train, "effects": {"gate": config.effects.gate}}
+    groups = {"train": train, "effects": {"gate": config.effects.gate}}  # off where `gated_if_possible` says so
     changed = {name: spec.plain[name] | values for name, values in groups.items()}
     return spec.plain | changed | {"model": model, "agr": config.agr}
 

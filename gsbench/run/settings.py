@@ -27,8 +27,8 @@ def check_settings(config: Config) -> None:
     check_choices(config)
     if not is_auto(config):
         return
-    alone = {name: with_candidate(config, name) for name in CANDIDATES}
-    for name, candidate in (candidates(config) if config.effects.compare else alone).items():
+    of_screen = {name: with_candidate(config, name) for name in CANDIDATES}  # the time screen chooses one of these
+    for name, candidate in (candidates(config) if config.effects.compare else of_screen).items():
         try:
             check_values(candidate)
         except InputError as error:

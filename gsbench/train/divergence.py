@@ -43,11 +43,11 @@ class FiniteCheck:
         This can be recorded and repeated in other steps.
         """
         gradients = [p.grad for group in groups.values() for p in group]
-        if len(self._result) != len(gradients) + 2:
+        if len(self._result) != len(gradients) + 2:  # at first use
             self._names = [name for name, group in groups.items() for _ in group]
             self._result = losses.new_zeros(len(gradients) + 2)
             self._results = self._result.new_empty(self.every, len(self._result))
-        loss = self._result[-1]
+        loss = self._result[-1]  # [] in the memory of the result
         torch.sum(losses, 0, out=loss)
         _flag([*gradients, loss], self._result[:-1], self.skip)
 
@@ -102,7 +102,7 @@ def explain(model: GaussianModel) -> str:
     for name, parameter in model.splats.items():
         if parameter.grad is None:
             continue
-        rows = parameter.grad.reshape(len(parameter), math.prod(parameter.shape[1:]))  # also if it has one dimension
+        rows = parameter.grad.reshape(len(parameter), math.prod(parameter.shape[1:]))  # flatten(1) refuses [N]
         bad = ~rows.isfinite().all(1)
         if bad.any():
             return f"the first is Gaussian {int(bad.nonzero()[0])} of {len(bad)} in '{name}' ({int(bad.sum())} in all)"

@@ -59,7 +59,7 @@ class Trainer(TrainingParts):
                 loss = f"loss {self.loss:.4f}"
                 bar.set_postfix_str(f"{self.curve.progress}, {loss}, {len(self.model)} Gaussians", refresh=False)
                 if measured and any(hook.stops(self.step) for hook in self.hooks):
-                    self.step = train.iterations
+                    self.step = train.iterations  # so the training counts as finished
                 if not goes_on():
                     break
                 if time.monotonic() - saved >= 60 * train.checkpoint_minutes and self.step < train.iterations:

@@ -180,6 +180,7 @@ def _differences(
     On a CPU, the gradient of `gather` adds equal indices in a fixed order, and is faster than that of `embedding`.
     """
     columns = vectors.T.contiguous()
+    # [3, B] and [3, k B]
     ends, starts = (columns.gather(1, rows.flatten().expand(3, -1)) for rows in (sample, pairs))
     return ends[:, None] - starts.unflatten(1, pairs.shape)
 

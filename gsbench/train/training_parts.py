@@ -106,7 +106,7 @@ class TrainingParts:
         return {
             "step": self.step,
             **self.state_of_gaussians(),
-            "hooks": {hook.name: hook.state_dict() for hook in self.hooks},
+            "hooks": {hook.name: hook.state_dict() for hook in self.hooks},  # also of those that measure
             "stages": self.stages.state_dict(),
             "effort": self.effort.state_dict(),
             "replay": dict(self.replay.counts),
@@ -115,7 +115,7 @@ class TrainingParts:
         }
 
     def state_of_gaussians(self) -> dict[str, Any]:
-        """Return the part of the state that an earlier iteration's Gaussians have, without measurements."""
+        """Return the part of the state that is restored with the Gaussians of an earlier iteration: no measurements."""
         return {
             "model": self.model.pack(),
             "optimizer": self.optimizer.state_dict(),

@@ -62,7 +62,7 @@ class DensityControl:
         """
         if self.accumulates(step):
             for part in results:
-                camera = views[part.views[0]].camera
+                camera = views[part.views[0]].camera  # views of a part have equal sizes
                 self.rule.accumulate(part.drawn, part.g_means2d, camera.width, camera.height, len(views), skip)
 
     def accumulates(self, step: int) -> bool:

@@ -65,7 +65,7 @@ class Training(Protocol):
         """Return the mean PSNR of the model over views, dB."""
 
     def state_of_gaussians(self) -> dict[str, Any]:
-        """Return the part of the state that an earlier iteration's Gaussians have, without measurements."""
+        """Return the part of the state that is restored with the Gaussians of an earlier iteration: no measurements."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return the whole state of the training."""

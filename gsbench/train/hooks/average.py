@@ -44,7 +44,7 @@ class Average(Hook):
         super().__init__(training)
         start = cast(AverageKey, training.config.train).average_from
         self.start = None if start is None else training.schedule.scaled(start)
-        self.count = 0
+        self.count = 0  # how many steps are in the means
         self.first = 0  # the step of the first parameters in the means
         self.means: list[Tensor] = []
         self.kept = 0  # the number of last iterations over which the model's parameters were averaged; 0: they were not
