@@ -72,7 +72,8 @@ def _gradients(model: Gaussians3DModel, parameters: list[nn.Parameter], backgrou
         image = rasterize_slice(gaussians, view.camera, background, model.backend).image
     gradients: dict[int, Tensor] = {}
     residual = image.detach() - view.image
-    tape.backward(image, 2 / residual.numel() * residual, parameters, gradients)
+    by_image = 2 / residual.numel() * residual  # the gradient of the mean of residual^2
+    tape.backward(image, by_image, parameters, gradients)
     return [gradients.get(id(parameter), torch.zeros_like(parameter)) for parameter in parameters]
 
 
@@ -100,15 +101,15 @@ def center_of(views: Sequence[View]) -> Tensor | None:
     The sum of squared distances |A_v (x - c_v)|^2, where A_v = I - a_v a_v^T for the axis a_v through the camera's
     centre c_v, is smallest where the sum of A_v (x - c_v) is zero.
     """
-    centers = torch.stack([view.camera.center for view in views]).cpu().double()
-    axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    centers = torch.stack([view.camera.center for view in views]).cpu().double()  # [V, 3]
+    axes = torch.stack([view.camera.viewmat[2, :3] for view in views]).cpu().double()  # [V, 3]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3] A_v
     total = across.mean(0)
     if float(torch.linalg.cond(total)) > 1e3:  # parallel axes meet nowhere
         return None
     meeting = torch.linalg.solve(total, (across @ centers[:, :, None]).mean(0)[:, 0])
     depth = ((meeting - centers) * axes).sum(-1)
-    miss = (across @ (meeting - centers)[:, :, None])[..., 0].norm(dim=-1)
+    miss = (across @ (meeting - centers)[:, :, None])[..., 0].norm(dim=-1)  # distance from each axis
     return meeting.float() if bool((depth > 0).all() and (miss < NEAR_AXES * depth).all()) else None
 
 

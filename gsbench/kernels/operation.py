@@ -378,7 +378,7 @@ class _Eager(torch.autograd.Function):
         ctx.save_for_backward(*tensors, *outputs)
         carries = operation.carries_gradient(outputs)
         ctx.mark_non_differentiable(*[x for x, has in zip(outputs, carries, strict=True) if not has])
-        ctx.set_materialize_grads(False)
+        ctx.set_materialize_grads(False)  # a gradient that is zero comes as None
         return tuple(outputs)
 
     @staticmethod

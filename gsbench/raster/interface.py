@@ -113,6 +113,6 @@ def check_values(inputs: RasterInputs) -> None:
         )
     if (Ks[:, [0, 1], [0, 1]] <= 0).any():
         raise InputError("Ks: expected positive focal lengths at [0, 0] and [1, 1]")
-    rest = Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
+    rest = Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]  # all entries but fx, fy, cx and cy
     if (rest != rest.new_tensor([0.0, 0.0, 0.0, 0.0, 1.0])).any():
         raise InputError("Ks: expected [fx 0 cx; 0 fy cy; 0 0 1]: skew is not drawn, undistort the images without it")

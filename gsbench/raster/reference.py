@@ -136,7 +136,7 @@ def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Te
         The tile [P] and the Gaussian [P] of each intersection.
     """
     order = torch.argsort(splats.depths, stable=True)
-    order = order[splats.half_sizes[order].amax(-1) > 0]
+    order = order[splats.half_sizes[order].amax(-1) > 0]  # the Gaussians that are drawn, by depth
     center, half = splats.means2d[order], splats.half_sizes[order]
     size = center.new_tensor([width, height])
     # The bounds are clamped as floats, because those of a huge Gaussian would overflow integers.
@@ -144,7 +144,7 @@ def bin_tiles(splats: CameraSplats, width: int, height: int) -> tuple[Tensor, Te
     high = (torch.minimum((center + half).clamp(min=0), size) / TILE).ceil().long()
     columns, rows = (high - low).clamp(min=1).unbind(-1)
     count = columns * rows
-    owner = torch.repeat_interleave(torch.arange(len(order), device=order.device), count)
+    owner = torch.repeat_interleave(torch.arange(len(order), device=order.device), count)  # [P] indices into `order`
     nth = torch.arange(len(owner), device=order.device) - (count.cumsum(0) - count)[owner]  # 0, 1, .. of each Gaussian
     across = -(-width // TILE)
     down = -(-height // TILE)

@@ -68,7 +68,7 @@ def measure_images(
 
     `evaluate` asks for one (name, render, ground truth) after the other; regions and flicker look at each on its way.
     """
-    shown: Pairs = []  # filled meanwhile
+    shown: Pairs = []  # `_beside_truth` fills it while `evaluate` runs
     regions = RegionScores(views, config.protocol.quantise)
     flicker = FlickerScores(views, regions.regions["moving"].of_any_size)
     pairs = _beside_truth(views, renders, config.protocol.pictures, shown)

@@ -134,7 +134,7 @@ class Candidates:
         """
         spec, run, trainer = self.spec, self._run(name), self.trainer(name)
         done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
-        error = frame_ms = None  # frame_ms stays None if the training failed or was too slow
+        error = frame_ms = None  # frame_ms stays None if the training fails or takes too long
         try:
             fitting.resume(trainer, run, fitting.saved_state(run, self.scene))
             fitting.fit(

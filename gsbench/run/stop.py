@@ -95,5 +95,5 @@ def requested() -> Iterator[Request]:
             raise
         raise Stopped(request.signal, f"stopped by {signal.Signals(request.signal).name}: {one_line(error)}") from error
     finally:
-        for signal_number, before in request._before.items():
-            signal.signal(signal_number, before)
+        for number, before in request._before.items():
+            signal.signal(number, before)

@@ -207,7 +207,7 @@ def check_rates(groups: Collection[str], config: ModelConfig) -> None:
         if name not in config.lr:
             raise InputError(f"model.lr: expected a learning rate for each of {sorted(groups)}, '{name}' has none")
     for name in config.lr:
-        if name not in {*groups, "refinement", "lambda"}:
+        if name not in {*groups, "refinement", "lambda"}:  # a run may switch off what has these two groups
             raise InputError(f"model.lr: model '{config.name}' has no '{name}'. {did_you_mean(name, groups)}")
 
 
