@@ -134,7 +134,7 @@ def _sizes_of_images(tensors: dict[str, Tensor], numbers: dict[str, Any]) -> dic
         "lists": tiles + 1,
         "D": D,
         "sums": GEOMETRY + ("shapes" in tensors) + D,
-        "state": tiles // C * TILE_PIXELS,
+        "state": tiles // C * TILE_PIXELS,  # of an image, for whole tiles
     }
 
 
@@ -214,6 +214,7 @@ def bin_tiles(splats: Splats, viewport: Viewport) -> Bins:
     offsets = like.new_empty(C * count_tiles(viewport.width, viewport.height) + 1, dtype=torch.int32)
     total = like.new_empty(1, dtype=torch.int64)
     library.call("count_tiles", slots | {"out.offsets": address(offsets), "out.pairs": address(total)}, like)
+    # The condition is for repetitions, when `room` is known.
     pairs = _checked_count(recording.read(total, lambda values: values[0] <= room)[0])
     room = pairs if recording.current() is None else int(ROOM * pairs)  # repetitions use the same memory
     require(4 * room, f"the lists of {pairs} pairs of a tile and a Gaussian", LOWER)
@@ -237,7 +238,7 @@ class Drawing(NamedTuple):
     def record(self) -> tuple[Splats, Tensor, Tensor]:
         """Record the call for the backward pass; return the splats, and image and alpha as `blend` does."""
         splats = Splats(*_project.record(*self.projection))
-        (_, _, _, *further), numbers, results = self.blending
+        (_, _, _, *further), numbers, results = self.blending  # the first three again, but with gradients
         image, alpha, *_ = _blend.record([splats.means2d, splats.roots, splats.half_sizes, *further], numbers, results)
         return splats, image, alpha
 
@@ -257,7 +258,7 @@ def enqueue(inputs: RasterInputs, viewport: Viewport, room: int) -> Drawing:
     ids = allocate(PAIRS, means, (room,), torch.int32)
     blending = _blend.split((means2d, roots, half_sizes, colors, background, offsets, ids, beta_exponents, *size))
     blended = _blend.allocate_results(*blending)
-    needed = allocate("numbers of tiles", means, (2,), torch.int64)
+    needed = allocate("a count of tile intersections", means, (2,), torch.int64)
     scratch_bytes = library.extension.draw_scratch(depths.numel(), room)
     scratch = allocate(PAIRS, means, (scratch_bytes,), torch.uint8)
     out = {"offsets": offsets, "ids": ids, "needed": needed, "scratch": scratch}
@@ -296,7 +297,7 @@ def _draw_unrecorded(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing,
         room = _rooms.setdefault(sizes, splats)
         drawing = enqueue(inputs, viewport, room)
         pairs, flagged = drawing.needed.tolist()
-        if not pairs <= room <= 2 * pairs:
+        if not pairs <= room <= 2 * pairs:  # too little, or more than twice as much as needed
             if len(_rooms) >= MOST_KNOWN:
                 _rooms.clear()
             _rooms[sizes] = room_for(pairs)
@@ -306,7 +307,7 @@ def _draw_unrecorded(inputs: RasterInputs, viewport: Viewport) -> tuple[Drawing,
 
 
 def room_for(pairs: int) -> int:
-    """Return for how many tile intersections to allocate memory where `pairs` are expected, or a few more.
+    """Return for how many tile intersections to allocate memory where `pairs` are expected: MARGIN times as many.
 
     Raises:
         InputError: there are more than int32 can count.

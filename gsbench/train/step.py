@@ -156,8 +156,9 @@ class Step:
         workers = min(len(parts), self.model.backend.workers(self.model.splats["means"]))
         bounds = [len(parts) * worker // workers for worker in range(workers + 1)]
         sums = deal(len(parts), bounds)
+        # The gradient of the batch's loss by the loss of each view of a part.
         seed = self.background.new_full((max(map(len, parts)),), 1 / len(views))
-        self.model.shared = self.leaves
+        self.model.shared = self.leaves  # views read these in place of computing them
         try:
             results = self.replay(
                 self._signature(views, parts, sources, workers),
@@ -174,7 +175,7 @@ class Step:
                     tape.backward(x, g, self.parameters, total)
             for parameter in self.parameters:
                 parameter.grad = total.get(id(parameter))
-            if (penalty := self.model.penalty()) is not None:
+            if (penalty := self.model.penalty()) is not None:  # of parameters alone: not on the tape
                 penalty.backward()
         return results
 
@@ -196,6 +197,7 @@ class Step:
         parts: dict[Hashable, list[int]] = {}
         for i, view in enumerate(views):
             camera, pixels = view.camera, view.pixels
+            # A call has one size and one near plane, and all of its views have times, or none.
             key = camera.width, camera.height, camera.near, pixels.shape, pixels.dtype, view.time is None
             parts.setdefault(key, []).append(i)
         return list(parts.values())
@@ -205,7 +207,8 @@ class Step:
     ) -> Hashable:
         """Return all that the calls of a step depend on, except values of tensors; None if they must not be repeated.
 
-        A model may have attributes that this class does not know, so all its numbers and strings are included.
+        A model may have attributes that this class does not know, so all its numbers and strings are included. So is
+        `model.active`, because the schedule changes which parts of the model act.
         """
         model, sets = self.model, self.model.effect_sets
         by_kernels = self.background.device.type in REPEATED_ON and model.backend.serves(self.background)
@@ -252,7 +255,7 @@ class Step:
             with stages("loss"):
                 image = output.image
                 for image_map in self.maps:
-                    image = image_map(image, part[0])
+                    image = image_map(image, part[0])  # the part has one view
                 loss = photometric(image, observed.targets(), self.ssim_weight, self.model.backend)
                 for weight, term in self.terms:
                     loss = loss + weight * term(queries[0], part[0])

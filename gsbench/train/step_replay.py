@@ -39,13 +39,13 @@ class Observed(NamedTuple):
     def copy(self) -> Observed:
         """Return a copy in memory of its own, which `overwrite` changes."""
         cameras, together = [camera.clone() for camera in self.cameras], torch.stack(self.images)
-        like, times = cameras[0].K, list[float | Tensor | None]()
-        times += [None if time is None else like.new_tensor(time) for time in self.times]
+        K = cameras[0].K
+        times: list[float | Tensor | None] = [None if time is None else K.new_tensor(time) for time in self.times]
         return Observed(cameras, times, list(together.unbind()), together)
 
     def overwrite(self, other: Observed) -> None:
         """Take the values of views of the same signature."""
-        torch._foreach_copy_(self.images, other.images)  # on a GPU in one launch
+        torch._foreach_copy_(self.images, other.images)  # views of `together`; on a GPU in one launch
         torch._foreach_copy_(_tensors_of(self.cameras), _tensors_of(other.cameras))
         for kept, time in zip(self.times, other.times, strict=True):
             if isinstance(kept, Tensor) and time is not None:
@@ -64,6 +64,7 @@ class Observed(NamedTuple):
 
 
 def _tensors_of(cameras: Sequence[Camera]) -> list[Tensor]:
+    """Return what differs between cameras of one size."""
     return [x for camera in cameras for x in (camera.viewmat, camera.K, camera.center)]
 
 
@@ -83,7 +84,7 @@ class Recorded(Generic[Result]):
         self.result = work(recorded)
         self.is_repeatable = all(recording.is_repeatable for _, recording in self._recordings)
         if self.is_repeatable and device in GRAPHED_ON:
-            with suppress(RuntimeError):  # then single calls are repeated
+            with suppress(RuntimeError):  # then single calls of this stage and of later ones are repeated
                 for _, recording in self._recordings:
                     recording.capture()
 
@@ -139,6 +140,8 @@ class StepReplay(Generic[Result]):
     ) -> list[Result]:
         """Return the results of all parts; a later call overwrites the tensors in them.
 
+        The first step with a signature is launched, the second is launched and recorded, and all further ones replayed.
+
         Args:
             signature: all that the work depends on, except values of tensors; None: it must not be recorded.
             parts: the views of the batch that are rendered together, of equal size.
@@ -156,7 +159,7 @@ class StepReplay(Generic[Result]):
                 self.counts["replayed"] += 1
                 return results
         self.counts["launched"] += 1
-        if is_new or not self._is_repeatable:
+        if is_new or not self._is_repeatable:  # a recording must not make again what is made at first use
             return of_all(lambda index, stages: work(index, observed[index], stages))
         recorded = of_all(lambda index, stages: _RecordedPart(partial(work, index), observed[index], stages))
         self._is_repeatable = all(part.is_repeatable for part in recorded)

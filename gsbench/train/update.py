@@ -57,7 +57,7 @@ class Update:
         """Update the model once, then delete the gradients.
 
         Raises:
-            DivergedError: the loss or a gradient was not finite, in this step or since the CPU looked. No bad gradient
+            DivergedError: the loss or a gradient was not finite, in this step or since the last look. No bad gradient
                 is used, and the present gradients are kept to say which Gaussian has them.
         """
         self.optimizer.begin(step, factors)
@@ -67,6 +67,8 @@ class Update:
 
     @torch.no_grad()
     def _do(self, step: int, views: Sequence[View], results: Sequence[PartResult]) -> None:
+        """Check, update and accumulate; by repeating a recording if this has the same memory and the same work."""
+
         def work(stages: Stages) -> None:
             with stages("optimizer"):
                 self.check.check(_joined([part.loss for part in results]), self.optimizer.groups)
@@ -80,7 +82,7 @@ class Update:
         if self.replay.recording is None or signature != self._signature:
             self.forget()
             self._signature = signature
-            work(self.stages)  # as written: a repetition must not make anew what is made at first use
+            work(self.stages)  # not recorded: a recording must not make again what is made at first use
         elif self._recorded is None or not self._recorded.is_repeatable:
             self._recorded = Recorded(work, self.stages, self.check.skip.device.type)
         else:
