@@ -23,7 +23,7 @@ class _Layout:
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
     reader: str  # module.function of this package: (root, rendition) -> Scene; imported late
-    reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised
+    reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised, and which this reader reads too
     options: tuple[str, ...] = ()  # of `load` that only some layouts have
     beside: str = "*"  # a pattern of names, one of which is there too; other data has poses_bounds.npy as well
 
@@ -84,7 +84,7 @@ def load(
     repair: Sequence[str] | None = None,
     leave_out: Sequence[str] | None = None,
 ) -> Scene:
-    """Load a scene from a folder in the layout of Blender (D-NeRF), Technicolor, N3V, Panoptic, COLMAP or nerfstudio.
+    """Load a scene from a folder in the layout of Blender, Technicolor, Panoptic, Nerfies, N3V, COLMAP or nerfstudio.
 
     What was decided where the files leave a choice, such as which number of the names is the time, is printed and is
     in `Scene.notes`.
@@ -121,8 +121,8 @@ def load(
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r:.80}")
     if resize is not None and resize not in RESIZES:
         raise InputError(f"resize '{resize!s:.80}' is not known. {did_you_mean(str(resize), RESIZES)}")
-    numbers = isinstance(background, tuple | list) and all(isinstance(value, int | float) for value in background)
-    if not numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
+    are_numbers = isinstance(background, tuple | list) and all(isinstance(value, int | float) for value in background)
+    if not are_numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")
     root = _folder(path)
     present = [layout for layout in _LAYOUTS if os.path.lexists(root / layout.marker) and any(root.glob(layout.beside))]
@@ -130,15 +130,15 @@ def load(
         why = "a folder without a scene" if root.is_dir() else "no such folder"
         layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
         raise InputError(f"{root}: {why}: looked for {layouts}", docs="data.md#what-is-read")
-    layout = present[0]
-    more: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
-    more |= {} if repair is None else {"repair": _repair(repair, layout)}
-    more |= {} if leave_out is None else {"leave_out": _leave_out(leave_out, layout)}
+    layout = present[0]  # the order of _LAYOUTS decides
+    options: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
+    options |= {} if repair is None else {"repair": _repair(repair, layout)}
+    options |= {} if leave_out is None else {"leave_out": _leave_out(leave_out, layout)}
     from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
 
     module, function = layout.reader.split(".")
     reader = getattr(importlib.import_module(f"gsbench.scenes.{module}"), function)
-    scene: Scene = reader(root, Rendition(downscale, background, resize), **more)
+    scene: Scene = reader(root, Rendition(downscale, background, resize), **options)
     if others := ", ".join(other.marker for other in present[1:] if other.marker not in layout.reads_too):
         scene = replace(scene, notes=(f"{layout.marker} is read, and not {others}", *scene.notes))
     for note in scene.notes:
@@ -147,7 +147,7 @@ def load(
 
 
 def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
-    """Check and return the numbers of the first and the last frame; raise InputError for a layout without frames."""
+    """Check and return the first and the last frame; raise InputError for a layout without this option."""
     if "frames" not in layout.options:
         raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
     if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
@@ -158,7 +158,7 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
 
 
 def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
-    """Check and return the names of images to replace; raise InputError for a layout without frames."""
+    """Check and return the names of images to replace; raise InputError for a layout without this option."""
     if "repair" not in layout.options:
         raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
@@ -167,7 +167,7 @@ def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
 
 
 def _leave_out(names: object, layout: _Layout) -> tuple[str, ...]:
-    """Check and return the names of cameras to leave out; raise InputError for a layout without named cameras."""
+    """Check and return the names of cameras to leave out; raise InputError for a layout without this option."""
     if "leave_out" not in layout.options:
         raise InputError(f"leave_out: {layout.marker} has no names of cameras, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
@@ -176,13 +176,13 @@ def _leave_out(names: object, layout: _Layout) -> tuple[str, ...]:
 
 
 def _folder(path: object) -> Path:
-    """Convert `path` to a Path; raise InputError if it is not a printable string or cannot be accessed."""
+    """Convert `path` to a Path; raise InputError if it is no path, cannot be printed in messages or not be accessed."""
     if not isinstance(path, str | Path) or not str(path).isprintable():
         raise InputError(f"path: expected the path of a scene's folder, got {path!r:.200}")
     try:
         Path(path).stat()
     except FileNotFoundError:
-        pass  # the message says what was looked for
+        pass  # the error of `load` says so, and lists the layouts
     except OSError as error:
         raise InputError(f"path: expected the path of a scene's folder, {str(path)!r:.200}: {error.strerror}") from None
     return Path(path)

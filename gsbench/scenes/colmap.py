@@ -73,7 +73,7 @@ class PosedImage:
 
     name: str  # relative to the folder of the images
     viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
-    camera: int  # key of `read_cameras`
+    camera: int  # id, a key of `read_cameras`
 
 
 def load(root: Path, rendition: Rendition) -> Scene:
@@ -93,14 +93,14 @@ def load(root: Path, rendition: Rendition) -> Scene:
     name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
     root = root.resolve()
     folder, notes = largest_model(root / "sparse")
-    cameras, posed, points = (read_part(folder, part) for part in ("cameras", "images", "points3D"))
+    model = cameras, posed, points = [read_part(folder, part) for part in ("cameras", "images", "points3D")]
     listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
     loaded = shots.read(listed, rendition)
     digests |= {
         shot.path.relative_to(root).as_posix(): digest for shot, digest in zip(listed, loaded.digests, strict=True)
     }
-    digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in (cameras, posed, points)}
+    digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in model}
     train, test = hold_out(loaded.views, HELD_OUT)
     return standard_scene(
         name=name,
@@ -141,15 +141,16 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
         viewmat = torch.from_numpy(image.viewmat)
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
         listed_shots.append(Shot(path, mask, name, named_by, time, viewmat, lenses[image.camera]))
-    ordered = sorted(listed_shots, key=lambda shot: (shot.time or 0.0, shot.name))
+    ordered = sorted(listed_shots, key=lambda shot: (shot.time or 0.0, shot.name))  # either all have a time or none
     return ordered, digests, timed.notes + finder.notes() + _unregistered(root, ordered)
 
 
 def _unregistered(root: Path, listed: Sequence[Shot]) -> list[str]:
     """Return a sentence on images in the folder that the model does not have, if there are any."""
     known = {shot.path for shot in listed}
-    there = [Path(folder, name) for folder, _, names in os.walk(root / IMAGES) for name in names]
-    others = sorted(path for path in there if files.without_suffix(path.name) != path.name and path not in known)
+    paths = [Path(folder, name) for folder, _, names in os.walk(root / IMAGES) for name in names]
+    images = [path for path in paths if files.without_suffix(path.name) != path.name]
+    others = sorted({*images} - known)
     if not others:
         return []
     first = others[0].relative_to(root).as_posix()
@@ -169,8 +170,8 @@ def read_part(folder: Path, part: str) -> ModelFile:
 def largest_model(sparse: Path) -> tuple[Path, list[str]]:
     """Return the folder of the model with the most images in `sparse` and its subfolders, and what was left out.
 
-    COLMAP writes a folder 0, 1, .. for each part of a capture that it could not join. Of equals, the first is taken,
-    and `sparse` itself last.
+    COLMAP writes a folder 0, 1, .. for each part of a capture that it could not join. Of equals, the first is taken, 2
+    before 10, and `sparse` itself last.
     """
     folders = sorted(sparse.iterdir(), key=lambda path: (len(path.name), path.name)) if sparse.is_dir() else []
     models = [
@@ -190,14 +191,14 @@ def largest_model(sparse: Path) -> tuple[Path, list[str]]:
 
 
 def read_cameras(file: ModelFile) -> dict[int, Lens]:
-    """Return the cameras of a model by their numbers."""
+    """Return the lenses of a model by the ids of their cameras."""
     rows = _text_cameras(file) if file.path.suffix == ".txt" else _binary_cameras(file)
-    by_name = {}
+    by_id = {}
     for camera, model, width, height, values in rows:
-        if camera in by_name:
+        if camera in by_id:
             raise InputError(f"{file.path}: camera {camera} appears twice: write the model again")
-        by_name[camera] = _lens(model, width, height, values, f"{file.path}: camera {camera}")
-    return by_name
+        by_id[camera] = _lens(model, width, height, values, f"{file.path}: camera {camera}")
+    return by_id
 
 
 def read_images(file: ModelFile) -> list[PosedImage]:
@@ -235,7 +236,7 @@ def read_points(file: ModelFile) -> Points:
     """Return positions (float64) and colours of the points of a model."""
     path = file.path
     rows = _text_points(file) if path.suffix == ".txt" else _binary_points(file)
-    values = np.array(rows, np.float64).reshape(-1, 6)
+    values = np.array(rows, np.float64).reshape(-1, 6)  # x y z, r g b from 0 to 255
     if not len(values):
         raise InputError(f"{path}: expected at least one point")
     if not (np.abs(values[:, :3]) <= np.finfo(np.float32).max).all():
@@ -271,8 +272,8 @@ def _check_model(model: str, where: str) -> str:
     return model
 
 
-_CameraRow = tuple[int, str, int, int, tuple[float, ...]]  # number, model, width, height, parameters
-_ImageRow = tuple[str, tuple[float, ...], int]  # name, quaternion (w first) and translation, number of the camera
+_CameraRow = tuple[int, str, int, int, tuple[float, ...]]  # id, model, width, height, parameters
+_ImageRow = tuple[str, tuple[float, ...], int]  # name, quaternion (w first) and translation, id of the camera
 
 
 def _binary_cameras(file: ModelFile) -> Iterator[_CameraRow]:
@@ -314,10 +315,10 @@ def _text_images(file: ModelFile) -> Iterator[_ImageRow]:
     for line_number, line in lines:
         if not line:
             continue
-        words = line.split(maxsplit=9)
+        words = line.split(maxsplit=9)  # the name is last, and may have spaces
         with _expects("an image's id, qw qx qy qz tx ty tz, camera and name", file, line_number, line):
             row = words[9], tuple(float(word) for word in words[1:8]), int(words[8])
-        line_number, line = next(lines, (line_number + 1, ""))
+        line_number, line = next(lines, (line_number + 1, ""))  # an editor may have removed an empty last line
         if not _are_keypoints(line.split()):
             raise InputError(
                 f"{file.path}: line {line_number}: expected the keypoints (x y id ..) of image "
@@ -391,9 +392,8 @@ class _Reader:
 
     def text(self) -> str:
         """Read a text that ends with a zero byte."""
-        end = self._data.find(b"\0", self._at)
-        start = self._at
-        self.skip((end if end >= 0 else len(self._data)) + 1 - start)
+        start, end = self._at, self._data.find(b"\0", self._at)
+        self.skip((end if end >= 0 else len(self._data)) + 1 - start)  # without a zero byte too far, which is refused
         return self._data[start:end].decode("utf-8", "replace")
 
     def skip(self, size: int) -> None:

@@ -47,7 +47,7 @@ def find_inside(
 
 
 def read_keys(kind: type[T], source: Path) -> tuple[T, str, set[str]]:
-    """Read the keys of a JSON file that a dataclass has; return its SHA-256 and the names of other keys too."""
+    """Return a dataclass `kind` with the keys of a JSON file, the file's SHA-256, and its keys that `kind` lacks."""
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]  # of a dataclass
@@ -83,9 +83,9 @@ class ImageFinder:
         name: str,  # a path relative to the scene's folder, with or without suffix, with / or Windows' backslashes
         where: str,
     ) -> Path:
-        """Return the path of the image: `name` itself if it is a file, otherwise that of another suffix, or of case.
+        """Return the path of the image: `name` itself if it is a file, otherwise one with another suffix (.jpg, .PNG).
 
-        If there is neither, the path of the PNG or of what `name` says is returned, for a message that names it.
+        Without either, the path of the PNG or of what `name` says is returned, so that the error of reading names it.
         """
         path = find_inside(self._root, name, where)
         if not os.path.isfile(path) and "\\" in name:
@@ -97,6 +97,7 @@ class ImageFinder:
         names = self._images(path.parent).get(unicodedata.normalize("NFC", stem))
         if not names:
             return path if suffix else path.with_name(f"{path.name}{_SUFFIXES[0]}")
+        # The suffix in another case comes before other suffixes.
         best = min(names, key=lambda other: (other.lower() != path.name.lower(), _order(other), other))
         if suffix and (read := os.path.splitext(best)[1]) != suffix:
             self._replaced[f"{read} for {suffix}"] += 1
@@ -130,10 +131,10 @@ def _order(name: str) -> int:
     return _SUFFIXES.index(os.path.splitext(name)[1].lower())
 
 
-def number(text: str, largest: float, message: str) -> float:
-    """Convert a text to a number; raise InputError with a message and the text if it is none or above `largest`."""
+def number(text: str, largest: float, message: str) -> float:  # with at most `largest` as absolute value
+    """Convert a text to a number; raise InputError with a message and the text if it is none or too large."""
     try:
-        value = float(text) if "_" not in text else math.nan
+        value = float(text) if "_" not in text else math.nan  # Python reads 1_0 as 10
     except ValueError:
         value = math.nan
     if not abs(value) <= largest:

@@ -70,7 +70,7 @@ def read_trained(path: Path) -> TrainedGaussians:
 
     An opacity of exactly 0 or 1, which converters of compressed files write as an infinite logit, becomes 0.001 or
     0.999, the largest alpha that is blended. The 3D filter of Mip-Splatting becomes a part of scales and opacities.
-    Lines on stderr say both, which columns are left out, and that a deformation network beside the file is.
+    Lines on stderr say both, and name what is not read: columns, and a deformation network beside the file.
     """
     vertices = read_vertices(path)
     names = vertices.dtype.names or ()
@@ -86,16 +86,17 @@ def read_trained(path: Path) -> TrainedGaussians:
     rest = tuple(f"f_rest_{i}" for i in range(count))
     if missing := [name for name in rest if name not in names]:
         raise InputError(f"{path}: f_rest_*: expected the numbers 0 to {count - 1}, found no '{missing[0]}'")
-    require(_VALUE * len(vertices) * (14 + count), f"{path}: {len(vertices)} Gaussians", "use a smaller file")
+    needed = _VALUE * len(vertices) * (sum(map(len, _COLUMNS.values())) + count)
+    require(needed, f"{path}: {len(vertices)} Gaussians", "use a smaller file")
     vertices = _with_finite_logits(vertices, path)
     read = {name: _table(vertices, group, path) for name, group in _COLUMNS.items()}
     if not (read["quats"].square().sum(1) > 0).all():
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
-    channels = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
+    by_channel = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
     if FILTER in names:
         _fuse(read, _table(vertices, (FILTER,), path), path)
-    higher = channels.view(len(vertices), 3, count // 3).mT.contiguous()
+    higher = by_channel.view(len(vertices), 3, count // 3).mT.contiguous()  # [N, K - 1, 3]
     return TrainedGaussians(read["means"], read["log_scales"], read["quats"], read["logits"], read["dc"], higher)
 
 
@@ -111,9 +112,9 @@ def ply_of(trained: TrainedGaussians) -> bytes:
     rest[:, : trained.rest.shape[1]] = trained.rest
     columns = [
         trained.means,
-        torch.zeros(N, 3),
+        torch.zeros(N, 3),  # normals
         trained.dc,
-        rest.mT.flatten(1),
+        rest.mT.flatten(1),  # by channel
         trained.logits[:, None],
         trained.log_scales,
         trained.quats,
@@ -150,19 +151,20 @@ def share_seen(
     the camera's pyramid of view, is at least one pixel wide, and has its mean beyond the near plane. What stands in
     front of it does not count.
     """
-    unseen = (torch.sigmoid(trained.logits) >= ALPHA_MIN).nonzero()[:, 0]
-    hidden, N = len(trained) - len(unseen), len(trained)
+    unseen = (torch.sigmoid(trained.logits) >= ALPHA_MIN).nonzero()[:, 0]  # indices of those that could be seen
+    transparent, N = len(trained) - len(unseen), len(trained)
     means, radii = trained.means.double(), 3 * trained.log_scales.double().amax(1).exp()
     for camera in cameras:
-        if 1 - (hidden + len(unseen)) / N >= enough:
+        if 1 - (transparent + len(unseen)) / N >= enough:
             break
         K, viewmat = camera.K.double(), camera.viewmat.double()
+        # For a pixel (u, v) of depth z, K (x, y, z) = (u z, v z, z): inside are 0 <= u <= width and 0 <= v <= height.
         sides = torch.stack([K[0], camera.width * K[2] - K[0], K[1], camera.height * K[2] - K[1]])
         sides = sides / sides.norm(dim=1, keepdim=True)  # [4, 3] unit normals into the pyramid
         centers, radius = means[unseen] @ viewmat[:3, :3].T + viewmat[:3, 3], radii[unseen]
         outside = (centers @ sides.T < -radius[:, None]).any(1) | (centers[:, 2] <= camera.near)
-        unseen = unseen[outside | (2 * radius * K[0, 0] < centers[:, 2])]
-    return 1 - (hidden + len(unseen)) / N
+        unseen = unseen[outside | (2 * radius * K[0, 0] < centers[:, 2])]  # or narrower than a pixel
+    return 1 - (transparent + len(unseen)) / N
 
 
 def _deformations(path: Path) -> list[Path]:
@@ -198,9 +200,10 @@ def _fuse(
         raise InputError(f"{path}: {FILTER}: expected sizes of at least 0, some are negative: export the file anew")
     scales, logits = read["log_scales"].double(), read["logits"].double()
     wider = torch.logaddexp(2 * scales, 2 * filters.double().log()) / 2
-    lower = (scales - wider).sum(1)  # ln of the factor of the opacity, at most 0
-    odds = torch.logaddexp(torch.zeros_like(logits), logits + (-torch.expm1(lower)).log())
-    read["log_scales"], read["logits"] = wider.float(), (logits + lower - odds).float()
+    lower = (scales - wider).sum(1)  # ln r, where r = sqrt(det S / det S') <= 1
+    # logit(r opacity) = logit + ln r - ln(1 + (1 - r) exp(logit))
+    correction = torch.logaddexp(torch.zeros_like(logits), logits + (-torch.expm1(lower)).log())
+    read["log_scales"], read["logits"] = wider.float(), (logits + lower - correction).float()
     print(
         f"{path}: {FILTER} of Mip-Splatting is now a part of scales and opacities; its filter of images is "
         f"raster.antialias=true",

@@ -57,7 +57,7 @@ _DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel
 DECODING = 64  # bytes per pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
 # The images of a scene are stored as floats if all together need at most this many bytes, else in 8 bits. To convert an
 # image of 800 x 800 from 8 bits takes 6 ms on one thread. With 160 x 160 it would take 0.2 ms of a step of 6 ms.
-_MOST_FLOATS = 1 << 29
+_MOST_FLOATS = 1 << 29  # bytes
 _MAX_FILE = 1 << 30  # bytes; the largest accepted image has 2^29 bytes before compression
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
@@ -101,7 +101,7 @@ def read_image(path: Path, where: str) -> bytes:
 
 
 def photo_size(data: bytes, where: str) -> Size:
-    """Return the width and height of a PNG, which is checked as by `png_size`, or of a JPEG, whose header is."""
+    """Return the width and height of a PNG, checked as by `png_size`, or of a JPEG, of which the header is checked."""
     if not data.startswith((_JPEG, _SIGNATURE)):
         raise DamagedError(
             f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it, or copy it again"
@@ -118,7 +118,7 @@ def is_turned(data: bytes) -> bool:  # of an image that was checked
     """Return whether an image has an EXIF orientation by which other programs turn or mirror it."""
     if data.startswith(_JPEG):
         with _jpeg(data, "EXIF") as image:
-            return image.getexif().get(_ORIENTATION, 1) != 1
+            return image.getexif().get(_ORIENTATION, 1) != 1  # 1: stored as it is shown
     exif = Image.Exif()
     with suppress(Exception):  # Pillow raises many types of exceptions for a damaged chunk, of which nothing is read
         exif.load(next((body for name, body in _chunks(data) if name == b"eXIf"), b""))
@@ -142,7 +142,7 @@ def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
     at = len(_SIGNATURE)
     while True:
         header = data[at : at + 8]
-        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")  # then the checksum lacks too
         body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(checksum) < 4:
             raise DamagedError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
@@ -178,7 +178,8 @@ def stays_in_8_bits(
     This is so for a large scene of 8-bit images that are not reduced.
     """
     is_8_bits = data.startswith(_JPEG) or data[_DEPTH_AT] == 8
-    return downscale == 1 and is_8_bits and 12 * count * size[0] * size[1] > _MOST_FLOATS
+    float_bytes = 3 * 4 * count * size[0] * size[1]
+    return downscale == 1 and is_8_bits and float_bytes > _MOST_FLOATS
 
 
 def count_readers(
@@ -188,7 +189,7 @@ def count_readers(
     where: str,
     pixel_bytes: int = 12,  # bytes a pixel of the reduced image
 ) -> int:
-    """Return how many threads can decode images at the same time, given the free memory and the size of all images."""
+    """Return how many threads can decode at the same time in the memory that all reduced images leave free."""
     pixels = size[0] * size[1]
     kept_bytes, decoding_bytes = count * pixel_bytes * pixels // downscale**2, DECODING * pixels
     what = f"{where}: {count} images of {size[0]}x{size[1]}, reduced {downscale} times,"
@@ -225,7 +226,7 @@ def decode_regions(data: bytes, size: Size, where: str) -> NDArray[np.uint8]:  #
 def subsample(numbers: Pixels, size: Size) -> Tensor:  # [H, W] the number of the object in each pixel -> [h, w] 8 bits
     """Reduce a mask: each pixel has the number at its centre."""
     rows, columns = (
-        (2 * np.arange(after) + 1) * before // (2 * after)
+        (2 * np.arange(after) + 1) * before // (2 * after)  # (i + 1/2) before / after, rounded down
         for before, after in zip(numbers.shape, size[::-1], strict=True)
     )
     return torch.from_numpy(numbers[rows[:, None], columns])

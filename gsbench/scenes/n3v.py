@@ -56,7 +56,7 @@ class _Film:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def decoded(self, first: int, last: int) -> Iterator[Pixels]:  # each [H, W, 3] RGB
-        """Yield frames, from 0; a video may end before its header says."""
+        """Yield the frames from `first` to `last`, counted from 0; a video may end before its header says."""
         for path in self.images[first : last + 1]:
             yield images.decode_photo(images.read_image(path, str(path)), str(path))
         if not self.images:
@@ -89,14 +89,15 @@ def load(
     films, notes = _list_films(root)
     source = root / POSES
     data = read_file(source, str(source), _MAX_POSES)
-    rows = dict(zip(films, _read_rows(data, source, films), strict=True))
+    rows = dict(zip(films, _read_rows(data, source, films), strict=True))  # of all films, also those left out
     films = _without(films, leave_out)
     first, last = _range(films, frames)
     size = images.reduced_size(films[0].size, rendition.downscale, str(films[0].path))
     needed = memory_needed(films[0].size, size, last - first + 1)
     require(needed, f"{root}: frames while they are decoded and measured", "use a larger scene.downscale")
     cameras = [_camera(film, rows[film], size, source) for film in films]
-    beside = colmap.points_beside(root)  # before frames are decoded, which takes minutes: its files may be damaged
+    # Before frames are decoded, which takes minutes, because these files may be damaged.
+    points, points_file = colmap.points_beside(root) or (None, None)
     digests = {film.path.name: film.digest() for film in films} | {POSES: files.digest(data)}
     paths = _decoded_files(root, films, digests, (first, last), rendition, size)
     by_film = [
@@ -110,17 +111,17 @@ def load(
     )
     notes.append(f"{POSES}: depths are not read; no distortion is stated")
     notes += [f"cameras left out: {', '.join(leave_out)}"] if leave_out else []
-    if beside:
-        digests[beside[1].relative_to(root).as_posix()] = files.digest(beside[1].read_bytes())
-    notes.append(f"initial points: those of {beside[1].relative_to(root)}" if beside else "initial points: random")
-    test, *train = by_film
+    if points_file:
+        digests[points_file.relative_to(root).as_posix()] = files.digest(points_file.read_bytes())
+    notes.append(f"initial points: {f'those of {points_file.relative_to(root)}' if points_file else 'random'}")
+    test, *train = by_film  # the test camera is cam00, the first
     return standard_scene(
         name=name,
         train=[view for views in zip(*train, strict=True) for view in views],  # by frame, then by camera
         val=[],
         test=test,
         background=rendition.background,
-        points=beside[0] if beside else None,
+        points=points,
         fingerprint=files.fingerprint(digests),
         notes=tuple(notes),
         up=None,
@@ -157,7 +158,7 @@ def memory_needed(
 
 
 def _camera(film: _Film, row: NDArray[np.float64], size: Size, source: Path) -> Camera:
-    """Return the camera of images of a size; raise InputError if the film's sides have two ratios to the row's."""
+    """Return the camera of a film's frames reduced to `size`; raise InputError if its row has other proportions."""
     viewmat, lens = camera_of(row, f"{source}: {film.name}")
     resized = lens.resized(*film.size)
     if resized is None:
@@ -190,22 +191,27 @@ def _list_films(root: Path) -> tuple[list[_Film], list[str]]:
     return films, notes
 
 
-def _open(name: str, path: Path) -> _Film:
+def _open_folder(camera: str, path: Path) -> _Film:
+    """Return the film of a folder of images, whose numbers must be consecutive."""
+    folder = path / "images" if (path / "images").is_dir() else path
+    numbered = sorted(
+        (int(number[0]), file)
+        for file in os.listdir(folder)
+        if (stem := files.without_suffix(file)) != file and (number := re.search(r"\d{1,9}$", stem))
+    )
+    if not numbered:
+        raise InputError(f"{folder}: expected a PNG or JPEG for each frame, with its number at the end of the name")
+    for (before, _), (after, name_after) in pairwise(numbered):
+        if after != before + 1:
+            raise InputError(f"{folder}: expected frame {before + 1} after frame {before}, got {name_after}")
+    listed = tuple(files.find_inside(folder, image, str(folder)) for _, image in numbered)
+    return _Film(camera, path, listed, len(listed), shots.size_of(listed[0], str(listed[0])))
+
+
+def _open(camera: str, path: Path) -> _Film:
     """Return a film without decoding it; raise InputError if it is no MP4 and no folder of images."""
     if path.is_dir():
-        folder = path / "images" if (path / "images").is_dir() else path
-        numbered = sorted(
-            (int(number[0]), file)
-            for file in os.listdir(folder)
-            if (stem := files.without_suffix(file)) != file and (number := re.search(r"\d{1,9}$", stem))
-        )
-        if not numbered:
-            raise InputError(f"{folder}: expected a PNG or JPEG for each frame, with its number at the end of the name")
-        for (before, _), (after, name_after) in pairwise(numbered):
-            if after != before + 1:
-                raise InputError(f"{folder}: expected frame {before + 1} after frame {before}, got {name_after}")
-        listed = tuple(files.find_inside(folder, image, str(folder)) for _, image in numbered)
-        return _Film(name, path, listed, len(listed), shots.size_of(listed[0], str(listed[0])))
+        return _open_folder(camera, path)
     if not path.is_file():
         raise InputError(f"{path}: expected a film or a folder of frames, found neither")
     try:
@@ -221,8 +227,8 @@ def _open(name: str, path: Path) -> _Film:
             for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         )
     if min(count, width, height) < 1:
-        raise InputError(f"{path}: OpenCV cannot decode this film: copy it again, or write its frames to {name}/")
-    return _Film(name, path, (), count, (width, height))
+        raise InputError(f"{path}: OpenCV cannot decode this film: copy it again, or write its frames to {camera}/")
+    return _Film(camera, path, (), count, (width, height))
 
 
 def _read_rows(data: bytes, source: Path, films: Sequence[_Film]) -> NDArray[np.float64]:  # [cameras, 17]
@@ -255,7 +261,7 @@ def _without(films: Sequence[_Film], leave_out: Sequence[str]) -> list[_Film]:
 
 
 def _range(films: Sequence[_Film], frames: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the first and the last frame; raise InputError if films differ in length, or are too short."""
+    """Return the first and the last frame; raise InputError if films are too short, or, without `frames`, differ."""
     shortest, longest = (choice(films, key=lambda film: film.count) for choice in (min, max))
     first, last = frames or (0, shortest.count - 1)
     if frames is None and shortest.count != longest.count:
@@ -278,11 +284,11 @@ def _decoded_files(
 ) -> list[Path]:
     """Return the files of the reduced frames of films; those that do not exist are written, if all fit on the disk."""
     folder, count = root / DECODED, frames[1] - frames[0] + 1
-    needed = 3 * count * size[0] * size[1]
+    needed = 3 * count * size[0] * size[1]  # bytes of a file
+    hashes = [files.digest(f"{digests[film.path.name]} {rendition.resize}".encode())[:12] for film in films]
     paths = [
-        folder / f"{film.name}_{frames[0]}-{frames[1]}_{size[0]}x{size[1]}_{content[:12]}.rgb"
-        for film in films
-        for content in [files.digest(f"{digests[film.path.name]} {rendition.resize}".encode())]
+        folder / f"{film.name}_{frames[0]}-{frames[1]}_{size[0]}x{size[1]}_{digits}.rgb"
+        for film, digits in zip(films, hashes, strict=True)
     ]
     try:
         folder.mkdir(exist_ok=True)

@@ -119,7 +119,7 @@ def _read_warps(source: Path, names: Sequence[str]) -> tuple[dict[str, int], str
 
 
 def camera_of(content: CameraFile, where: str) -> tuple[Tensor, Lens]:  # [4, 4] float64
-    """Return the viewmat and the intrinsics of a camera; raise InputError if it has skew or a third radial term."""
+    """Return the viewmat and the lens of a camera; raise InputError if it has skew or a third radial term."""
     orientation, position = np.array(content.orientation), np.array(content.position)
     cx, cy = content.principal_point
     k1, k2, k3 = content.radial_distortion

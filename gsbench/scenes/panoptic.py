@@ -71,7 +71,7 @@ def load(root: Path, rendition: Rendition) -> Scene:
     if shared := sorted(train.cameras & test.cameras):
         notes.append(f"cameras {', '.join(map(str, shared))} of test are cameras of train too")
     loaded = shots.read([*train.shots, *test.shots], rendition)
-    views = iter(loaded.views)
+    views = iter(loaded.views)  # first those of train
     paths = [shot.path.relative_to(root).as_posix() for split in splits.values() for shot in split.shots]
     digests = dict(zip(paths, loaded.digests, strict=True))
     digests |= {f"{split}_meta.json": content.digest for split, content in splits.items()}
@@ -96,7 +96,8 @@ def _read_split(root: Path, source: Path) -> _Split:
     """Read and check a file of cameras; the images are not read yet."""
     meta, digest, others = files.read_keys(_Meta, source)
     times, cameras = len(meta.fn), len((meta.fn or [[]])[0])
-    if not cameras or {*map(len, meta.fn), *map(len, meta.cam_id)} != {cameras} or len(meta.cam_id) != times:
+    row_lengths = {*map(len, meta.fn), *map(len, meta.cam_id)}
+    if not cameras or row_lengths != {cameras} or len(meta.cam_id) != times:
         raise InputError(f"{source}: fn, cam_id: expected one image and number for each camera at each time")
     if min(meta.w, meta.h) < 1:
         raise InputError(f"{source}: w, h: expected the size of the images, got {meta.w}x{meta.h}")
@@ -132,8 +133,8 @@ def _array(nested: list[Any], shape: tuple[int, ...], where: str) -> NDArray[np.
 
 def _check_pinhole(K: NDArray[np.float64], where: str) -> None:
     """Raise InputError unless [3, 3] intrinsics are those of a pinhole without skew."""
-    focal = K[0, 0], K[1, 1]
-    if min(focal) < shots.SMALLEST or any(K[[0, 1, 2, 2], [1, 0, 0, 1]]) or K[2, 2] != 1:
+    is_zero_elsewhere = not any((K[0, 1], K[1, 0], K[2, 0], K[2, 1]))
+    if min(K[0, 0], K[1, 1]) < shots.SMALLEST or not is_zero_elsewhere or K[2, 2] != 1:
         raise InputError(f"{where}: expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx and fy, got {K.tolist()}")
 
 

@@ -45,8 +45,8 @@ def standard_scene(
 ) -> Scene:
     """Return a scene whose cameras and points are in single precision, in the standard place and size."""
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
-    centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]
-    axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
+    centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]; R is rigid to 1e-4 only
+    axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)  # [C, 3] viewing directions
     visible, share = _seen_points(name, train, points)
     middle, size = place_and_size(centers, axes, visible)
     placement = _placement(middle, size)
@@ -55,9 +55,9 @@ def standard_scene(
     is_near = torch.from_numpy(_are_near(centers, size))
     lines = _notes(placement, is_near)
     if points is not None:
-        away = float((points.means.double() - torch.from_numpy(middle)).norm(dim=1).median())
+        distance = float((points.means.double() - torch.from_numpy(middle)).norm(dim=1).median())
         points = Points(placement.to_standard(points.means), points.colors.float(), points.times)
-        lines += _notes_of_points(points, share, is_far_away=away > _FAR_POINTS * size > 0)
+        lines += _notes_of_points(points, share, is_far_away=size > 0 and distance > _FAR_POINTS * size)
     return Scene(
         name=name,
         train=train,
@@ -95,18 +95,21 @@ def place_and_size(
     spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] take away what lies along an axis
     target, weights = middle, np.ones(len(centers))
-    for _ in range(_ROUNDS):  # sums of distances, not of their squares: iteratively reweighted least squares
+    # Sums of distances, not of their squares: iteratively reweighted least squares. With weights w, across P, centres c
+    # and x = target - middle, sum w P (x - (c - middle)) + pull x = 0.
+    for _ in range(_ROUNDS):
         weighted = weights[:, None, None] * across
         pull = _PULL * weights.sum()
-        left = weighted.sum(0) + pull * np.eye(3)
-        target = middle + np.linalg.solve(left, (weighted @ (centers - middle)[:, :, None]).sum(0)[:, 0])
+        matrix = weighted.sum(0) + pull * np.eye(3)
+        target = middle + np.linalg.solve(matrix, (weighted @ (centers - middle)[:, :, None]).sum(0)[:, 0])
         offsets = target - centers
-        away = np.linalg.norm(across @ offsets[:, :, None], axis=(1, 2))
-        weights = 1 / np.maximum(away, 1e-3 * np.median(np.linalg.norm(offsets, axis=1)) + 1e-300)
+        to_axis = np.linalg.norm(across @ offsets[:, :, None], axis=(1, 2))  # [C] distances
+        # An axis through the target would have an infinite weight.
+        weights = 1 / np.maximum(to_axis, 1e-3 * np.median(np.linalg.norm(offsets, axis=1)) + 1e-300)
         weights /= weights.max()
     distances = np.linalg.norm(target - centers, axis=1)
     ahead = ((target - centers) * axes).sum(1)
-    if np.median(ahead) > _AHEAD * np.median(distances) > 0:
+    if np.median(ahead) > _AHEAD * np.median(distances) > 0:  # most cameras look at the target
         return target, float(np.median(distances))
     if visible is not None and len(visible[0]):
         return np.median(visible[0], axis=0), float(np.median(visible[1]))
@@ -165,7 +168,7 @@ def _notes(placement: Placement, is_near: Tensor) -> list[str]:
 
 
 def _notes_of_points(points: Points, share: float, *, is_far_away: bool) -> list[str]:
-    """Return sentences on points of which cameras see the given share only, or which lie far away or far outside."""
+    """Return sentences on points of which cameras see a small share only, or which lie far away or far outside."""
     notes = []
     if share < _ENOUGH_SEEN:
         notes.append(f"the training cameras see {share:.1%} of the points: {_COORDINATES}")
@@ -184,7 +187,7 @@ def _seen_points(
 ) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]] | None, float]:  # ([S, 3], [S]), share
     """Return points that cameras see, once for each camera, with their depths, and the share of points that are seen.
 
-    The points are None if a data set has none.
+    Of many points, every n-th is tested. Points and depths are None if a data set has no points.
     """
     if points is None:
         return None, 1.0
@@ -209,7 +212,8 @@ def _seen_points(
 def _are_near(centers: NDArray[np.float64], size: float) -> NDArray[np.bool_]:  # [C]
     """Return which cameras are not far from the others; all if they are at one place."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    return distances <= _FAR_CAMERA * max(size, float(np.quantile(distances, 0.75)))
+    spread = float(np.quantile(distances, 0.75))  # of cameras that may be of two groups, such as the ends of a room
+    return distances <= _FAR_CAMERA * max(size, spread)
 
 
 def _text(position: tuple[float, float, float]) -> str:

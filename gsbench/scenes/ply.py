@@ -124,16 +124,16 @@ def _read_header(lines: list[str], path: Path) -> tuple[str, list[_Element], _El
 
 
 def _read_properties(
-    element: str, lines: list[list[str]], order: str, path: Path
+    element: str, lines: list[list[str]], byte_order: str, path: Path
 ) -> tuple[dict[str, str], list[list[str]]]:
-    """Return the numpy types of the properties of an element, and the lines of the header behind them."""
+    """Return the numpy types of an element's properties by their names, and the lines of the header behind them."""
     fields: dict[str, str] = {}
     for i, line in enumerate(lines):
         match line:
             case ["element", *_]:
                 return fields, lines[i:]
             case ["property", kind, name] if kind in _TYPES and name not in fields:
-                fields[name] = order + _TYPES[kind]
+                fields[name] = byte_order + _TYPES[kind]
             case _:
                 raise InputError(
                     f"{path}: element {element:.80}: expected distinct scalar properties, as far as the "
@@ -146,7 +146,7 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path, *, is
     """Parse the vertices of an ascii PLY, which `skipped` values of other elements precede."""
     count, dtype = vertices
     names, expected = dtype.names or (), skipped + vertices.values
-    # A value needs at least two bytes, so a wrong count in the header is found before memory is allocated.
+    # A value needs at least two bytes, the last but one, so a wrong count is noticed before memory is allocated.
     values = []
     if 2 * expected <= len(body) + 1:
         require(_ASCII_VALUE * expected, f"{path}: {expected} values in ascii", "write a binary PLY")
@@ -173,24 +173,25 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path, *, is
 
 
 def _check_readable(path: Path, data: bytes) -> None:
-    """Raise InputError if the bytes of a file that is no PLY, or its suffix, are of a compressed format."""
+    """Raise InputError for a checkpoint of PyTorch, and for a file whose bytes or suffix are of a compressed format."""
     if data.startswith(b"PK\x03\x04") and _PICKLE in data[:_HEAD]:
         raise refused(
             path,
             "expected a PLY of 3DGS, this file is a checkpoint of PyTorch: export a PLY with the program that wrote it",
         )
     for mark, form in _COMPRESSED.items():
-        if data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark:
+        is_of_form = data.startswith(mark) if isinstance(mark, bytes) else path.suffix.lower() == mark
+        if is_of_form:
             raise compressed(path, form)
 
 
 def columns(vertices: NDArray[np.void], names: Sequence[str], path: Path, largest: float) -> NDArray[np.float64]:
-    """Return some properties of vertices as [P, len(names)]; raise InputError for a missing one or a wrong value."""
+    """Return some properties of vertices as [P, len(names)]; raise InputError if one lacks or exceeds +-`largest`."""
     for name in names:
         if name not in (vertices.dtype.names or ()):
             raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")
     table = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
-    bad = ~(np.abs(table) <= largest)
+    bad = ~(np.abs(table) <= largest)  # NaN too
     if bad.any():
         named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
         raise InputError(

@@ -49,7 +49,7 @@ def frustum_points(
     """Draw `count` nearly grey points in the part of space that all cameras see, for a scene without known points.
 
     A point lies on the ray through a random pixel of a random camera. Its inverse depth is uniform between
-    1 / (NEAREST radius) and 1 / (FARTHEST radius).
+    1 / (NEAREST radius) and 1 / (FARTHEST radius), as then its parallax in pixels is uniform too.
     """
     K, viewmats = torch.stack([camera.K for camera in cameras]), torch.stack([camera.viewmat for camera in cameras])
     size = torch.tensor([[camera.width, camera.height] for camera in cameras])  # [C, 2]
@@ -58,10 +58,10 @@ def frustum_points(
         chosen = torch.randint(len(cameras), (count,), generator=generator)
         draws = torch.rand(count, 3, generator=generator)
         depth = radius / (draws[:, 2] * (1 / NEAREST - 1 / FARTHEST) + 1 / FARTHEST)
-        pixel = torch.cat([draws[:, :2] * size[chosen], torch.ones(count, 1)], 1)
-        inside = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3] in the camera
+        pixel = torch.cat([draws[:, :2] * size[chosen], torch.ones(count, 1)], 1)  # [count, 3] u, v, 1
+        in_camera = depth[:, None] * (K.inverse()[chosen] @ pixel[:, :, None])[..., 0]  # [count, 3]
         rotation, translation = viewmats[chosen, :3, :3], viewmats[chosen, :3, 3]
-        points = (rotation.mT @ (inside - translation)[:, :, None])[..., 0]
+        points = (rotation.mT @ (in_camera - translation)[:, :, None])[..., 0]  # [count, 3] in the world
         visible = torch.stack([is_seen(points, camera, camera.near) for camera in cameras]).all(0)
         drawn = torch.cat([drawn, points[visible]])
         if len(drawn) >= count:
@@ -79,7 +79,7 @@ def is_seen(
     near: float = 0.0,  # least depth, world units
 ) -> Tensor:  # [P] bool
     """Return which points are inside the image of a camera."""
-    x = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.to(points).T
+    x = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.to(points).T  # [P, 3] u z, v z, z
     pixel = x[:, :2] / x[:, 2:]
     return (x[:, 2] > near) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
 
@@ -154,5 +154,5 @@ def far_outside(means: Tensor) -> Tensor:  # [P, 3] -> [P] bool
     outside.
     """
     distances = (means.double() - means.double().median(0).values).norm(dim=1)
-    within = distances.kthvalue(max(1, math.ceil(0.75 * len(distances)))).values
+    within = distances.kthvalue(max(1, math.ceil(0.75 * len(distances)))).values  # radius of three quarters
     return distances > FAR * within if within > 0 else torch.zeros_like(distances, dtype=torch.bool)

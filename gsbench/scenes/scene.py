@@ -11,7 +11,7 @@ from gsbench.kernels.raster import NEAR
 UP = (0.0, 0.0, 1.0)  # in Blender's layout: D-NeRF, 7DGS-PBR, the embedded scenes
 STANDARD = 4.0  # the distance of cameras from what they look at, in the coordinates of a training; D-NeRF's
 HELD_OUT = 8  # every eighth view in the order of time is a test view, where a capture has no split
-_LEAN = 0.01  # weight of the mean up vector against cameras without roll: decides where these leave a choice
+_LEAN = 0.01  # weight w of the mean up vector in `up_of`: decides where cameras without roll leave a choice
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Camera:
         return replace(self, viewmat=self.viewmat.clone(), K=self.K.clone())
 
     def overwrite(self, other: "Camera") -> None:
-        """Write the values of another camera, with images of the same size, to the memory of this one."""
+        """Write the values of another camera, with the same size and near plane, to the memory of this one."""
         self.viewmat.copy_(other.viewmat)
         self.K.copy_(other.K)
         self.center.copy_(other.center)
@@ -79,11 +79,11 @@ class View:
 
     @property
     def target(self) -> Tensor:
-        """The image that a training loss takes, [H, W, 3]: the 8 bits of an image without alpha, otherwise `image`."""
+        """The image that a training loss takes, [H, W, 3]: `pixels` as stored if without alpha, otherwise `image`."""
         return self.pixels.to(self.camera.K.device) if self.pixels.shape[-1] == 3 else self.image
 
     def to(self, device: str) -> "View":
-        """Return a copy of the view whose tensors are on `device`."""
+        """Return a copy of the view whose tensors are on `device`, but for pixels that map a file."""
         alpha, regions = (x if x is None else x.to(device) for x in (self.composited_alpha, self.regions))
         camera, pixels = self.camera.to(device), self.pixels if self.is_on_disk else self.pixels.to(device)
         return replace(self, camera=camera, pixels=pixels, composited_alpha=alpha, regions=regions)
@@ -112,7 +112,7 @@ class Placement:
 
     @property
     def float_step(self) -> float:
-        """Return the distance of neighbouring floats at the scene, in units of the cameras' distance."""
+        """Return the distance of neighbouring float32 numbers at the centre, in units of the cameras' distance."""
         return 2**-23 * max(map(abs, self.center)) / (self.unit * STANDARD)
 
     def to_standard(self, positions: Tensor) -> Tensor:  # [.., 3] in the user's coordinates -> [.., 3] float32
@@ -132,6 +132,7 @@ class Placement:
         viewmat: Tensor,  # [4, 4] float64, world to camera in the user's coordinates
     ) -> Tensor:  # [4, 4] float32
         """Convert a world-to-camera matrix: its rotation stays, and the camera moves as positions do."""
+        # R (unit x + center) + t = unit (R x + (t + R center) / unit)
         moved = viewmat.double().clone()
         moved[:3, 3] += moved[:3, :3] @ moved.new_tensor(self.center)
         moved[:3, 3] /= self.unit
@@ -161,7 +162,7 @@ class Scene:
         return all(view.time is not None for view in self.train)
 
     def with_near(self, near: float) -> "Scene":  # in the user's units
-        """Return a copy of the scene whose cameras have a near plane."""
+        """Return a copy of the scene in which the near plane of all cameras is `near`."""
         depth = self.placement.near_to_standard(near)
         train, val, test = (
             [replace(view, camera=replace(view.camera, near=depth)) for view in views]
@@ -199,8 +200,7 @@ def to_floats(pixels: Tensor) -> Tensor:  # [..] floats in [0, 1] or 8 bits
     """Return the values of an image in [0, 1]; those of 8 bits are divided by 255."""
     if pixels.is_floating_point():
         return pixels
-    # The divisor is a tensor, because a GPU would replace a division by a number by a product, which rounds
-    # differently.
+    # The divisor is a tensor, because a GPU would multiply by the rounded 1/255 instead of dividing by a number.
     return pixels.float().div_(torch.full((), 255.0, device=pixels.device))
 
 
@@ -211,7 +211,7 @@ def scene_extent(viewmats: Tensor) -> float:  # [C, 4, 4] the training cameras
     clone and split are multiples of the extent.
     """
     rotations, translations = viewmats[:, :3, :3].double(), viewmats[:, :3, 3].double()
-    centers = -torch.einsum("cji,cj->ci", rotations, translations)
+    centers = -torch.einsum("cji,cj->ci", rotations, translations)  # [C, 3] -R^T t
     return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
 
 
@@ -220,13 +220,14 @@ def up_of(viewmats: Tensor) -> tuple[float, float, float]:  # [C, 4, 4] the trai
 
     The mean of the cameras' up vectors leans towards the scene if the cameras look down and stand on one side of it.
     Cameras without roll have level x axes r_i, so the result is the unit vector u along (mean r_i r_i^T + w I)^-1 m,
-    where m is the mean up vector and w is small: level to all r_i, and in the plane that they leave free along m.
+    where m is the mean up vector and w is small. Before it is normalised, u minimises mean (r_i u)^2 + w |u|^2 - 2 m u:
+    it is level to all r_i, and in the plane that they leave free along m.
     """
     rotations = viewmats[:, :3, :3].double()
-    right, mean_up = rotations[:, 0], -rotations[:, 1].mean(0)
-    spread = right.T @ right / len(right) + _LEAN * torch.eye(3, dtype=torch.float64)
-    if float(mean_up.norm()) < _LEAN:  # the cameras stand every way
+    right, mean_up = rotations[:, 0], -rotations[:, 1].mean(0)  # [C, 3] and [3], as rows are camera axes and y is down
+    matrix = right.T @ right / len(right) + _LEAN * torch.eye(3, dtype=torch.float64)
+    if float(mean_up.norm()) < _LEAN:  # the up vectors cancel, so that they say nothing
         return UP
-    up = torch.linalg.solve(spread, mean_up)
+    up = torch.linalg.solve(matrix, mean_up)
     x, y, z = (up / up.norm()).tolist()
     return x, y, z

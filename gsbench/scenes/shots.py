@@ -51,6 +51,7 @@ class Lens:
             return self
         ratio = max(self.width / width, width / self.width)
         is_exact = width * self.height == height * self.width
+        # Pixels by which a side differs from that of one ratio; either side may have been rounded.
         off = min(abs(self.height * width / self.width - height), abs(self.width * height / self.height - width))
         if not is_exact and not (ratio > _LEAST_RATIO and off < 1):
             return None
@@ -82,11 +83,12 @@ class Lens:
             x, y = cv2.initUndistortRectifyMap(
                 self.K - _HALF, np.array(self.distortion), np.eye(3), K, size, cv2.CV_32FC1
             )
+            # Strong distortion gives OpenCV a mirrored camera, or pixels that the image does not have.
             inside = [(at >= -_OUTSIDE) & (at <= n - 1 + _OUTSIDE) for at, n in zip((x, y), size, strict=True)]
             if K[0, 0] > 0 and K[1, 1] > 0 and all(part.all() for part in inside):
                 return cv2.remap(pixels, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
         except cv2.error:
-            pass
+            pass  # is the same error
         raise InputError(
             f"{where}: OpenCV cannot undo the distortion k1 k2 p1 p2 = {self.distortion}: undo it by "
             "`colmap image_undistorter`"
@@ -157,7 +159,7 @@ def read(
     if in_8_bits is None:
         in_8_bits = rendition.resize is None and images.stays_in_8_bits(data, size, len(shots), downscale)
 
-    def read_one(shot: Shot) -> tuple[View, str, bool, bool]:
+    def read_one(shot: Shot) -> tuple[View, str, bool, bool]:  # view, SHA-256, has an orientation, is opaque
         data = images.read_image(shot.path, shot.where)
         decoded = decode(shot, data)
         lens = _lens_of_image((decoded.shape[1], decoded.shape[0]), size, shot)
@@ -167,16 +169,17 @@ def read(
                 "`colmap image_undistorter`"
             )
         pixels = lens.undistort(decoded, shot.where)
-        is_kept = in_8_bits and pixels.dtype == np.uint8
-        image = torch.from_numpy(pixels) if is_kept else images.composite(pixels, rendition, reduced)
+        is_stored = in_8_bits and pixels.dtype == np.uint8
+        image = torch.from_numpy(pixels) if is_stored else images.composite(pixels, rendition, reduced)
         K = np.diag([reduced[0] / size[0], reduced[1] / size[1], 1]) @ lens.pinhole()
         camera = Camera(shot.viewmat, torch.from_numpy(K.astype(np.float32)), image.shape[1], image.shape[0])
-        alpha = None if is_kept else images.alpha_of(decoded, reduced)
+        alpha = None if is_stored else images.alpha_of(decoded, reduced)
         regions = None if shot.mask is None else _read_mask(shot, shot.mask, lens, reduced)
         view = View(shot.name, camera, shot.time, image, rendition.background, alpha, regions)
         return view, files.digest(data), images.is_turned(data), decoded.shape[2] == 3
 
-    pixel_bytes = (4 if in_8_bits else 13) + any(shot.mask is not None for shot in shots)  # with alpha and mask
+    # RGBA, or three floats and alpha; and a mask
+    pixel_bytes = (4 if in_8_bits else 3 * 4 + 1) + any(shot.mask is not None for shot in shots)
     threads = images.count_readers(size, len(shots), downscale, first.where, pixel_bytes)
     with images.quiet_opencv(), ThreadPoolExecutor(threads) as pool:
         views, digests, turned, opaque = zip(*pool.map(read_one, shots), strict=True)
@@ -216,9 +219,9 @@ def _lens_of_image(size: Size, expected: Size, shot: Shot) -> Lens:
 def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> list[str]:
     """Return sentences on images that are resized, and on sizes that `downscale` does not divide."""
     notes = []
-    cameras = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
-    if cameras:
-        stated = f"{cameras[0][0]}x{cameras[0][1]}"
+    other_sizes = sorted({(shot.lens.width, shot.lens.height) for shot in shots} - {size})
+    if other_sizes:
+        stated = f"{other_sizes[0][0]}x{other_sizes[0][1]}"
         notes.append(
             f"images of {size[0]}x{size[1]} are resized from those of their camera, {stated}, "
             "whose intrinsics are scaled with them"
@@ -232,7 +235,7 @@ def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> 
 
 
 def _read_mask(shot: Shot, path: Path, lens: Lens, size: Size) -> Tensor:  # [H, W] 8 bits
-    """Read and undistort the mask of an image: a PNG with the number of the object in each pixel."""
+    """Read, undistort and reduce the mask of an image: a PNG with the number of the object in each pixel."""
     where = f"{path} (the mask of {shot.name}{shot.path.suffix}; without its folder a scene has no regions)"
     numbers = images.decode_regions(images.read_image(path, where), (lens.width, lens.height), where)
     return images.subsample(lens.undistort(numbers, where, cv2.INTER_NEAREST), size)

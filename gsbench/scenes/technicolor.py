@@ -74,14 +74,14 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
-    points = colmap.points_beside(root)
+    points, _ = colmap.points_beside(root) or (None, None)
     return standard_scene(
         name=root.name,
         train=train,
         val=[],
         test=test,
         background=rendition.background,
-        points=points[0] if points else None,
+        points=points,
         fingerprint=files.fingerprint(digests),
         repaired=tuple(image.path.stem for image in replaced),
         up=None,
@@ -120,7 +120,7 @@ def _read_rows(text: str, source: Path) -> list[dict[str, float]]:
 
 
 def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:
-    """Return the viewmat [4, 4] and the intrinsics of a row of the table, for images of a size."""
+    """Return the viewmat [4, 4] and the lens of a row, by the names of COLUMNS, for images of a size."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()  # scipy: w last
     viewmat[:3, 3] = row["tx"], row["ty"], row["tz"]
@@ -130,16 +130,16 @@ def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:
     """List the image files, sorted by frame and then camera; raise InputError if an image is missing."""
-    by_number: dict[tuple[int, int], Path] = {}
+    by_number: dict[tuple[int, int], Path] = {}  # by frame and camera
     scenes = set()
     for path in sorted(root.glob("*.png")):
         name = IMAGE.fullmatch(path.name)
         if name is None:
             continue
         scenes.add(name["scene"])
-        key = int(name["frame"]), int(name["camera"])
-        if frames is None or frames[0] <= key[0] <= frames[1]:
-            by_number[key] = files.find_inside(root, path.name, str(root))
+        frame, camera = int(name["frame"]), int(name["camera"])
+        if frames is None or frames[0] <= frame <= frames[1]:
+            by_number[frame, camera] = files.find_inside(root, path.name, str(root))
     if len(scenes) > 1:
         raise InputError(f"{root}: expected images of one scene, got those of {', '.join(sorted(scenes))[:120]}")
     numbers = sorted({frame for frame, _ in by_number}) if frames is None else range(frames[0], frames[1] + 1)
@@ -209,7 +209,7 @@ def _read_views(
         for image in listed
     ]
 
-    def decode(shot: Shot, data: bytes) -> images.Pixels:
+    def decode(shot: Shot, data: bytes) -> images.Pixels:  # the image before in place of a damaged one
         image = by_path[shot.path]
         if image not in replaced:
             return _decode(image, data)
@@ -221,7 +221,10 @@ def _read_views(
         raise InputError(f"data.repair: expected a damaged image, {image.path} is whole: leave it out")
 
     loaded = shots.read(listed_shots, rendition, in_8_bits=rendition.downscale == 1, decode=decode)
-    names = [f"{i.path.name} replaced by {replaced[i].path.name}" if i in replaced else i.path.name for i in listed]
+    names = [image.path.name for image in listed]
+    for i, image in enumerate(listed):
+        if image in replaced:
+            names[i] += f" replaced by {replaced[image].path.name}"
     return loaded.views, dict(zip(names, loaded.digests, strict=True)), loaded.notes
 
 

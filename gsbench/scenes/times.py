@@ -35,6 +35,7 @@ _SHORT = 0.5  # times in [0, 1] that cover less may be in another unit
 _FEW = 0.1  # a file whose times lie in [0, 1], a smaller share of all times than this, has another unit than the others
 _WHOLE = re.compile(r"(?:(?<![^=/_])-)?[0-9]+")  # "-" is a sign at the start and after = / _
 _DECIMAL = re.compile(_WHOLE.pattern + r"(?:\.[0-9]+(?:[eE][-+][0-9]{1,2}(?![0-9]))?)?")
+# Groups: H M S hours, minutes, seconds; f, g digits of the fraction, g only behind a point; Y m D the date; c, d repeat
 _CLOCK = (
     r"(?P<H>[01]\d|2[0-3])(?P<c>{})(?P<M>[0-5]\d)(?P=c)(?P<S>[0-5]\d)"
     r"(?:[-_.,]?(?P<f>\d{{3}}|\d{{6}}|\d{{9}})|[.,](?P<g>\d{{1,9}}))?(?!\d)"
@@ -129,7 +130,7 @@ def places_of(
 
 
 def of_images(root: Path, images: NamedImages) -> tuple[Times, dict[str, str]]:
-    """Return the times from times.csv in `root`, if it exists, otherwise from names; and its SHA-256 by its name."""
+    """Return the times from times.csv in `root` and its SHA-256 by its name; without it those from names, and {}."""
     path = table_of(root)
     if path is None:
         return of_names(images), {}
@@ -148,7 +149,7 @@ def of_names(images: NamedImages) -> Times:
     columns, none = _columns(images), [None] * len(images.names)
     changing = [column for column in columns if len(set(column.values)) > 1]
     if not changing:
-        if columns:
+        if columns:  # all numbers are equal: then no camera may have two images
             check_distinct(images, [Fraction(0)] * len(images.names), images.source)
         why = "the numbers in the names do not change" if columns else "the names have no numbers"
         return Times([*none], [f"times: none, as {why} and there is no {TABLE}"])
@@ -183,13 +184,14 @@ def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of
     for line, row in filled[1:]:
         cells = dict(zip(columns, row, strict=False))
         name, text = cells.get("name", ""), cells.get("time", "")
-        if len(row) < len(columns) or any(row[len(columns) :]) or not name or name in table:
+        is_whole = len(row) >= len(columns) and not any(row[len(columns) :])  # empty cells may follow
+        if not is_whole or not name or name in table:
             raise InputError(f"{path}: line {line}: expected a name, once, and its time, got {','.join(row)[:60]!a}")
         table[name] = _exact(text.replace(",", ".") if separator == ";" else text, f"{path}: line {line}")
-    loose: dict[str, list[str]] = defaultdict(list)
+    by_loose: dict[str, str] = {}
     for name in table:
-        loose[_loose(name)].append(name)
-    used = [name if name in table else next(iter(loose.get(_loose(name), [""]))) for name in images.names]
+        by_loose.setdefault(_loose(name), name)
+    used = [name if name in table else by_loose.get(_loose(name), "") for name in images.names]  # "": no row
     missing = next((name for name, row in zip(images.names, used, strict=True) if not row), None)
     if missing is not None:
         raise InputError(
@@ -246,7 +248,7 @@ def check_distinct(
     """Raise InputError if two images of a fixed camera have the same time."""
     first: dict[tuple[Hashable, float | Fraction], str] = {}
     for name, time, place in zip(images.names, times, images.places, strict=True):
-        other = name if time is None else first.setdefault((place, time), name)
+        other = name if time is None else first.setdefault((place, time), name)  # the first image there and then
         if other != name:
             raise InputError(
                 f"{source}: images {other[:80]!a} and {name[:80]!a}: expected different times, as their "
@@ -270,6 +272,7 @@ def _columns(images: NamedImages) -> list[_Column]:
     columns = [
         _Column(tuple(row[at] for row in numbers), len(numbers[0]) + at + 1, len(numbers[0])) for at in range(-least, 0)
     ]
+    # Names may have more numbers before those that all have, if the texts between those are the same in all names.
     if len({len(row) for row in numbers}) > 1 and any(len({n.label for n in column.numbers}) > 1 for column in columns):
         few, many = (
             next(name for name, row in zip(names, numbers, strict=True) if len(row) == count)
@@ -304,7 +307,7 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
             is_moment = moment is not None and (start, end) == moment.span()
             value = (
                 _seconds(moment, source)
-                if is_moment and moment
+                if moment and is_moment
                 else _exact(name[start:end], f"{source}: image {name[start:end][:40]}")
             )
             of_name.append(_Number(value, label, is_moment))
@@ -323,7 +326,10 @@ def _spans(name: str, moment: re.Match[str] | None, pattern: re.Pattern[str]) ->
 
 
 def _have_decimals(names: Sequence[str]) -> bool:
-    """Return whether a point between digits is a decimal point: 1.9 and 1.10 are numbers 9 and 10 of a take 1."""
+    """Return whether a point between digits is a decimal point, and not, as in 1.9 and 1.10, one between two numbers.
+
+    Decimals are written with as many digits in all names, or without zeros at their ends.
+    """
     decimals = [part for name in names for part in re.findall(r"[0-9]\.([0-9]+)", name)]
     return len({len(part) for part in decimals}) < 2 or not any(len(part) > 1 and part[-1] == "0" for part in decimals)
 
@@ -331,10 +337,10 @@ def _have_decimals(names: Sequence[str]) -> bool:
 def _seconds(moment: re.Match[str], source: Path) -> Fraction:
     """Return a date and time of day, or a time of day, in seconds."""
     fields = moment.groupdict()
-    digits = fields.get("f") or fields.get("g") or ""
+    digits = fields.get("f") or fields.get("g") or ""  # of the fraction of a second
     fraction = Fraction(int(digits or 0), 10 ** len(digits))
     try:
-        year, month, day = (int(fields.get(key) or 1) for key in "YmD")
+        year, month, day = (int(fields.get(key) or 1) for key in "YmD")  # any day, if the names have none
         days = date(year, month, day).toordinal()
     except ValueError:
         raise InputError(
@@ -362,7 +368,7 @@ def _time_among(changing: list[_Column], images: NamedImages) -> _Column | None:
     """
     candidates = [column for column in changing if _changes_at_a_place(column, images.places)]
     if not candidates:
-        if images.has_fixed_camera:  # its images have equal numbers
+        if images.has_fixed_camera:  # its images have equal numbers, which is refused
             check_distinct(images, [Fraction(0)] * len(images.names), images.source)
         candidates = [column for column in changing if not column.words & {*_CAMERA_WORDS}]
         if not candidates:
@@ -374,7 +380,7 @@ def _time_among(changing: list[_Column], images: NamedImages) -> _Column | None:
         named = [column for column in candidates if column.words <= {*_TIME_WORDS}]
         candidates = named if len(named) == 1 else _steadiest(candidates, changing, images)
     if len(candidates) == 1:
-        candidates += _chapters(candidates[0], changing, images)
+        candidates += _chapters(candidates[0], changing, images)  # then no number alone is the time
     if len(candidates) == 1:
         return candidates[0]
     first_values = ", ".join(f"{float(column.values[0]):.10g}" for column in candidates)
@@ -412,21 +418,24 @@ def _steadiest(candidates: list[_Column], changing: list[_Column], images: Named
         least = step * (_CLEARLY**2 if has_fewer else _CLEARLY)
         if len(moving) == 1 or least < moving[1][0]:
             return [best]
-    orders = [column.order for column in candidates]
+    have_one_order = all(column.order == candidates[0].order for column in candidates)
     decimal = [column for column in candidates if any(value.denominator > 1 for value in column.values)]
-    return decimal if not moving and len(decimal) == 1 and orders.count(orders[0]) == len(orders) else candidates
+    return decimal if not moving and have_one_order and len(decimal) == 1 else candidates
 
 
 def _step(column: _Column, others: list[_Column], images: NamedImages) -> float | None:
-    """Return by how much poses change on average from one number to the next while the rest of the name stays."""
+    """Return by how much poses change on average from one number to the next while the rest of the name stays.
+
+    None: no two names differ in this number alone.
+    """
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for i, name in enumerate(images.names):
         groups[(re.sub("[0-9]+", "#", name), *(other.values[i] for other in others))].append(i)
-    values, lengths = column.values, []
+    values, distances = column.values, []
     for group in groups.values():
         ordered = sorted(group, key=values.__getitem__)
-        lengths += [_distance(images, a, b) for a, b in pairwise(ordered)]
-    return sum(lengths) / len(lengths) if lengths else None
+        distances += [_distance(images, a, b) for a, b in pairwise(ordered)]
+    return sum(distances) / len(distances) if distances else None
 
 
 def _distance(images: NamedImages, a: int, b: int) -> float:
@@ -445,8 +454,9 @@ def _chapters(column: _Column, changing: list[_Column], images: NamedImages) -> 
         return []
     chapters = []
     for other in others:
-        order = sorted(column.order, key=other.values.__getitem__)
+        order = sorted(column.order, key=other.values.__getitem__)  # by chapter, then by number
         jumps = [_distance(images, a, b) for a, b in pairwise(order) if other.values[a] != other.values[b]]
+        # The number begins anew in a chapter.
         repeats = len({(other.values[i], column.values[i]) for i in order}) > len(set(column.values))
         if repeats and sum(jumps) < _CLEARLY * step * len(jumps):
             chapters.append(other)
@@ -456,7 +466,7 @@ def _chapters(column: _Column, changing: list[_Column], images: NamedImages) -> 
 def _relative(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 4, 4] -> [N, 12]
     """Return rotations, and positions relative to the radius of the cameras, so that a scene's unit does not matter."""
     rotations = viewmats[:, :3, :3]
-    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
+    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])  # -R^T t
     centers -= centers.mean(0)
     radius = np.linalg.norm(centers, axis=1).max() or 1.0
     return np.concatenate([rotations.reshape(-1, 9), centers / radius], 1)
@@ -483,5 +493,5 @@ def _described(column: _Column, names: Sequence[str]) -> str:
 
 
 def _loose(name: str) -> str:
-    """Return the name of an image without suffix, without the folder of the images, and with / for backslashes."""
+    """Return the name of an image without suffix, without the folder images/, and with / for backslashes."""
     return without_suffix(name.replace("\\", "/").removeprefix("./").removeprefix("images/"))

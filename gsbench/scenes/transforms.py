@@ -62,7 +62,7 @@ class Intrinsics:
         """Return the camera of an image of width x height pixels; it has another size if the file states both sides."""
         width, height = size
         if None not in self.size:
-            width, height = (round(side or 0) for side in self.size)
+            width, height = (round(side or 0) for side in self.size)  # or 0: for mypy
         for key, stated, actual in zip("wh", self.size, (width, height), strict=True):
             if stated is not None and stated != actual:
                 raise InputError(
@@ -70,7 +70,7 @@ class Intrinsics:
                     "intrinsics with it, or write both w and h"
                 )
         fx, fy = (self._focal(axis, side) for axis, side in enumerate((width, height)))
-        fx, fy = fx or fy or 0.0, fy or fx or 0.0
+        fx, fy = fx or fy or 0.0, fy or fx or 0.0  # _read_intrinsics demands one; both are equal then
         if self.y_of_file and abs(fx - fy) > _AGREE * fx:
             raise InputError(
                 f"{self.where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
@@ -294,8 +294,7 @@ def _viewmat(
         raise InputError(f"{where}: expected 4 rows of 4 numbers, got {_brief(matrix)}")
     c2w: NDArray[np.float64] = np.array([[_number(value, where) for value in row] for row in rows])
     shots.check_rigid(c2w, where, "camera-to-world")
-    rotation = c2w[:3, :3]
-    turned = rotation * [1, -1, -1]
+    turned = c2w[:3, :3] * [1, -1, -1]  # the columns are the camera's axes; y and z are reversed
     viewmat = np.eye(4)
     viewmat[:3, :3] = turned.T
     viewmat[:3, 3] = -turned.T @ c2w[:3, 3]
@@ -307,6 +306,7 @@ def _times(splits: list[Split]) -> tuple[list[list[float | None]], list[str]]:
     _check_all_or_none(splits)
     if splits[0].frames[0].time is None:
         return [[None] * len(split.frames) for split in splits], []
+    # or 0.0: for mypy, as all have a time
     fields = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits}
     for split in splits:
         times.check_distinct(_named_images(split), fields[str(split.source)], split.source, _OWN_TIMES)
@@ -363,7 +363,9 @@ def _split_views(
     by_split: list[list[View]] = []
     for key, names in zip(_SPLITS, lists, strict=True):
         where, of_split = f"{split.source}: {key}", dict[int, View]()
-        for name in [] if names is None else names if isinstance(names, list) else [names]:
+        if not isinstance(names, list):
+            names = [] if names is None else [names]  # a single value is read as a list of one, or refused
+        for name in names:
             view = by_path.get(finder.find(name, where)) if isinstance(name, str) else None
             if view is None:
                 raise InputError(f"{where}: expected file_path of frames, got {_brief(name)}: add its frame")
@@ -387,6 +389,7 @@ def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], sourc
     field of view along this axis, and the reverse.
     """
     of_frame = _LENS_KEYS & frame.keys()
+    # A key of the frame replaces both keys of its axis.
     replaced = {key for axis in _AXES if of_frame & {*axis} for key in axis} | of_frame
     merged = {key: content[key] for key in _LENS_KEYS & content.keys() - replaced} | {
         key: frame[key] for key in of_frame
@@ -408,14 +411,14 @@ def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], sourc
     for _, key in _AXES:
         if key in values and not 1e-6 < values[key] < math.pi:
             raise InputError(f"{where}: {key}: expected radians between 0 and pi, got {values[key]}")
-    x, y = ({*axis} for axis in _AXES)
+    x_keys, y_keys = ({*axis} for axis in _AXES)
     return Intrinsics(
         where,
         focal=(values.get("fl_x"), values.get("fl_y")),
         angle=(values.get("camera_angle_x"), values.get("camera_angle_y")),
         principal=(values.get("cx"), values.get("cy")),
         size=(values.get("w"), values.get("h")),
-        y_of_file=bool(of_frame & x and not of_frame & y and y & content.keys()),
+        y_of_file=bool(of_frame & x_keys and not of_frame & y_keys and y_keys & content.keys()),
     )
 
 
