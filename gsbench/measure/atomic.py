@@ -64,7 +64,8 @@ def create_atomically(path: Path, data: bytes) -> bool:
         try:
             os.link(temporary, path)
         except FileExistsError:
-            return temporary.stat().st_nlink == 2  # NFS may have made the link although its reply was lost
+            # True if the other name is `path`: NFS may have made the link although its reply was lost.
+            return temporary.stat().st_nlink == 2
         except OSError as error:
             if error.errno not in WITHOUT_LINKS:
                 raise
@@ -85,7 +86,7 @@ def _remove(temporary: Path) -> None:
 
 def name_file(error: OSError, path: Path) -> None:
     """Name a file in an error: that of a full disk has no name, and a user does not know the temporary file."""
-    if error.errno:
+    if error.errno:  # not of Python's own, such as UnsupportedOperation
         error.filename = str(path)
         del error.filename2  # None would be printed
 

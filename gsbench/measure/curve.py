@@ -52,7 +52,7 @@ class Curve:
         return max((p for p in reversed(self.points) if p.psnr_val is not None), key=_rank, default=None)
 
     def equal_to(self, iteration: int) -> list[Point]:
-        """Return the evaluations between which PSNR cannot decide: that of an iteration, and all with the same PSNR."""
+        """Return the evaluations between which PSNR cannot decide: that of an iteration, and all of the same rank."""
         ranks = {_rank(p) for p in self.points if p.iteration == iteration}
         return [p for p in self.points if _rank(p) in ranks]
 

@@ -38,11 +38,12 @@ NAMES = ("flicker", "static_drift", "flicker_truth")
 class Film:
     """The frames of one camera, of which one at a time is added; only numbers of static pixels and one row are kept."""
 
-    def __init__(self, frames: int, still: Mask) -> None:  # [H, W]
+    def __init__(self, frames: int, still: Mask) -> None:  # number of frames; [H, W] the static pixels
         self.frames = frames
         self.still = still
         self._still = torch.from_numpy(still)
-        self._row = int((~still).sum(1).argmax()) or len(still) // 2  # with the most movement
+        # The row of the picture: the one with the most movement; the middle one if that is the first, or none moves
+        self._row = int((~still).sum(1).argmax()) or len(still) // 2
         self._before: tuple[Tensor, Tensor] | None = None  # error and truth of the static pixels, [P, 3]
         self._changes: list[tuple[float, float]] = []  # mean absolute changes of both
         self._drift = torch.zeros(())  # [P, 3], the mean error of the last third minus that of the first third
@@ -56,7 +57,7 @@ class Film:
             error, image = ((b - a).abs().mean() for a, b in zip(self._before, now, strict=True))
             self._changes.append((float(error), float(image)))
         i, third = len(self._rows), self.frames // 3
-        sign = (i >= self.frames - third) - (i < third)
+        sign = (i >= self.frames - third) - (i < third)  # 1 in the last third, -1 in the first, else 0
         self._drift = self._drift + sign * now[0] / third
         self._before = now
         self._rows.append((render[self._row], truth[self._row]))
@@ -70,7 +71,7 @@ class Film:
     def picture(self) -> Pixels:
         """Return a picture of one row of pixels over time, which runs down: render, truth and error."""
         render, truth = (torch.stack(rows).numpy() for rows in zip(*self._rows, strict=True))
-        repeats = -(-LEAST_HEIGHT // len(render))
+        repeats = -(-LEAST_HEIGHT // len(render))  # rounded up
         return strip([(render.repeat(repeats, 0), truth.repeat(repeats, 0))])
 
 
@@ -104,8 +105,10 @@ class FlickerScores:
 
     def metrics(self) -> dict[str, float | None]:
         """Return the means over films; None without one."""
-        scores = [film.scores for film in self.films]
-        return dict(zip(NAMES, map(fmean, zip(*scores, strict=True)), strict=True)) if scores else dict.fromkeys(NAMES)
+        if not self.films:
+            return dict.fromkeys(NAMES)
+        by_metric = zip(*(film.scores for film in self.films), strict=True)
+        return dict(zip(NAMES, map(fmean, by_metric), strict=True))
 
     def missing(self) -> dict[str, str]:
         """Return the reasons why a metric is None."""

@@ -38,7 +38,7 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
     for image in (image for pair in pairs for image in pair):
         if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
             raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
-    factor = -(-LEAST_WIDTH // shape[1])
+    factor = -(-LEAST_WIDTH // shape[1])  # rounded up
     picture = [_header(shape[1] * factor)]
     gap = np.full((GAP, picture[0].shape[1], 3), GREY, np.uint8)
     for render, truth in pairs:
@@ -105,7 +105,10 @@ def in_a_row(images: list[Pixels], factor: int) -> Pixels:
 
 
 def _header(width: int) -> Pixels:
-    """Return the header of a comparison image: the titles of three columns of `width` pixels, and the error scale."""
+    """Return the header of a comparison image: the titles of three columns of `width` pixels, and the error scale.
+
+    Titles are above the scale, at rows 26 to 38, which leaves 16 pixels for its label on the left and 64 on the right.
+    """
     header = np.full((HEADER, 3 * width + 2 * GAP, 3), 255, np.uint8)
     titles = ("render", "ground truth", "absolute error, mean of RGB")
     for column, title in enumerate(titles):

@@ -28,9 +28,9 @@ class BackboneMissing(Exception):  # noqa: N818  # not an error: the column stay
 
 def _alexnet() -> nn.Sequential:
     """Return the convolutional layers of torchvision's AlexNet, up to the last ReLU."""
-    relu, pool = nn.ReLU(), nn.MaxPool2d(3, 2)
+    relu, pool = nn.ReLU(), nn.MaxPool2d(3, stride=2)
     return nn.Sequential(
-        *(nn.Conv2d(3, 64, 11, 4, 2), relu, pool),
+        *(nn.Conv2d(3, 64, 11, stride=4, padding=2), relu, pool),
         *(nn.Conv2d(64, 192, 5, padding=2), relu, pool),
         *(nn.Conv2d(192, 384, 3, padding=1), relu),
         *(nn.Conv2d(384, 256, 3, padding=1), relu),
@@ -99,6 +99,7 @@ class Perceptual(nn.Module):
         self.trunk.load_state_dict(trunk)
         self.taps = backbone.taps
         self.linear = nn.ParameterList(linear)
+        # ImageNet's means and standard deviations, of images in [-1, 1]
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
         self.requires_grad_(False)
@@ -110,7 +111,7 @@ class Perceptual(nn.Module):
         for i, layer in enumerate(self.trunk):
             x = layer(x)
             if i in self.taps:
-                tapped.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+                tapped.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))  # as in the lpips package
         return tapped
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:  # [B, 3, H, W] in [-1, 1], each

@@ -74,9 +74,9 @@ def running_commit() -> str | None:
 def git_commit() -> str | None:
     """Return the git commit of gsbench's checkout, with the suffix "-dirty" if code was changed or added.
 
-    If git cannot say whether it was, the suffix is there too. Changed results and documents do not count, because they
-    change no measurement. Of new files, those in gsbench and conf count unless git ignores them: a run may read them.
-    Return None if git does not track this file, for instance if gsbench was installed from a wheel.
+    If git cannot say whether code was changed, the suffix is there too. Changed results and documents do not count,
+    because they change no measurement. Of new files, those in gsbench and conf count unless git ignores them: a run may
+    read them. Return None if git does not track this file, for instance if gsbench was installed from a wheel.
     """
     here = Path(__file__)
     if _git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
@@ -84,7 +84,8 @@ def git_commit() -> str | None:
     head = _git(here.parent, "rev-parse", "HEAD")
     changed = _git(here.parent, "diff", "--name-only", "HEAD", "--", ":/", *(f":(top,exclude){x}" for x in NO_CODE))
     added = _git(here.parent, "ls-files", "--others", "--exclude-standard", "--", ":/gsbench", ":/conf")
-    return f"{head}-dirty" if head is not None and (changed, added) != ("", "") else head
+    is_clean = (changed, added) == ("", "")  # None: git failed
+    return head if head is None or is_clean else f"{head}-dirty"
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

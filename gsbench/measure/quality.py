@@ -155,6 +155,7 @@ def lpips(a: Tensor, b: Tensor, backbone: str = "alex", weights: Path | None = N
 def quantise(image: Tensor) -> Tensor:  # [..., 3]
     """Round an image to the values in [0, 1] that an 8-bit PNG can store."""
     check_tensor(image, "quantise: the image")
+    # The clamped, the multiplied and the rounded image are in memory at the same time.
     require(3 * image.element_size() * image.numel(), f"quantise: images {list(image.shape)}", "use smaller ones")
     return (image.clamp(0, 1) * 255).round() / 255
 
@@ -235,13 +236,13 @@ def evaluate(
 
 
 def _images(a: Tensor, b: Tensor, least_side: int, what: str) -> tuple[Tensor, Tensor]:
-    """Convert two images to float64 and clamp them to [0, 1].
+    """Convert two images to float64 and clamp them to [0, 1]; a metric needs memory for about eight such images.
 
     Raises:
         InputError: the arguments are not images of the same size.
     """
     _check_images(a, b, least_side, what)
-    require(64 * a.numel(), f"{what}: two images {list(a.shape)}", "use smaller ones")
+    require(8 * 8 * a.numel(), f"{what}: two images {list(a.shape)}", "use smaller ones")
     return a.detach().double().clamp(0, 1), b.detach().double().clamp(0, 1)
 
 

@@ -293,10 +293,10 @@ def write(record: Record, path: Path) -> None:
         InputError: the record is not valid; the message names the field.
     """
     try:
-        plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))
+        plain = json.loads(json.dumps(dataclasses.asdict(_without_non_finite(record))))  # tuples become lists
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: expected a record of plain JSON values: {error}") from None
-    parsed(plain, path)
+    parsed(plain, path)  # raises if it could not be read again
     write_atomically(path, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
 
 
@@ -347,8 +347,8 @@ def model_folder(model: str, variant: str) -> str:
 def _check_names(experiment: str, scene: str, model: str, variant: str, where: str) -> None:
     """Raise InputError if a name is not a valid folder name, for instance because it leads out of its parent."""
     for what, name in (("experiment", experiment), ("scene", scene), ("model", model)):
-        letters = unicodedata.normalize("NFC", name)  # letters of every script, as a folder of the user's has them
-        if not re.fullmatch(r"[^\W_][\w.+-]{0,99}", letters) or len(name.encode()) > LONGEST_NAME:
+        composed = unicodedata.normalize("NFC", name)  # \w has letters of every script, but not their accents alone
+        if not re.fullmatch(r"[^\W_][\w.+-]{0,99}", composed) or len(name.encode()) > LONGEST_NAME:
             raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
     if not re.fullmatch(r"([A-Za-z0-9][A-Za-z0-9_.+,=-]{0,99})?", variant):
         raise InputError(f"{where}variant: expected words such as iterations=10, got {variant!r:.80}")

@@ -75,10 +75,11 @@ def moving(views: Sequence[View]) -> Regions:
         median = np.empty_like(sums[0])
         for row in range(0, sums.shape[1], STRIP):
             strip = np.sort(sums[:, row : row + STRIP], axis=0)
-            median[row : row + STRIP] = strip[(len(group) - 1) // 2]
+            median[row : row + STRIP] = strip[(len(group) - 1) // 2]  # the lower one of an even number
         radius = round(sums.shape[1] / PIXELS_OF_A_RADIUS)
         for view, image_sums in zip(group, sums, strict=True):
-            moved = (np.abs(image_sums.astype(np.int32) - median) > 9 * THRESHOLD).any(-1).astype(np.uint8)
+            changes = np.abs(image_sums.astype(np.int32) - median)  # of sums of 9 pixels
+            moved = (changes > 9 * THRESHOLD).any(-1).astype(np.uint8)
             moved = cv2.morphologyEx(moved, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             masks[view.name] = cv2.dilate(moved, np.ones((2 * radius + 1,) * 2, np.uint8)).astype(bool)
     return _large(masks, "images of one camera")
@@ -157,16 +158,16 @@ def _large(masks: dict[str, Mask], source: str) -> Regions:
 
 
 def by_camera(views: Sequence[View]) -> list[list[View]]:
-    """Group the views by equal cameras and image sizes."""
+    """Group the views by cameras that are equal to SAME, and by image sizes."""
     cameras = [view.camera for view in views]
     keys = np.array(
         [[each.width, each.height, *each.viewmat.flatten().tolist(), *each.K.flatten().tolist()] for each in cameras]
     )
-    groups, left = [], np.arange(len(views))
-    while len(left):
-        same = (np.abs(keys[left] - keys[left[0]]) <= SAME).all(1)
-        groups.append([views[i] for i in left[same]])
-        left = left[~same]
+    groups, remaining = [], np.arange(len(views))  # indices of the views that are in no group yet
+    while len(remaining):
+        same = (np.abs(keys[remaining] - keys[remaining[0]]) <= SAME).all(1)
+        groups.append([views[i] for i in remaining[same]])
+        remaining = remaining[~same]
     return groups
 
 

@@ -76,6 +76,7 @@ def check_renders(
 def _of_folder(
     folder: Path, views: Sequence[View], background: tuple[float, float, float], reduces: bool
 ) -> CheckedRenders:
+    """Check the images of a folder, and match them to views; arguments are as in `check_renders`."""
     listed = sorted((folder / name for name in os.listdir(folder)), key=_order)
     images = [path for path in listed if path.suffix.lower() in SUFFIXES]
     files, matched = _matched(folder, images, views)
@@ -87,7 +88,7 @@ def _of_folder(
     if len(kinds) > 1:
         raise InputError(f"{folder}: expected images of one kind, got {' and '.join(sorted(kinds))}: keep one kind")
     facts = Renders(kinds.pop(), matched, _resized(sizes, views), fingerprint(digests))
-    images_of_views = partial(_composited, partial(map, _read, files), views, background)
+    images_of_views = partial(_composited, partial(map, _read, files), views, background)  # reads files when called
     others = tuple(path.name for path in listed if path not in files)
     return CheckedRenders(facts, images_of_views, tuple(file.name for file in files), others)
 
@@ -95,6 +96,7 @@ def _of_folder(
 def _of_video(
     path: Path, views: Sequence[View], background: tuple[float, float, float], reduces: bool
 ) -> CheckedRenders:
+    """Check the frames of a video, which are matched to views by order; arguments are as in `check_renders`."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(0)
@@ -102,7 +104,7 @@ def _of_video(
     if not any(re.match(pattern, start, re.DOTALL) for pattern in VIDEO_STARTS):
         raise InputError(f"{path}: expected a folder of images, or a video (mp4, webm, mkv, avi), got another file")
     with closing(video_frames(path)) as frames:
-        sizes = [(frame.shape[1], frame.shape[0]) for frame in islice(frames, len(views) + 1)]
+        sizes = [(frame.shape[1], frame.shape[0]) for frame in islice(frames, len(views) + 1)]  # + 1: to notice more
     if len(sizes) != len(views):
         count = f"{len(sizes)} that OpenCV can read" if len(sizes) < len(views) else "more"
         raise InputError(f"{path}: expected {len(views)} frames, one for each evaluated view, got {count}", docs=HOW_TO)
@@ -115,7 +117,7 @@ def _of_video(
 def _matched(
     folder: Path, images: Sequence[Path], views: Sequence[View]
 ) -> tuple[list[Path], Literal["names", "order"]]:
-    """Return the image of each view, and by what it was found."""
+    """Return the image of each view, and whether images were matched by names or by order."""
     by_name: dict[str, Path] = {}
     for path in images:
         name = without_suffix(path.stem if path.suffix == ".npy" else path.name)
@@ -123,10 +125,10 @@ def _matched(
             raise InputError(f"{folder}: expected one image of a name, got {by_name[name].name} and {path.name}")
         by_name[name] = path
     names = [without_suffix(PurePosixPath(view.name).name) for view in views]
-    if len(set(names)) < len(names):  # of several folders
+    if len(set(names)) < len(names):  # views of several folders, such as cam01/0003, whose image is cam01_0003
         names = [without_suffix(view.name).replace("/", "_") for view in views]
     missing = [name for name in names if name not in by_name]
-    if len(missing) < len(views):
+    if len(missing) < len(views):  # some images have the names of views, so all must
         more = sorted(by_name.keys() - set(names))
         if missing or more:
             wrong = f"none of {_some(missing)}" if missing else f"one of no view: {_some(more)}"
@@ -163,6 +165,7 @@ def _checked(path: Path) -> tuple[str, tuple[int, int], str]:
 
 
 def _read(path: Path) -> Image:
+    """Read an image; raise InputError if floats are not in [0, 1]."""
     if path.suffix.lower() != ".npy":
         return decode_photo(read_image(path, str(path)), str(path))
     image: NDArray[np.float32] = np.array(_array(path), np.float32)
@@ -188,6 +191,7 @@ def _fitting(size: tuple[int, int], view: View, where: str, reduces: bool) -> tu
     """Return the size of an image; raise InputError if it is not, and cannot be reduced to, that of its view."""
     (width, height), camera = size, view.camera
     is_larger = width >= camera.width and height >= camera.height
+    # The ratio of the sides is equal, up to one pixel in a side of the view.
     is_similar = abs(width * camera.height - height * camera.width) <= max(size)
     if size != (camera.width, camera.height) and not (reduces and is_larger and is_similar):
         todo = "render it so" + (", or add --reduce" if is_larger and is_similar else "")

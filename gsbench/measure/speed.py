@@ -80,7 +80,10 @@ def time_in_turns(
     count: int = LEAST_RENDERS,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> list[RenderTimes]:
-    """Time several render functions in turns, frame by frame, so that other load on the machine affects all alike."""
+    """Time several render functions in turns, frame by frame, so that other load on the machine affects all alike.
+
+    Two turns of frame 0 come before, and do not count.
+    """
     times: list[list[float]] = [[] for _ in renders]
     for i in range(-2, count):
         for milliseconds, render in zip(times, renders, strict=True):
@@ -253,8 +256,8 @@ class Effort:
 
     def __init__(self) -> None:
         """Start with no CPU-seconds and no load."""
-        self._seconds = self._cpu_s = self._load_s = 0.0
-        self._began = 0.0, 0.0
+        self._seconds = self._cpu_s = self._load_s = 0.0  # the last: the sum of load x seconds
+        self._began = 0.0, 0.0  # wall clock and CPU clock, s
 
     def __enter__(self) -> None:
         self._began = time.perf_counter(), time.process_time()
