@@ -49,7 +49,7 @@ def coefficients_within(
 ) -> Tensor:  # [N, waves, (degree + 1)^2] bool
     """Return a mask of the colour coefficients that each Gaussian uses, given its SH degree and frequencies in time."""
     order = order_of(packed)
-    degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])
+    degrees = packed.new_tensor([math.isqrt(k) for k in range((degree + 1) ** 2)])  # of each coefficient
     frequencies = torch.arange(waves, device=packed.device)
     return (frequencies[:, None] < order.waves[:, None, None]) & (degrees <= order.degree[:, None, None])
 

@@ -54,13 +54,14 @@ class GaussianModel(nn.Module, ABC):
     takes_views: bool = False
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Let torch slice a model that overrides `condition` and inherits the kernel of its base."""
+        """Reset what the methods of a subclass make untrue: `takes_views`, and the kernel of another `condition`."""
         super().__init_subclass__(**more)
         methods = ("slice", "refined", "slice_geometry", "kernel_arguments", "colored", "shade")
         if not vars(cls).keys().isdisjoint(("kernel", *methods)):
             cls.takes_views = vars(cls).get("takes_views", False)
-        order = [next(base for base in cls.__mro__ if name in vars(base)) for name in ("condition", "kernel")]
-        if cls.__mro__.index(order[0]) < cls.__mro__.index(order[1]):
+        order = cls.__mro__
+        condition, kernel = (next(base for base in order if name in vars(base)) for name in ("condition", "kernel"))
+        if order.index(condition) < order.index(kernel):  # `condition` is of a later class, so torch slices
             cls.kernel = None
 
     def __init__(
@@ -99,7 +100,7 @@ class GaussianModel(nn.Module, ABC):
         self.backend = backend
         self.effect_sets: EffectSets | None = None  # None: every row has every effect; a GatedModel may have them
         self.extent = 1.0  # of the scene, world units
-        self.active = ActiveComponents(sh_degree, agr, False)
+        self.active = ActiveComponents(sh_degree, refine=agr, tunes_lambda=False)
 
     # ---- what a subclass provides
 
@@ -185,12 +186,12 @@ class GaussianModel(nn.Module, ABC):
         is at least 1/255, unless `fading_times` says otherwise. Times are in [0, 1]; (inf, inf) marks a Gaussian that
         is never visible. The intervals only serve to sort the Gaussians: they ignore AGR, the neural refinement.
         """
-        lifetimes = self.lifetimes()
-        if lifetimes is None:
+        times_and_lifetimes = self.lifetimes()
+        if times_and_lifetimes is None:
             return None
-        times, deviations = lifetimes
+        times, lifetimes = times_and_lifetimes
         opacities = torch.sigmoid(self.splats["opacities"])
-        half = self.fading_times(log(opacities / ALPHA_MIN).clamp(min=0), deviations)
+        half = self.fading_times(log(opacities / ALPHA_MIN).clamp(min=0), lifetimes)  # 0: too faint at all times
         interval = torch.stack([times - half, times + half], 1)
         never = (half == 0) | (interval[:, 1] < 0) | (interval[:, 0] > 1)
         return torch.where(never[:, None], math.inf, interval.clamp(0, 1))
@@ -215,9 +216,9 @@ class GaussianModel(nn.Module, ABC):
 
         `raw` are the initial parameters. By default the Gaussians become spheres of the same volume.
         """
-        points, radii = Points(trained.means, trained.means), exp(trained.log_scales.mean(1))
+        points, radii = Points(trained.means, colors=trained.means), exp(trained.log_scales.mean(1))  # colours: unused
         spheres = self.initial_geometry(points, radii, torch.Generator().manual_seed(0))
-        return {name: spheres[name] for name in self.geometry}
+        return {name: spheres[name] for name in self.geometry}  # not the random means
 
     def long_in_time(self) -> Tensor:
         """Return which Gaussians must be split because they are long in time, [N] bool (7DGS, section 4.4)."""
@@ -285,6 +286,7 @@ class GaussianModel(nn.Module, ABC):
         raw |= self.initial_colors((points.colors - 0.5) / SH_C0)
         self.splats = nn.ParameterDict({name: nn.Parameter(value.clone()) for name, value in raw.items()})
         if self.agr:
+            # AGR has a network for each mean, and one for the covariance.
             widths = {name: raw[name].shape[-1] for name in (*self.centers, *self.geometry)}
             outputs = [*(widths[name] for name in self.centers), sum(widths[name] for name in self.geometry)]
             size = size_of(points)
@@ -365,7 +367,7 @@ class GaussianModel(nn.Module, ABC):
         if effect_sets is not None:
             return effect_sets.by_name(N)
         refined, conditioned = N if self.refines else 0, N if self.observes else 0
-        counts = refined, conditioned - refined if conditioned else 0, N - max(refined, conditioned)
+        counts = refined, max(conditioned - refined, 0), N - max(refined, conditioned)
         return dict(zip(NAMES, counts, strict=True))
 
     @property

@@ -224,12 +224,14 @@ class UniversalBetaModel(BetaModel):
     def factors(self, raw: Raw) -> Tensor:
         return self._modulated(reduce(joint_factor(raw)), shift_weights(raw["betas"]))
 
-    def _modulated(self, reduced: Reduced, weights: Tensor) -> Tensor:
+    def _modulated(self, reduced: Reduced, weights: Tensor) -> Tensor:  # weights: [N, k] the diagonal of B
+        """Compute factors [N, 3, 3] of the covariances of the class, or of those that `modulation=raw` has."""
         T_qq, T_pq, T_pp = reduced
         if self.modulation == "whitened":
-            left = 1 - weights
-            root = torch.where(left > 0, sqrt(torch.where(left > 0, left, 1.0)), 0.0)  # its gradient at 0 is infinite
-            rows = torch.cat([T_pp, T_pq * root[:, None]], -1)
+            narrowing = 1 - weights
+            is_positive = narrowing > 0  # at 0 the gradient of the root is infinite
+            root = torch.where(is_positive, sqrt(torch.where(is_positive, narrowing, 1.0)), 0.0)
+            rows = torch.cat([T_pp, T_pq * root[:, None]], -1)  # [N, 3, 3 + k], a factor of the sum
             return triangularise(rows, 3)[0]
         S_pq = T_pq @ T_qq.mT
         cov = T_pp @ T_pp.mT + T_pq @ T_pq.mT - (gain_of(T_pq, T_qq) * weights[:, None]) @ S_pq.mT

@@ -16,10 +16,10 @@ FIELD_OF_VIEW = 0.69  # radians, horizontal; D-NeRF's camera_angle_x
 def middle(model: GaussianModel) -> Tensor:
     """Return the middle of a model, [3]: the median of the Gaussians' means, weighted by opacity."""
     means = model.splats["means"].detach().cpu()
-    order = means.argsort(0)
-    weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3]
-    half = (weights < weights[-1] / 2).sum(0, keepdim=True)
-    return means.gather(0, order.gather(0, half.clamp(max=len(means) - 1)))[0]
+    order = means.argsort(0)  # [N, 3] along each axis
+    weights = torch.sigmoid(model.splats["opacities"].detach().cpu())[order].cumsum(0)  # [N, 3] of all up to each
+    place = (weights < weights[-1] / 2).sum(0, keepdim=True)  # [1, 3] the first with half of the weight
+    return means.gather(0, order.gather(0, place.clamp(max=len(means) - 1)))[0]
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
@@ -59,6 +59,7 @@ def around(
     """Return a camera that looks at the middle of a model."""
     flat, axis = math.cos(elevation), torch.tensor(up, dtype=torch.float32)
     basis = torch.stack([*_level(axis), axis])
+    # [3] from the middle to the camera; with azimuth 0 it looks along the second level axis
     towards = torch.tensor([flat * math.sin(azimuth), -flat * math.cos(azimuth), math.sin(elevation)]) @ basis
     target = middle(model)
     return Camera(look_at(target + distance * towards, target, axis), intrinsics(width, height), width, height)

@@ -65,10 +65,10 @@ class CholeskyModel(JointModel):
         self.scheme = scheme
         self.split_in_time = split_in_time
         # The row numbers of p, d and t in the triangular factor, then the indices of d and t in q, ordered (d, t).
-        there = "p" + "".join(LETTERS[x] for x in self.observes)
-        letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in there)
+        variables = "p" + "".join(LETTERS[x] for x in self.observes)
+        letters = "".join(x * WIDTH[x] for x in FACTOR_ORDERS[factor_order] if x in variables)  # such as dddtppp
         self.rows = {x: [i for i, letter in enumerate(letters) if letter == x] for x in "pdt"}
-        columns = {"time": [len(letters) - 4], "direction": [0, 1, 2]}
+        columns = {"time": [len(letters) - WIDTH["p"] - 1], "direction": [0, 1, 2]}  # t is the last of q
         self.columns = {x: columns[x] for x in columns if x in self.observes}
         self.layout = CholeskyLayout(letters, off_diagonal)
         self.is_reduced = factor_order == "conditioned_first" and scheme == "square_root"
@@ -76,11 +76,12 @@ class CholeskyModel(JointModel):
     def initial_geometry(self, points: Points, distances: Tensor, generator: torch.Generator) -> Raw:
         """Return spheres with random mean times and directions.
 
-        The standard deviation is sqrt(1/10) in time and 1 in direction. Mean times are uniform in [-0.1, 1.1], and with
-        `bounded_times` then clipped to [0, 1]. Mean directions are uniform on the unit sphere.
+        The standard deviation is sqrt(1/10) in time and 1 in direction. Mean times are those of the points, else
+        uniform in [-0.1, 1.1]; with `bounded_times` they are clipped to [0, 1]. Mean directions are uniform on the unit
+        sphere.
         """
         N = len(distances)
-        log_diagonal = torch.zeros(N, sum(map(len, self.rows.values())))
+        log_diagonal = torch.zeros(N, len(self.layout.letters))
         log_diagonal[:, self.rows["p"]] = log(distances)[:, None]
         log_diagonal[:, self.rows["t"]] = 0.5 * math.log(1 / 10)
         raw = {"log_diagonal": log_diagonal}
@@ -111,14 +112,15 @@ class CholeskyModel(JointModel):
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
         else:
-            mean = F.pad(raw["means"], (0, offset.shape[1]))  # q is measured from mu_q
+            mean = F.pad(raw["means"], (0, k))  # q is measured from mu_q
             means, factors, _ = slice_gaussians(mean, factor, offset, scheme=self.scheme)
         return Conditioned(means, factors, opacity_factor)
 
     def static(self, raw: Raw) -> Conditioned:
         """Return 3D Gaussians whose covariance factor is the position block of the Cholesky factor."""
         space = self.rows["p"]
-        factors = CholeskyLayout("ppp", self.layout.form).factor(raw["log_diagonal"][:, space], raw)
+        layout = CholeskyLayout("ppp", self.layout.form)  # has the kind `shape` only
+        factors = layout.factor(raw["log_diagonal"][:, space], raw)
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def uses_kernel(self, raw: Raw) -> bool:
@@ -127,7 +129,7 @@ class CholeskyModel(JointModel):
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
         named = super().kernel_arguments(raw, query) | {
-            "coupling": raw.get("coupling", raw["motion"].detach()[..., :0]),
+            "coupling": raw.get("coupling", raw["motion"].detach()[..., :0]),  # [N, 0] if q is time alone
             "half": 0.5 if self.directional_half else 1.0,
             "conditioned_first": self.factor_order == "conditioned_first",
             "form": OFF_DIAGONALS.index(self.layout.form),
@@ -145,7 +147,7 @@ class CholeskyModel(JointModel):
         return torch.linalg.matrix_norm(T_pp, ord=2)
 
     def hold_sizes(self, least: Tensor) -> None:
-        space = self.rows["p"]
+        space = self.rows["p"]  # adjacent, so that a slice, which shares memory, takes them
         self.splats["log_diagonal"].data[:, space[0] : space[-1] + 1].clamp_(min=log(least)[:, None])
 
     def split(self, raw: Raw, generator: torch.Generator) -> Raw:
@@ -199,7 +201,7 @@ class CholeskyModel(JointModel):
         if effect_sets.orders is None:
             return masks
         static = ~effect_sets.is_conditioned
-        gone = {"p": torch.zeros_like(static), "t": static, "d": static}
+        gone = {"p": torch.zeros_like(static), "t": static, "d": static}  # [N] which Gaussians have lost a variable
         masks["log_diagonal"] = ~torch.stack([gone[x] for x in self.layout.letters], -1)
         for kind in self.layout.kinds[1:]:  # all but shape
             pairs = [self.layout.pair(place) for place in self.layout.places[kind]]
@@ -235,9 +237,9 @@ class CholeskyModel(JointModel):
         """
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)
-        by_name = {name: [name] for name in self.columns} | {"static": list(self.columns)}
-        shift = torch.zeros_like(gain[:, 0])
-        opacity_factors = {name: torch.zeros_like(gain[:, 0, 0]) for name in by_name}
+        removed = {name: [name] for name in self.columns} | {"static": list(self.columns)}  # variables, by the result
+        shift = torch.zeros_like(gain[:, 0])  # [N, k] mean of q - mu_q over views
+        opacity_factors = {name: torch.zeros_like(gain[:, 0, 0]) for name in removed}  # [N]
         for query, weight in zip(queries, weights.double(), strict=True):
             delta = self.offset(raw, query).double()
             shift += weight[:, None] * delta
@@ -245,13 +247,13 @@ class CholeskyModel(JointModel):
             for name, factor in opacity_factors.items():
                 factor += weight * exp(-exponents[name])
         changed = {}
-        for name, variables in by_name.items():
+        for name, variables in removed.items():
             columns = [column for x in variables for column in self.columns[x]]
             moved = raw["means"] + (gain[..., columns] @ shift[:, columns, None])[..., 0]
             opacity = torch.sigmoid(raw["opacities"].double()) * opacity_factors[name]
             new = self.layout.parameters(self._without(blocks, gain, variables)) | {"means": moved}
             new["opacities"] = torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN))
-            new |= {center: torch.zeros_like(raw[center]) for x in variables for center in [CENTERS[x]]}
+            new |= {CENTERS[x]: torch.zeros_like(raw[CENTERS[x]]) for x in variables}
             changed[name] = {key: value.to(raw["means"].dtype) for key, value in new.items()}
         return changed
 
@@ -349,12 +351,13 @@ class TimedModel(CholeskyModel):
         self.bounded_times = bounded_times
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
-        lifetimes = super().lifetimes()
-        assert lifetimes is not None
-        return self.mean_times(dict(self.splats.items()))[:, 0], lifetimes[1]
+        times_and_lifetimes = super().lifetimes()
+        assert times_and_lifetimes is not None
+        _, lifetimes = times_and_lifetimes  # the times are raw
+        return self.mean_times(dict(self.splats.items()))[:, 0], lifetimes
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the diagonal entry of time in each Cholesky factor, a lower bound of sqrt(S_t), to at least `least`."""
+        """Raise the diagonal entry of time in each factor, a lower bound of sqrt(S_t), to `least` sqrt(lambda_t)."""
         least_entry = math.log(least) + 0.5 * self.log_lambda["time"].detach()
         self.splats["log_diagonal"].data[:, self.rows["t"][0]].clamp_(min=least_entry)
 
@@ -423,7 +426,7 @@ class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
         both = white.square().sum(-1)
         return {
             "direction": scale * (both - time).clamp(min=0),
-            "time": scale * white[:, 3].square(),
+            "time": scale * white[:, 3].square(),  # as the squares of the first three are the distance of d alone
             "static": scale * both,
         }
 
@@ -432,8 +435,8 @@ class Gaussians7DModel(TimedModel, DirectionalModel, gates=True):
 
         With a joint gate, s is that of the direction which dims the Gaussian least at each time.
         """
-        times, deviations = super().lifetimes()
-        return times, deviations / math.sqrt(2) if self.joint_gate else deviations
+        times, lifetimes = super().lifetimes()
+        return times, lifetimes / math.sqrt(2) if self.joint_gate else lifetimes  # a joint gate has no 1/2
 
     def hold_lifetimes(self, least: float) -> None:
         super().hold_lifetimes(least * math.sqrt(2) if self.joint_gate else least)

@@ -89,13 +89,13 @@ class DeformationField(nn.Module):
 
     def __init__(
         self,
-        width: int,
+        width: int,  # the first five are options of `DeformableModel`
         depth: int,
         octaves: int,
         time_octaves: int,
         time_network: bool,
         generator: torch.Generator,
-        outputs: Sequence[int] = OUTPUTS,
+        outputs: Sequence[int] = OUTPUTS,  # numbers in each result of `forward`
     ) -> None:
         super().__init__()
         self.octaves, self.time_octaves, self.outputs = octaves, time_octaves, outputs

@@ -89,8 +89,8 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         """
         raw, n = self.raw_of(torch.arange(len(self), device=drawn.device)), self.intervals
         is_static = ~is_dynamic(raw)[:, 0] & drawn  # [V, N]
-        squares = (raw["means"] - centers[:, None]).square().sum(-1)
-        motion = raw["velocities"].square().sum(-1) / squares.square()
+        squares = (raw["means"] - centers[:, None]).square().sum(-1)  # [V, N] of distances
+        motion = raw["velocities"].square().sum(-1) / squares.square()  # (|v| / distance^2)^2
         order = torch.where(is_static, motion, -1.0).amax(0).argsort(descending=True, stable=True)
         rows = order[: int(self.dynamic_share * is_static.any(0).sum())]
         times = torch.arange(-1, n + 2).to(motion) / n  # of the keyframes
@@ -111,6 +111,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         begin, end = raw["windows"].amin(1), raw["windows"].amax(1)
         before, after = (sizes(raw["fades"]) + LEAST_FADE).unbind(1)
         begun = tau > begin
+        # The time before or after the window; with `code` it is that to its end on both sides, as x is squared.
         x = tau - end if self.rise == "code" else torch.where(begun, tau - end, begin - tau)
         x = torch.where(begun & (tau < end), 0.0, x / torch.where(begun, after, before))
         return exp(-x.square())
@@ -120,6 +121,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         assert query.time is not None
         tau = self.tau(query.time)
         k = tau.floor().clamp(max=self.intervals).long()  # the last keyframe before this time, from 1 to n
+        # Keyframes k and k + 1; quaternions begin at keyframe 1.
         pair = raw["key_quats"].unflatten(1, (-1, 4)).index_select(1, k + torch.arange(-1, 1, device=k.device))
         first, last = F.normalize(raw["quats"][:, None] + pair, dim=-1).unbind(1)
         return torch.where(is_dynamic(raw), slerp(first, last, tau - k), raw["quats"])
@@ -177,8 +179,8 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
 
     def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
         fade = (sizes(self.splats["fades"].detach().amax(1)) + LEAST_FADE) / self.intervals
-        inside = lifetimes - fade * 0.5**0.5
-        return torch.where(fading > 0, inside + fade * sqrt(fading), 0.0)
+        half_window = lifetimes - fade * 0.5**0.5
+        return torch.where(fading > 0, half_window + fade * sqrt(fading), 0.0)  # behind it, exp(-(x / fade)^2)
 
 
 def is_dynamic(raw: Raw) -> Tensor:

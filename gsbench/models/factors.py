@@ -47,8 +47,8 @@ class CholeskyLayout:
         below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `split` takes them
         places: dict[str, list[int]] = {"shape": [], "motion": [], "coupling": []}
         for place, (i, j) in enumerate(below):
-            in_space = (letters[i] + letters[j]).count("p")
-            places[("coupling", "motion", "shape")[in_space]].append(place)
+            count_of_p = (letters[i] + letters[j]).count("p")
+            places[("coupling", "motion", "shape")[count_of_p]].append(place)
         self.places = places  # the indices of the entries of each kind among all entries below the diagonal
         self.kinds = tuple(kind for kind in KINDS if places[kind])  # a factor over (t, p) has no coupling
         self.rows = [i for i, _ in below]
@@ -60,7 +60,7 @@ class CholeskyLayout:
 
     def pair(self, place: int) -> tuple[str, str]:
         """Return the variables ("p", "t" or "d") of the row and the column of entry `place` below the diagonal."""
-        row = self.rows[place]
+        row = self.rows[place]  # row (row - 1) / 2 entries are above it
         return self.letters[row], self.letters[place - row * (row - 1) // 2]
 
     def factor(self, log_diagonal: Tensor, kinds: dict[str, Tensor]) -> Tensor:
@@ -74,7 +74,7 @@ class CholeskyLayout:
         if self.form == "row_scaled":
             x = 2 * torch.sigmoid(x) - 1
         x = torch.where(self.is_relative.to(x.device), x * diagonal[:, self.rows], x)
-        rows = zip(x.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)
+        rows = zip(x.split(list(range(n)), -1), diagonal.split(1, -1), strict=True)  # row i has i entries in x
         return torch.stack([F.pad(torch.cat(row, -1), (0, n - 1 - i)) for i, row in enumerate(rows)], 1)
 
     def parameters(self, factor: Tensor) -> dict[str, Tensor]:
@@ -85,7 +85,7 @@ class CholeskyLayout:
         """
         n = factor.shape[-1]
         L, _ = triangularise(factor, n)
-        L = L * torch.where(L.diagonal(dim1=1, dim2=2) < 0, -1.0, 1.0)[:, None, :]
+        L = L * torch.where(L.diagonal(dim1=1, dim2=2) < 0, -1.0, 1.0)[:, None, :]  # L L^T stays, its diagonal is > 0
         diagonal = L.diagonal(dim1=1, dim2=2)
         i, j = torch.tril_indices(n, n, -1, device=factor.device)
         x = L[:, i, j]

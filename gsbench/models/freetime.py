@@ -104,7 +104,7 @@ class FreeTimePlusModel(FreeTimeModel, gates=True):
     def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
         G = permanent_share(dict(self.splats.items())).detach()
         share = exp(-fading)
-        passing = torch.where(share > G, (share - G) / (1 - G), 0.0)
+        passing = torch.where(share > G, (share - G) / (1 - G), 0.0)  # of G + (1 - G) passing = share; 0: never so low
         return super().fading_times(-log(passing), lifetimes)
 
 
@@ -150,10 +150,10 @@ class SharpTimeModel(FreeTimeModel, gates=True):
         return self.splats["times"].detach()[:, 0], r + sigma / math.sqrt(2)
 
     def fading_times(self, fading: Tensor, lifetimes: Tensor) -> Tensor:
-        r = sizes(self.splats["plateaus"].detach()[:, 0])
+        r = sizes(self.splats["plateaus"].detach()[:, 0])  # lifetimes - r is sigma / sqrt(2), as FreeTimeGS' s
         return torch.where(fading > 0, r + super().fading_times(fading, lifetimes - r), 0.0)
 
     def hold_lifetimes(self, least: float) -> None:
         """Raise sigma until opacities fall to exp(-1/2) at `least` or later."""
         missing = least - sizes(self.splats["plateaus"].data)
-        self.splats["durations"].data.clamp_(min=log((math.sqrt(2) * missing).clamp(min=1e-30)))
+        self.splats["durations"].data.clamp_(min=log((math.sqrt(2) * missing).clamp(min=1e-30)))  # 1e-30: no limit

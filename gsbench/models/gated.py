@@ -182,22 +182,22 @@ def as_gated(model: GaussianModel) -> GatedModel:
 
 def effect_sets_in(state: dict[str, Any]) -> EffectSets | None:
     """Read from a checkpoint which Gaussians depend on time, direction and AGR (a network); None if not stored."""
-    stored = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
-    if not stored:
+    unread = {key: value for key, value in state.items() if isinstance(key, str) and key.startswith(_STATE)}
+    if not unread:
         return None
     opacities = state.get("splats.opacities")
     N = len(opacities) if isinstance(opacities, Tensor) and opacities.dim() == 1 else 0
 
     def part(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        value = stored.pop(f"{_STATE}{name}", None)
+        value = unread.pop(f"{_STATE}{name}", None)
         if not isinstance(value, Tensor) or tuple(value.shape) != shape or value.dtype != dtype:
             raise InputError(f"checkpoint: expected {_STATE}{name} as {dtype} of shape {list(shape)}")
         return value
 
     refined, conditioned = part("counts", (2,), torch.int64).tolist()
     orders = part("orders", (N,), torch.uint8).to(torch.int32)
-    intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in stored else None
-    if stored or not bool((orders <= MOST_PACKED).all()) or not 0 <= refined <= conditioned <= N:
+    intervals = part("intervals", (refined, 2), torch.float32) if f"{_STATE}intervals" in unread else None
+    if unread or not bool((orders <= MOST_PACKED).all()) or not 0 <= refined <= conditioned <= N:
         raise InputError(
             f"checkpoint: expected effect sets of {N} rows, got {refined}, {conditioned} and orders that there are not"
         )

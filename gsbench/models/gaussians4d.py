@@ -107,7 +107,7 @@ class Gaussians4DModel(JointModel, gates=True):
         """
         factor = self.factors(raw).double()
         blocks = reduce(factor)
-        shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])
+        shift, opacity = torch.zeros_like(factor[:, 3:, 0]), torch.zeros_like(factor[:, 0, 0])  # [N, 1], [N]
         for query, weight in zip(queries, weights.double(), strict=True):
             assert query.time is not None
             delta = (query.time - raw["times"]).double()
@@ -116,6 +116,7 @@ class Gaussians4DModel(JointModel, gates=True):
             f_temp = torch.where(f_temp > TIME_OPACITY_FACTOR_MIN, f_temp, 0.0)
             opacity += weight * f_temp * torch.sigmoid(raw["opacities"].double())
         turn, lengths, _ = torch.linalg.svd(blocks.T_pp)
+        # A mirrored turn times -1 is a rotation, with the same covariance.
         left = turn_of_space(quaternion(turn * torch.linalg.det(turn)[:, None, None]))
         new = {
             "means": raw["means"] + (gain_of(blocks.T_pq, blocks.T_qq) @ shift[..., None])[..., 0],
@@ -178,7 +179,7 @@ class Gaussians4DModel(JointModel, gates=True):
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
-        if waves <= MAX_WAVES and self.backend.serves(means):
+        if waves <= MAX_WAVES and self.backend.serves(means):  # as the kernel has no more
             timed = {"times": raw["times"], "time": query.time} if waves > 1 else {}
             return show_colors(
                 sh0,
@@ -207,7 +208,7 @@ class Gaussians4DModel(JointModel, gates=True):
         self.splats["scales"].data[:, :3].clamp_(min=log(least)[:, None])
 
     def hold_lifetimes(self, least: float) -> None:
-        """Raise the fourth scale of each Gaussian to `least`, in the model's unit of time; rotations do not change."""
+        """Raise the fourth scale of each Gaussian to `least` sqrt(lambda_t) clips, in world units (`clock`)."""
         least_scale = math.log(least) + 0.5 * self.log_lambda["time"].detach() + log(self.clock)
         self.splats["scales"].data[:, 3].clamp_(min=least_scale)
 
@@ -245,5 +246,5 @@ def _leading_first(factor: Tensor) -> Tensor:
     largest = factor[:, 3].detach().abs().argmax(-1, keepdim=True)
     columns = torch.arange(4, device=factor.device).repeat(len(factor), 1)
     columns[:, :1] = largest
-    columns.scatter_(1, largest, 0)
+    columns.scatter_(1, largest, 0)  # where it was
     return factor.gather(2, columns[:, None].expand_as(factor))

@@ -89,8 +89,9 @@ class HexPlaneModel(Gaussians3DModel):
         if self.active.warms_up:
             return raw
         assert query.time is not None
-        of_heads = zip(self.changes(raw["means"], query.time), self.heads, strict=True)
-        changes = [x for y, names in of_heads for x in y.split([self.outputs[name] for name in names], -1)]
+        changes: list[Tensor] = []  # of each raw parameter, [N, its numbers]
+        for outputs, names in zip(self.changes(raw["means"], query.time), self.heads, strict=True):
+            changes += outputs.split([self.outputs[name] for name in names], -1)
         by_name = zip(self.outputs, changes, strict=True)
         changed = collect_gradients(*(raw[name] + change.view_as(raw[name]) for name, change in by_name))
         return raw | dict(zip(self.outputs, changed, strict=True))
@@ -100,10 +101,12 @@ class HexPlaneModel(Gaussians3DModel):
         widths = self.network.outputs
         if not CPU.serves(means):
             return list(self.network(self.planes(means, time)).split(widths, -1))
-        planes, (products, *weights) = self.planes, self.shared or self._timeless(means)
+        planes = self.planes
+        products, *weights = self.shared or self._timeless(means)
         arguments = products, means, planes.high, planes.low, time, planes.of_time, *weights, self.network.ends
-        y = field(*arguments, *planes.size)[0].flatten().split([len(means) * width for width in widths])
-        return [part.view(len(means), width) for part, width in zip(y, widths, strict=True)]
+        outputs = field(*arguments, *planes.size)[0].flatten()  # head by head, each [N, width]
+        by_head = outputs.split([len(means) * width for width in widths])
+        return [part.view(len(means), width) for part, width in zip(by_head, widths, strict=True)]
 
     def shared_by_views(self) -> list[Tensor]:
         means = self.splats["means"]
@@ -147,7 +150,7 @@ class Planes(nn.Module):
         self.register_buffer("low", torch.minimum(low, high - THINNEST * (high - low).max()))
         self.size = channels, levels, *nodes
         along = [
-            dict(zip("xyzt", (*(n << level for n in nodes[:3]), nodes[3]), strict=True)) for level in range(levels)
+            dict(zip("xyzt", (*(n * 2**level for n in nodes[:3]), nodes[3]), strict=True)) for level in range(levels)
         ]
         # The rows and columns of each level's planes: the second axis runs over rows.
         self.shapes = [{axes: (n[axes[1]], n[axes[0]]) for axes in SPACE + TIME} for n in along]

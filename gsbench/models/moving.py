@@ -151,12 +151,12 @@ class DirectModel(MovingGaussians3D, gates=True):
         direction = unit(raw["means"] - query.center).detach()
         delta = torch.cat([direction - unit(raw["directions"]), query.time - torch.sigmoid(raw["times"])], -1)
         L = precision_factor(raw["precision"])
-        white = (L.mT @ delta[..., None])[..., 0]
+        white = (L.mT @ delta[..., None])[..., 0]  # L^T delta, so that V_qq delta is L white
         opacity_factor = exp(-DIRECT_FADING * white.square().sum(-1))
         if self.coupling == "none":
             return torch.zeros_like(raw["means"]), opacity_factor
         V_pq = coupling_matrix(raw["coupling"], sizes(raw["scales"]))
-        shares = torch.sigmoid(raw["shares"])[:, [0, 0, 0, 1]]
+        shares = torch.sigmoid(raw["shares"])[:, [0, 0, 0, 1]]  # [N, 4] the diagonal of Lam
         shift = shares * (L @ white[..., None])[..., 0]
         if self.coupling == "interpolated":
             shift = shift + (1 - shares) * delta
@@ -178,6 +178,7 @@ class DirectModel(MovingGaussians3D, gates=True):
 
     def lifetimes(self) -> tuple[Tensor, Tensor]:
         L_tt = sizes(self.splats["precision"].detach()[:, 6])
+        # exp(-lambda_o (L_tt (t - mu_t))^2) = exp(-1/2 ((t - mu_t) / s)^2)
         return torch.sigmoid(self.splats["times"].detach()[:, 0]), 1 / (math.sqrt(2 * DIRECT_FADING) * L_tt)
 
     def hold_lifetimes(self, least: float) -> None:
@@ -198,11 +199,11 @@ def precision_factor(raw: Tensor) -> Tensor:
     """
     zero = torch.zeros_like(raw[:, 0])
     xx, yx, yy, zx, zy, zz, *time = raw.unbind(-1)
-    xx, yy, zz = (sizes(log) for log in (xx, yy, zz))
+    xx, yy, zz = (sizes(entry) for entry in (xx, yy, zz))
     L = torch.stack([xx, zero, zero, yx, yy, zero, zx, zy, zz], -1).unflatten(-1, (3, 3))
     if not time:
         return L
-    L = F.pad(L, (0, 1, 0, 1))
+    L = F.pad(L, (0, 1, 0, 1))  # with a row and a column of zeros
     return L + F.pad(sizes(time[0])[:, None, None], (3, 0, 3, 0))
 
 
@@ -248,15 +249,16 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         return super().static(raw)._replace(beta_exponents=profiles(raw))
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Compute shifts of means [N, 3] and opacity factors [N] from the offsets delta of direction and time."""
         delta = unit(raw["means"] - query.center).detach() - raw["directions"]
         if "time" in self.observes:
             assert query.time is not None
             delta = torch.cat([delta, query.time - raw["times"]], -1)
         L = precision_factor(raw["precision"])
-        white = (L.mT @ delta[..., None])[..., 0]
+        white = (L.mT @ delta[..., None])[..., 0]  # z
         V_pq = coupling_matrix(raw["coupling"], positive(raw["scales"]))
-        moved = V_pq @ (shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0])[..., None]
-        return moved[..., 0], opacity_factor(white, raw["betas"])
+        weighted = shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0]  # [N, C] of V_qq delta
+        return (V_pq @ weighted[..., None])[..., 0], opacity_factor(white, raw["betas"])
 
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return mean times [N] and standard deviations [N] of the Gaussians exp(-b z^2); None without time.

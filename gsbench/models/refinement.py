@@ -44,28 +44,25 @@ class Changes(nn.Module, ABC):
 
     def forward(
         self,
-        values: list[
-            Tensor
-        ],  # raw parameters [N, c]: first the means, which are the input, then those of the covariance
+        values: list[Tensor],  # raw parameters [N, c]: first the means, which are the input, then the covariance's
         time: Tensor,  # [] in [0, 1], or [V] those of several views
         *,
-        by_kernel: bool = False,  # whether the backend's kernel (float32) may compute it
+        by_kernel: bool = False,  # whether a subclass that has a kernel (float32) may use it
         rows: int | None = None,  # only the first `rows` Gaussians change; None: all
-        intervals: Tensor
-        | None = None,  # [rows, 2] the first and last time at which each of these changes; None: always
+        intervals: Tensor | None = None,  # with `rows`, [rows, 2]: first and last time of the change; None: always
     ) -> list[Tensor]:
         """Return the raw parameters plus the outputs of the networks at a time, or at several times [V, N, c]."""
         if time.dim():
             of_views = [self.forward(values, at, rows=rows, intervals=intervals) for at in time.unbind()]
             return stack(list(zip(*of_views, strict=True)))
-        resting = values if rows is None else [x[:rows] for x in values]
-        moved = [x + added for x, added in zip(resting, self.added(resting, time), strict=True)]
+        before = values if rows is None else [x[:rows] for x in values]
+        moved = [x + added for x, added in zip(before, self.added(before, time), strict=True)]
         if rows is None:
             return moved
         if intervals is not None:
             awake = ((intervals[:, 0] <= time) & (time <= intervals[:, 1]))[:, None]
-            moved = [torch.where(awake, x, y) for x, y in zip(moved, resting, strict=True)]
-        return [torch.cat([x, rest[rows:]]) for x, rest in zip(moved, values, strict=True)]
+            moved = [torch.where(awake, x, y) for x, y in zip(moved, before, strict=True)]
+        return [torch.cat([x, value[rows:]]) for x, value in zip(moved, values, strict=True)]
 
 
 class Refinement(Changes):
@@ -177,6 +174,5 @@ class DeepRefinement(Changes):
         means = means / self.units[: means.shape[-1]]
         gamma = encode_time(time, self.octaves)
         inputs = torch.cat([encode(means, self.mean_octaves), gamma.expand(len(means), -1)], -1)
-        return list(
-            (collect_gradients(self.head(self.hidden(inputs)))[0] * self.units).split([x.shape[-1] for x in values], -1)
-        )
+        (outputs,) = collect_gradients(self.head(self.hidden(inputs)))
+        return list((outputs * self.units).split([x.shape[-1] for x in values], -1))

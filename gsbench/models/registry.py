@@ -22,6 +22,7 @@ def register(name: str) -> Callable[[M], M]:
 
     def enter(model: M) -> M:
         other = _REGISTRY.get(name, model)
+        # A module that is imported again registers a new class of the same name, which replaces the old one.
         if (other.__module__, other.__qualname__) != (model.__module__, model.__qualname__):
             raise InputError(f"model '{name}': expected a name of its own, {other.__module__} has a model of that name")
         _REGISTRY[name] = model
@@ -72,7 +73,7 @@ def import_models(
     except InputError:
         raise
     except Exception as error:  # whatever the code of another package raises
-        place = traceback.extract_tb(error.__traceback__)[-1]
+        place = traceback.extract_tb(error.__traceback__)[-1]  # in importlib if there is no such module
         where = "" if "importlib" in place.filename else f"{Path(place.filename).name}, line {place.lineno}: "
         raise InputError(
             f"{named_by}: expected a Python module that can be imported: {where}"

@@ -131,21 +131,22 @@ class GraphedFrames:
             InputError: the model depends on time and `time` is None, or a value is out of range.
             RuntimeError: CUDA cannot record this model.
         """
-        size = camera.width, camera.height, time is None
-        if size not in self._recordings:
-            self._recordings[size] = self._record(camera, time)
-        recording = self._recordings[size]
+        key = camera.width, camera.height, time is None
+        if key not in self._recordings:
+            self._recordings[key] = self._record(camera, time)
+        recording = self._recordings[key]
         recording.camera.overwrite(camera)
         if recording.time is not None and time is not None:
             recording.time.fill_(time)
         recording.play()
         pairs, flags = recording.needed.tolist()  # waits for the image
-        if flags or pairs > recording.room:
-            del self._recordings[size]
+        if flags or pairs > recording.room:  # record again: for more pairs, or to raise the error of a wrong value
+            del self._recordings[key]
             return self(camera, time)
         return recording.image
 
     def _record(self, camera: Camera, time: float | None) -> _Recording:
+        """Record a graph with room for more intersections than this image has, which is checked as it is drawn once."""
         gaussians = self.model.slice(CameraTime.of(camera, time))
         drawn = rasterize_slice(gaussians, camera, self.background, self.model.backend, self.antialias)
         room = room_for(drawn.info.pairs)

@@ -65,7 +65,7 @@ class ScgsModel(DeformableModel):
         """Start as 3DGS does, with a field that at first moves next to nothing."""
         super().initialise(points, extent, generator)
         for x in self.field.hidden.parameters():
-            if x.dim() == 2:
+            if x.dim() == 2:  # weights; the others are biases
                 nn.init.kaiming_uniform_(x, nonlinearity="relu", generator=generator)
             else:
                 x.zero_()
@@ -88,6 +88,7 @@ class ScgsModel(DeformableModel):
         n = self.nodes.positions
         t, ds, dr, turn = self.field(n.detach(), query.time)
         R = rotation(turn + turn.new_tensor([1, 0, 0, 0]))  # [M, 3, 3]
+        # R (mu_p - n) + n + t = R mu_p + (n + t - R n)
         moves = torch.cat([R.flatten(1), n + t - (R @ n[..., None])[..., 0], ds, dr], -1)
         near, weights = self.nodes.nearest(raw["means"].detach(), raw["features"])
         blended = (of_nodes(moves.T, near) * weights).sum(-1).T  # [N, 9 + 3 + 3 + 4]
@@ -150,7 +151,8 @@ class Nodes(nn.Module):
             near = linear(x, places, -places.square().sum(-1) / 2).topk(count).indices
         of_near = of_nodes(torch.cat([places.T, self.log_radii[None], self.logits[None]]), near)
         squares = (x.T[..., None] - of_near[:-2]).square().sum(0)  # [N, count]
-        weights = exp(-squares / (2 * exp(2 * of_near[-2]))) * sigmoid(of_near[-1]) + 1e-7
+        log_radii, logits = of_near[-2], of_near[-1]
+        weights = exp(-squares / (2 * exp(2 * log_radii))) * sigmoid(logits) + 1e-7
         return near, weights / weights.sum(-1, keepdim=True)
 
 
@@ -172,7 +174,8 @@ def stretch(
     columns = paths.transpose(1, 2).flatten(0, 1)  # [3 T, M]
     edges = (of_nodes(columns, near) - columns[..., None]).unflatten(0, (len(paths), 3)).transpose(1, 2)  # [T, M, 3, K]
     before, after = edges[:-1], edges[1:]
-    with torch.no_grad():  # at the least energy, the gradient by R is zero
+    # The rotation is that of Kabsch: R^T = U diag(1, 1, det U V^T) V^T. At the least energy, the gradient by R is zero.
+    with torch.no_grad():
         U, _, V = torch.linalg.svd(((weights[:, None] * before) @ after.mT).double())
         V = V * torch.stack([torch.ones_like(U[..., 0, 0])] * 2 + [torch.linalg.det(U @ V)], -1)[..., None]
         R = (U @ V).mT.to(paths)

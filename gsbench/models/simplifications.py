@@ -47,23 +47,24 @@ def simplifications_of(
     simplified = []
     names = (*model.centers, *model.geometry)
     raw: Raw = {name: value.detach() for name, value in model.splats.items()}
-    fewer = {
+    by_order = {  # raw parameters without the coefficients above an order
         order: raw | {"shN": raw["shN"] * model.used_entries(EffectSets(0, 0, _all(model, order)))["shN"]}
         for order in model.lower_orders()
     }
     rows = model.count_by_effects()
     conditioned = len(model) - rows["static"]
-    refined, lost = _averages(model, queries, slices, weights, names if rows["refined"] else (), list(fewer.values()))
+    refined_names, lower = names if rows["refined"] else (), list(by_order.values())
+    refined, lost_colors = _averages(model, queries, slices, weights, refined_names, lower)
     raw = raw | refined
     if rows["refined"]:
         simplified.append(Simplification(CONDITIONED, refined, rows["refined"]))
     if frozen := model.frozen(raw, queries, weights):
         simplified.append(Simplification(STATIC, {key: raw[key] for key in names} | frozen[STATIC], conditioned))
     simplified.append(Simplification(REMOVED, None, len(model)))
-    for (order, less), missing in zip(fewer.items(), lost, strict=True):
-        constant = less["sh0"].clone()
-        constant.flatten(1, -2)[:, 0] += missing / SH_C0
-        simplified.append(Simplification(f"order{order}", {"sh0": constant, "shN": less["shN"]}, len(model), order))
+    for (order, lower_raw), lost_color in zip(by_order.items(), lost_colors, strict=True):
+        sh0 = lower_raw["sh0"].clone()
+        sh0.flatten(1, -2)[:, 0] += lost_color / SH_C0  # the coefficient that is constant in time too
+        simplified.append(Simplification(f"order{order}", {"sh0": sh0, "shN": lower_raw["shN"]}, len(model), order))
     return simplified
 
 
@@ -84,14 +85,15 @@ def _averages(
     slices: Sequence[Gaussians3D],  # of the model for these views
     weights: Tensor,  # [V, N] of each view for each Gaussian
     names: Sequence[str],  # of the raw parameters that AGR changes; empty without AGR
-    fewer: Sequence[Raw],  # raw parameters with lower SH degrees
+    lower: Sequence[Raw],  # raw parameters with lower SH degrees
 ) -> tuple[Raw, list[Tensor]]:
     """Return means over views of parameters after AGR (a network), and of the colour that a lower SH degree drops."""
 
-    def weighted(v: int) -> list[Tensor]:
+    def weighted(v: int) -> list[Tensor]:  # the terms of one view
         moved, sliced, weight = model.refined(queries[v]), slices[v], weights[v][:, None]
         colors = [
-            model.shade(moved | {"shN": less["shN"]}, sliced.means, sliced.opacities, queries[v]) for less in fewer
+            model.shade(moved | {"shN": simpler["shN"]}, sliced.means, sliced.opacities, queries[v])
+            for simpler in lower
         ]
         return [weight * moved[name] for name in names] + [weight * (sliced.colors - others) for others in colors]
 

@@ -197,7 +197,7 @@ def triangularise(rows: Tensor, k: int) -> tuple[Tensor, Tensor]:
 def gain_of(T_pq: Tensor, T_qq: Tensor) -> Tensor:
     """Compute K = T_pq T_qq^-1, by which means (p) move with time and direction (q); T_qq is lower triangular."""
     k = T_qq.shape[-1]
-    solved: list[Tensor] = []  # columns k-1, k-2, ..
+    solved: list[Tensor] = []  # columns k-1, k-2, .. of K, by substitution in K T_qq = T_pq
     for j in reversed(range(k)):
         column = T_pq[..., j]
         for i, x in zip(range(k - 1, j, -1), solved, strict=True):
@@ -215,6 +215,7 @@ def cholesky3(S: Tensor) -> Tensor:
     def over(x: Tensor, pivot: Tensor) -> Tensor:
         return torch.where(pivot > 0, x / torch.where(pivot > 0, pivot, 1.0), 0.0)
 
+    # L = [a 0 0; b d 0; c e f]
     a = root(S[:, 0, 0])
     b, c = over(S[:, 1, 0], a), over(S[:, 2, 0], a)
     d = root(S[:, 1, 1] - b * b)

@@ -163,7 +163,7 @@ def pixel_rays(camera: Camera) -> Tensor:
     x, y = (torch.arange(size, dtype=K.dtype, device=K.device) + 0.5 for size in (camera.width, camera.height))
     (fx, _, cx), (_, fy, cy), _ = K
     right, down, forward = camera.viewmat[:3, :3]
-    sight = ((x - cx) / fx)[:, None] * right + ((y - cy) / fy)[:, None, None] * down + forward
+    sight = ((x - cx) / fx)[:, None] * right + ((y - cy) / fy)[:, None, None] * down + forward  # [H, W, 3]
     return torch.cat([camera.center.expand_as(sight), unit(sight)], -1)
 
 
