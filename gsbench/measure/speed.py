@@ -161,7 +161,7 @@ class StageClock:
         yield clocks
         end = self._clock.mark()
         self.share([clock.seconds for clock in clocks], self._clock.seconds(start, end))
-        if self._last is not None:
+        if self._last is not None:  # in `running`: the next seconds of OTHER begin here
             self._last = end
 
     def share(self, workers: list[dict[str, float]], wall: float) -> None:

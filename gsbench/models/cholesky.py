@@ -179,6 +179,7 @@ class CholeskyModel(JointModel):
     @torch.no_grad()
     def shrink_rows(self, rows: Tensor, factors: Tensor) -> None:
         """Multiply factors T_pp of conditional covariances by a number for each Gaussian; motion does not change."""
+        # In double precision, because T_qq and T_pq are computed anew too.
         raw = {name: value.detach()[rows].double() for name, value in self.splats.items()}
         T_qq, T_pq, T_pp = reduce(self.factors(raw))
         for name, value in self._parameters_of(T_qq, T_pq, T_pp * factors[:, None, None]).items():

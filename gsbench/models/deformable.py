@@ -113,7 +113,10 @@ class DeformationField(nn.Module):
         positions: Tensor,  # [N, 3] world units
         time: Tensor,  # [] or [N] in [0, 1]
     ) -> tuple[Tensor, ...]:
-        """Return shifts [N, 3], changes of scales [N, 3] (both world units) and of quaternions [N, 4], or `outputs`."""
+        """Return shifts [N, 3], changes of scales [N, 3] (both world units) and of quaternions [N, 4].
+
+        With other `outputs`, return parts of these widths.
+        """
         features = self.of_time(encode(time.reshape(-1, 1), self.time_octaves))
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
         return collect_gradients(self.head(self.hidden(inputs)))[0].split(self.outputs, -1)

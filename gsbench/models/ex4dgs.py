@@ -76,10 +76,10 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         N, n = len(distances), self.intervals
         return super().initial_geometry(points, distances, generator) | {
             "velocities": torch.zeros(N, 3),
-            "key_means": torch.zeros(N, 3 * (n + 3)),
-            "key_quats": torch.zeros(N, 4 * (n + 1)),  # none outside of the clip
+            "key_means": torch.zeros(N, 3 * (n + 3)),  # at tau = 0 to n + 2
+            "key_quats": torch.zeros(N, 4 * (n + 1)),  # at tau = 1 to n + 1, none outside of the clip
             "windows": torch.tensor([-FOREVER, FOREVER]).repeat(N, 1),
-            "fades": log(torch.full((N, 2), float(n))),
+            "fades": log(torch.full((N, 2), float(n))),  # as long as the clip
         }
 
     def before_density(self, centers: Tensor, drawn: Tensor) -> None:
@@ -155,7 +155,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
     def penalty(self) -> Tensor:
         """Return the weighted sum of two means in units of the extent, [].
 
-        They are ln(|v| + 1e-3) of static Gaussians, and the distance |p_0 - p_k| of keyframes of dynamic ones.
+        They are ln(|v| + 1e-3) of static Gaussians, and |p_0 - p_k| of dynamic ones, a mean over keyframes and axes.
         """
         raw = {name: x[: self.conditioned] for name, x in self.splats.items()}
         dynamic = is_dynamic(raw)[:, 0]

@@ -105,7 +105,7 @@ class GatedModel(GaussianModel):
         state, effect_sets = super().pack(), self.effect_sets
         if effect_sets is None:
             return state
-        assert effect_sets.orders is not None
+        assert effect_sets.orders is not None  # a gate has set them
         for name, mask in self.used_entries(effect_sets).items():
             value = state[f"splats.{name}"]
             state[f"splats.{name}"] = value[mask.expand_as(value)]
@@ -164,18 +164,18 @@ def as_gated(model: GaussianModel) -> GatedModel:
     """Return the model if its single Gaussians can be made independent of time or direction; else raise InputError."""
     name = type(model).__name__
     if model.decodes:
-        cure = f"{name} decodes what is blended, so that its image is no sum over Gaussians: name another"
+        problem = f"{name} decodes what is blended, so that its image is no sum over Gaussians: name another"
     elif has_gates(model):
         return model
     elif isinstance(model, GatedModel):
-        cure = (
+        problem = (
             f"{name} inherits its methods for gates: see that they know all of its parameters, and write class "
             f"{name}(.., gates=True)"
         )
     else:
-        cure = f"{name} is no GatedModel: make it one"
+        problem = f"{name} is no GatedModel: make it one"
     raise InputError(
-        f"effects.gate: expected a model that gates can simplify, {cure}, or use effects.gate=off",
+        f"effects.gate: expected a model that gates can simplify, {problem}, or use effects.gate=off",
         docs="adding_a_model.md",
     )
 

@@ -163,6 +163,7 @@ class Planes(nn.Module):
         """Return the planes of each level by their axes, [rows, columns, C]; they share the memory of the nodes."""
         levels: list[dict[str, Tensor]] = [{} for _ in self.shapes]
         for kind, nodes in ((SPACE, self.of_space), (TIME, self.of_time)):
+            # In the order of the nodes; `level` is the dictionary that gets the plane
             named = [
                 (level, axes, shape[axes]) for level, shape in zip(levels, self.shapes, strict=True) for axes in kind
             ]

@@ -124,7 +124,8 @@ class Refinement(Changes):
         )
 
     def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
-        # The units scale rows and columns of the layers instead of the parameters of every Gaussian.
+        # The units divide the inputs and multiply the outputs: they scale columns and rows of the layers instead of the
+        # parameters of every Gaussian.
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         weights_out = (self.weight_out * self.units[:, None]).split(self.widths)
         biases_out = (self.bias_out * self.units).split(self.widths)

@@ -38,7 +38,7 @@ def rasterize_slices(
     """Rasterize slices of a model in one call, each for its camera, otherwise as `rasterize_slice`."""
     camera = cameras[0]
     return rasterize(
-        *gaussians[:4],
+        *gaussians[:4],  # means, factors, opacities and colours
         in_one([x.viewmat for x in cameras]),
         in_one([x.K for x in cameras]),
         camera.width,

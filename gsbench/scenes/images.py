@@ -131,7 +131,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
     while at < len(data):
         length, name = struct.unpack_from(">I4s", data, at)
         yield name, data[at + 8 : at + 8 + length]
-        at += 12 + length
+        at += 12 + length  # 4 bytes each of length, name and checksum
 
 
 def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
@@ -183,8 +183,8 @@ def stays_in_8_bits(
 
 
 def count_readers(
-    size: Size,
-    count: int,
+    size: Size,  # of an image before the reduction
+    count: int,  # of images
     downscale: int,
     where: str,
     pixel_bytes: int = 12,  # bytes a pixel of the reduced image

@@ -200,7 +200,7 @@ def _read_views(
     listed_shots = [
         Shot(
             image.path,
-            None,
+            None,  # no mask
             image.path.stem,
             str(image.path),
             (image.frame - first) / max(1, last - first),

@@ -293,10 +293,10 @@ def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
     """
     plain = [without_suffix(name.replace("\\", "/")) for name in names]
     moments: list[re.Match[str] | None] = [None] * len(names)
-    for pattern in _MOMENTS:
-        matches = [list(pattern.finditer(name)) for name in plain]
-        if all(len(match) == 1 for match in matches):
-            moments = [match[0] for match in matches]
+    for form in _MOMENTS:
+        matches = [list(form.finditer(name)) for name in plain]
+        if all(len(of_name) == 1 for of_name in matches):
+            moments = [of_name[0] for of_name in matches]
             break
     pattern = _DECIMAL if _have_decimals(plain) else _WHOLE
     by_name = []
@@ -415,8 +415,8 @@ def _steadiest(candidates: list[_Column], changing: list[_Column], images: Named
         others = [column for column in changing if column is not best]
         # Two cameras of a rig stand nearer to each other than it moves: a number of few values must be clearer.
         has_fewer = any(len(set(best.values)) < len(set(other.values)) for other in others)
-        least = step * (_CLEARLY**2 if has_fewer else _CLEARLY)
-        if len(moving) == 1 or least < moving[1][0]:
+        clearly_more = step * (_CLEARLY**2 if has_fewer else _CLEARLY)
+        if len(moving) == 1 or clearly_more < moving[1][0]:
             return [best]
     have_one_order = all(column.order == candidates[0].order for column in candidates)
     decimal = [column for column in candidates if any(value.denominator > 1 for value in column.values)]
