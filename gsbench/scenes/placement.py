@@ -212,7 +212,7 @@ def _seen_points(
 def _are_near(centers: NDArray[np.float64], size: float) -> NDArray[np.bool_]:  # [C]
     """Return which cameras are not far from the others; all if they are at one place."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    spread = float(np.quantile(distances, 0.75))  # of cameras that may be of two groups, such as the ends of a room
+    spread = float(np.quantile(distances, 0.75))  # the radius of three quarters of the cameras
     return distances <= _FAR_CAMERA * max(size, spread)
 
 
