@@ -94,6 +94,7 @@ def time_in_turns(
 
 
 def _milliseconds(render: Callable[[int], object], i: int, synchronise: Callable[[], None]) -> float:
+    """Return how long a call takes until the device has finished its work."""
     synchronise()
     start = time.perf_counter()
     render(i)

@@ -53,12 +53,12 @@ class BetaModel(GaussianModel):
         Mean directions are random in the cube [-1, 1]^3, and mean times in [0, 1], as in the authors' code.
         """
         N, has_time = len(distances), "time" in self.observes
-        exponents = [0.0, *([VIEW_BETA] * 3 if has_time else [0.0] * 3), *([0.0] if has_time else [])]
+        betas = [0.0, *([VIEW_BETA] * 3 if has_time else [0.0] * 3), *([0.0] if has_time else [])]
         raw = {
             "directions": torch.rand(N, 3, generator=generator) * 2 - 1,
             "scales": softplus_inverse(distances)[:, None].repeat(1, 3),
             "skew": torch.zeros(N, 3),
-            "betas": torch.tensor(exponents).repeat(N, 1),  # alpha's profile, direction x, y, z, time
+            "betas": torch.tensor(betas).repeat(N, 1),  # alpha's profile, direction x, y, z, time
         }
         return raw | {"times": initial_times(points, generator, margin=0)} if has_time else raw
 

@@ -128,6 +128,7 @@ class CholeskyModel(JointModel):
         return self.scheme in schemes and super().uses_kernel(raw)
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
+        """Return also the means of time and direction, and numbers by which the kernel knows the model's options."""
         named = super().kernel_arguments(raw, query) | {
             "coupling": raw.get("coupling", raw["motion"].detach()[..., :0]),  # [N, 0] if q is time alone
             "half": 0.5 if self.directional_half else 1.0,
@@ -161,7 +162,7 @@ class CholeskyModel(JointModel):
         factor = self.factors(raw)
         T_qq, T_pq, T_pp = reduce(factor)
         gain = gain_of(T_pq, T_qq)
-        in_time = self.moves_long(factor)[:, None]
+        in_time = self.moves_long(factor)[:, None]  # [N, 1]
         z = torch.randn(raw["means"].shape, generator=generator).to(factor)
         children = {"means": raw["means"] + torch.where(in_time, 0, (T_pp @ z[..., None])[..., 0])}
         T_pp = torch.where(in_time[..., None], T_pp, T_pp / SHRINK)

@@ -100,6 +100,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         splats["windows"][rows] = torch.tensor([1 + n / 4, 1 + 3 * n / 4]).to(motion)
 
     def change(self, raw: Raw, query: CameraTime) -> tuple[Tensor, Tensor]:
+        """Return shifts [N, 3], along keyframes or v t, and the factors f(tau) [N] of opacities."""
         assert query.time is not None
         tau = self.tau(query.time)
         along_keys = hermite(raw["key_means"].unflatten(1, (-1, 3)), tau)

@@ -177,6 +177,7 @@ class Gaussians4DModel(JointModel, gates=True):
         return super().kernel_arguments(raw, query) | {"clock": self.clock}
 
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
+        """Compute the colours [N, 3] at a camera centre and a time: `sh_time_colors`, or the same by a kernel."""
         assert query.time is not None
         sh0, degree, waves = raw["sh0"].flatten(1, 2), self.active.sh_degree, self.time_degree + 1
         if waves <= MAX_WAVES and self.backend.serves(means):  # as the kernel has no more

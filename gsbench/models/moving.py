@@ -140,7 +140,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         return super().initial_geometry(points, distances, generator) | {
             "times": logit(times),
             "directions": F.normalize(torch.randn(N, 3, generator=generator), dim=-1),
-            "precision": torch.tensor([view, 0.0, view, 0.0, 0.0, view, time]).repeat(N, 1),
+            "precision": torch.tensor([view, 0.0, view, 0.0, 0.0, view, time]).repeat(N, 1),  # a diagonal L
             "coupling": COUPLING_SPREAD * torch.randn(N, 12, generator=generator),
             "shares": torch.full((N, 2), SHARES),
         }
@@ -257,7 +257,7 @@ class DirectBetaModel(BetaModel, MovingGaussians3D, gates=True):
         L = precision_factor(raw["precision"])
         white = (L.mT @ delta[..., None])[..., 0]  # z
         V_pq = coupling_matrix(raw["coupling"], positive(raw["scales"]))
-        weighted = shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0]  # [N, C] of V_qq delta
+        weighted = shift_weights(raw["betas"]) * (L @ white[..., None])[..., 0]  # diag(min(b_q / 4, 1)) V_qq delta
         return (V_pq @ weighted[..., None])[..., 0], opacity_factor(white, raw["betas"])
 
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:

@@ -124,8 +124,10 @@ class Refinement(Changes):
         )
 
     def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
-        # The units divide the inputs and multiply the outputs: they scale columns and rows of the layers instead of the
-        # parameters of every Gaussian.
+        """Return units (W_out relu(W_in (means / units, encoded time) + b_in) + b_out), split as the parameters are.
+
+        The units scale columns and rows of the layers, which are fewer than the parameters of all Gaussians.
+        """
         weight_in, bias_in = self.weight_in[:, : self.features] / self.units[: self.features], self.at_time(time)
         weights_out = (self.weight_out * self.units[:, None]).split(self.widths)
         biases_out = (self.bias_out * self.units).split(self.widths)
@@ -171,6 +173,7 @@ class DeepRefinement(Changes):
         nn.init.zeros_(self.head.bias)
 
     def added(self, values: list[Tensor], time: Tensor) -> list[Tensor]:
+        """Return units network(means / units, encoded, and encoded time), split as the parameters are."""
         means = torch.cat(values[: self.inputs], -1).detach()
         means = means / self.units[: means.shape[-1]]
         gamma = encode_time(time, self.octaves)

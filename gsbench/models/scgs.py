@@ -82,6 +82,7 @@ class ScgsModel(DeformableModel):
         super().set_active(active)
 
     def condition(self, raw: Raw, query: CameraTime) -> Conditioned:
+        """Blend the motion of the M nodes for each Gaussian; in the warm-up nothing moves."""
         if self.active.warms_up:
             return self.static(raw)
         assert query.time is not None

@@ -142,7 +142,7 @@ def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
     at = len(_SIGNATURE)
     while True:
         header = data[at : at + 8]
-        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")  # then the checksum lacks too
+        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")  # then it has no checksum
         body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(checksum) < 4:
             raise DamagedError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")

@@ -186,7 +186,7 @@ def _check_readable(path: Path, data: bytes) -> None:
 
 
 def columns(vertices: NDArray[np.void], names: Sequence[str], path: Path, largest: float) -> NDArray[np.float64]:
-    """Return some properties of vertices as [P, len(names)]; raise InputError if one lacks or exceeds +-`largest`."""
+    """Return some properties of vertices as [P, len(names)]; raise InputError if one is missing or too large."""
     for name in names:
         if name not in (vertices.dtype.names or ()):
             raise InputError(f"{path}: {name}: expected this vertex property, found {vertices.dtype.names!r:.120}")

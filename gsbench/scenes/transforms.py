@@ -70,7 +70,7 @@ class Intrinsics:
                     "intrinsics with it, or write both w and h"
                 )
         fx, fy = (self._focal(axis, side) for axis, side in enumerate((width, height)))
-        fx, fy = fx or fy or 0.0, fy or fx or 0.0  # _read_intrinsics demands one; both are equal then
+        fx, fy = fx or fy or 0.0, fy or fx or 0.0  # at least one is stated; without the other, pixels are square
         if self.y_of_file and abs(fx - fy) > _AGREE * fx:
             raise InputError(
                 f"{self.where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
@@ -362,7 +362,7 @@ def _split_views(
     by_path = {frame.path: view for frame, view in zip(split.frames, views, strict=True)}
     by_split: list[list[View]] = []
     for key, names in zip(_SPLITS, lists, strict=True):
-        where, of_split = f"{split.source}: {key}", dict[int, View]()
+        where, of_split = f"{split.source}: {key}", dict[int, View]()  # by id, as views have no hash
         if not isinstance(names, list):
             names = [] if names is None else [names]  # a single value is read as a list of one, or refused
         for name in names:
