@@ -74,7 +74,9 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
-    points, _ = colmap.points_beside(root) or (None, None)
+    points, points_file = colmap.points_beside(root) or (None, None)
+    if points_file:
+        digests[points_file.relative_to(root).as_posix()] = files.digest(points_file.read_bytes())
     return standard_scene(
         name=root.name,
         train=train,

@@ -60,14 +60,17 @@ def test_cameras_times_and_splits(root: Path) -> None:
 
 
 def test_points_keep_their_times(root: Path) -> None:
-    """Catches times that are lost where a scene comes to its standard place."""
+    """Catches times that are lost where a scene comes to its standard place, and a fingerprint without the points."""
+    before = scenes.load(root).fingerprint
     properties = [
         f"property {kind}"
         for kind in ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float time")
     ]
     header = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header"]
     (root / "points3d.ply").write_text("\n".join([*header, "0 0 50 1 2 3 0.25", "1 1 50 1 2 3 1", ""]))
-    points = scenes.load(root).points
+    scene = scenes.load(root)
+    points = scene.points
+    assert scene.fingerprint != before
     assert points.times.tolist() == [0.25, 1.0]
     assert points.means.dtype == points.times.dtype == torch.float32
 
