@@ -237,7 +237,7 @@ class Drawing(NamedTuple):
 
     def record(self) -> tuple[Splats, Tensor, Tensor]:
         """Record the call for the backward pass; return the splats, and image and alpha as `blend` does."""
-        splats = Splats(*_project.record(*self.projection))
+        splats = Splats(*_project.record(*self.projection))  # `blending` has their exponents
         (_, _, _, *further), numbers, results = self.blending  # the first three again, but with gradients
         image, alpha, *_ = _blend.record([splats.means2d, splats.roots, splats.half_sizes, *further], numbers, results)
         return splats, image, alpha

@@ -140,7 +140,7 @@ def _judge(experiment: Experiment, run: Identity) -> RunStatus:
     if stopped and (went_on or (record and stopped.started <= record.written)):
         stopped = None  # or it was stopped when its record was written already
     state = RunStatus(list(run), "not started")
-    if report and (alive := _alive(report, experiment.queue)):
+    if report and (alive := _state_if_alive(report, experiment.queue)):
         left = report.seconds / report.step * (report.steps - report.step) if report.step else None
         waits = alive.partition(" ")[2] if alive.startswith("PENDING") else None
         going = _with_progress(state, report, "running" if waits is None else "queued", waits)
@@ -189,8 +189,11 @@ def _kept(experiment: Experiment, planned: PlannedRun | None) -> RecordStatus | 
     return experiment.records_by_path.get(experiment.folder.parent / planned.ended.record)
 
 
-def _alive(report: Progress, queue: Queue) -> str | None:
-    """Return the state of a run that has a progress file: `RUNNING`, `PENDING` with a reason, or None if it ended."""
+def _state_if_alive(report: Progress, queue: Queue) -> str | None:
+    """Return the state of a run that has a progress file: `RUNNING`, `PENDING` with a reason, or None if it ended.
+
+    If Slurm does not answer, the age of the progress file decides.
+    """
     if report.job is None:
         return "RUNNING" if is_alive(report) else None
     if queue.silent:

@@ -236,8 +236,9 @@ class GaussianModel(nn.Module, ABC):
     def shade(self, raw: Raw, means: Tensor, opacities: Tensor, query: CameraTime) -> Tensor:
         """Compute the SH colours [N, 3] of 3D Gaussians as seen from `query.center`, the camera's centre.
 
-        The kernel skips Gaussians that are culled because of their opacity. A model with other colours overrides this
-        method.
+        `means` [N, 3] and `opacities` [N] are those of the slice, and `self.orders` has the SH degree of each Gaussian.
+        The kernel leaves the colours of Gaussians 0 that are culled because of their opacity. A model with other
+        colours overrides this method.
         """
         degree = self.active.sh_degree
         if self.backend.serves(means):

@@ -97,7 +97,8 @@ class CholeskyModel(JointModel):
         """Condition Gaussians on time t and on the unit vector d from the camera to their means (7DGS, algorithm 1)."""
         factor, offset = self.factors(raw), self.offset(raw, query)
         k = offset.shape[1]
-        # With the rows (d, t, p) the factor has the form [T_qq 0; T_pq T_pp] as it is.
+        # `factors` sorts rows to (p, d, t), and leaves the columns in the order of the parametrization. If this is
+        # (d, t, p), the first columns are T_qq and T_pq, and the last T_pp.
         reduced = (
             Reduced(factor[:, 3:, :k], factor[:, :3, :k], factor[:, :3, k:]) if self.is_reduced else reduce(factor)
         )
@@ -111,7 +112,7 @@ class CholeskyModel(JointModel):
         opacity_factor = torch.where(visible, exp(-self.exponents(T_qq, delta, white)["static"]), 0.0)
         if self.scheme == "square_root":
             means, factors = raw["means"] + (reduced.T_pq * white[:, None]).sum(-1), reduced.T_pp
-        else:
+        else:  # these schemes are for comparison, and do without `delta`
             mean = F.pad(raw["means"], (0, k))  # q is measured from mu_q
             means, factors, _ = slice_gaussians(mean, factor, offset, scheme=self.scheme)
         return Conditioned(means, factors, opacity_factor)
@@ -235,7 +236,7 @@ class CholeskyModel(JointModel):
         To remove the dependence on a variable, its columns of the gain K (the derivative of the mean with respect to
         the variable) become zero. The average shift of the mean over views is added to the mean, and the opacity is
         multiplied by the average opacity factor. The standard deviation of the variable becomes exp(LOG_SIZE_MAX), so
-        that the opacity factor is 1 for every view.
+        that the opacity factor is 1 for every view. `weights` are [V, N].
         """
         blocks = Reduced(*(block.double() for block in reduce(self.factors(raw))))
         gain = gain_of(blocks.T_pq, blocks.T_qq)

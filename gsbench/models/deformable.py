@@ -119,4 +119,5 @@ class DeformationField(nn.Module):
         """
         features = self.of_time(encode(time.reshape(-1, 1), self.time_octaves))
         inputs = torch.cat([encode(positions, self.octaves), features.expand(len(positions), -1)], -1)
+        # The outputs are read by several kernels; `collect_gradients` lets autograd run through the network only once.
         return collect_gradients(self.head(self.hidden(inputs)))[0].split(self.outputs, -1)

@@ -42,7 +42,7 @@ class FreeTimeModel(MovingGaussians3D, gates=True):
     def __init__(
         self,
         *,
-        duration: float = math.sqrt(1 / 5),  # initial standard deviation in time: 4DGS', because points have no times
+        duration: float = math.sqrt(1 / 5),  # initial standard deviation in time: that of 4DGS
         **options: Any,
     ) -> None:
         super().__init__(**options)

@@ -48,11 +48,12 @@ class GatedModel(GaussianModel):
 
     @abstractmethod
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
-        """Return raw parameters of Gaussians in which time, direction or both are replaced by a mean over V views.
+        """Return raw parameters of Gaussians that no longer depend on time, on direction, or on both.
 
-        The result has a dictionary of changed raw parameters for each variable that is replaced, and a last dictionary
-        `static`, in which all variables are replaced. The result is empty if the model depends on neither time nor
-        direction. `raw` is without AGR; `weights` [V, N] are those of the views for each Gaussian, with a sum of 1.
+        Means and opacities become their weighted averages over V views; these are not those of an average time. The
+        keys of the result are "time" and "direction", where the model can lose this variable alone, and always
+        "static", which has lost both. Values are the raw parameters that change. The result is empty if the model
+        depends on neither. `raw` is without AGR; `weights` are [V, N], with a sum of 1 for each Gaussian.
         """
 
     def lower_orders(self) -> list[int]:

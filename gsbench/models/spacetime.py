@@ -78,12 +78,12 @@ class SpacetimeModel(MovingGaussians3D, gates=True):
 
     def kernel_arguments(self, raw: Raw, query: CameraTime) -> dict[str, Any]:
         """Return Gaussians that were moved and turned in torch, of which FreeTimeGS' kernel makes the slice."""
-        e = offset(raw, query).detach()[: self.conditioned]
+        e = offset(raw, query).detach()[: self.conditioned]  # the first `conditioned` ones are not static; None: all
         e = F.pad(e, (0, 0, 0, len(raw["means"]) - len(e)))  # static Gaussians neither move nor turn
         at_time = {
             "means": raw["means"] + shift(raw, e),
             "quats": turned(raw, e),
-            "durations": raw["durations"] - LOG_ROOT_2,
+            "durations": raw["durations"] - LOG_ROOT_2,  # to the standard deviations of FreeTimeGS
             "velocities": torch.zeros_like(raw["means"]),
         }
         return super().kernel_arguments(raw | at_time, query)

@@ -198,9 +198,9 @@ def _number(value: float | None) -> float:
 
 
 def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return runs without the times of other machines than that of most finished runs, which is in `timed_on`."""
+    """Set times to NaN unless they are of the machine with the most finished runs; `timed_on` is its name."""
     counted = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
-    machine = str(counted.machine.value_counts(sort=False).idxmax())
+    machine = str(counted.machine.value_counts(sort=False).idxmax())  # of equals the first
     times = {name: runs[name].where(runs.machine == machine) for name in TIMES}
     return runs.assign(**times, timed_on=machine)
 

@@ -350,7 +350,7 @@ def _protocol(record: Record) -> str:
 
 
 def sections(results: Results) -> dict[str, list[Section]]:
-    """Return the sections of each table by the name of its file."""
+    """Return the sections of each table by the name of its file; that of table1 also counts all runs."""
     runs = of_the_paper(results)
     return {
         "table1": [*_sections1(runs), pools(runs)],

@@ -49,7 +49,7 @@ def _of_views(record: Record) -> str:
     for score in VIEWS.values():
         mean = (record.metrics or {}).get(score)
         values = [value for view in record.per_view if (value := getattr(view, score)) is not None]
-        if mean is None or not (values or score == "psnr"):
+        if mean is None or not (values or score == "psnr"):  # early records have only PSNR of their views
             continue
         if len(values) < len(names) and score not in OF_PIXELS:
             return f"per_view: expected {score} of all {len(names)} views, as metrics has it, got it of {len(values)}"

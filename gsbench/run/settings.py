@@ -166,6 +166,8 @@ def candidates(config: Config) -> dict[str, Config]:
 def _with_model(config: Config, model: Any, key: str) -> Config:
     """Return settings with another model, from the config key `key`, with AGR only if the model's settings have it.
 
+    `model.gate`, the default of effects.gate, stays that of the run's model, such as auto.
+
     Raises:
         InputError: `model` is not a model config.
     """

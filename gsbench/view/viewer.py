@@ -256,7 +256,7 @@ class Viewer:
         self.wake = threading.Event()  # a browser needs a frame
         self.bounds = ThreadPoolExecutor(1)  # on the error of float32, which take so long that frames must not wait
         self._stops = False
-        with guard.active():
+        with guard.active():  # a server that is made here keeps refusing requests of other pages
             self.server = viser.ViserServer(host, guard.port, label=f"gsbench: {first.scene.name}", verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()  # beside the images instead of on top of them

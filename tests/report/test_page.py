@@ -252,6 +252,21 @@ def test_the_gallery_has_every_model_on_the_same_view_with_its_score(tmp_path):
     assert [view.scores["7dgs"] for view in views] == [f"{m}, moving {e}" for m, e in zip(moving, endings, strict=True)]
 
 
+def test_files_of_more_views_are_shown_beside_those_of_fewer(tmp_path):
+    """Catches a render of another view beside the true image: files have the views evenly spaced among all of them."""
+    runs = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))
+    folder = write_all(runs, tmp_path, pictures=3)
+    (path,) = folder.glob("suzanne/7dgs*/seed0/pictures.png")
+    colours = np.linspace(0, 1, 5)
+    write_png(strip([np.full((2, 40, 60, 3), colour) for colour in colours]), path)
+    views = shown_views(folder)
+    assert [view.name for view in views] == ["test/r_000", "test/r_006"]
+    assert [view.scores["7dgs"] for view in views] == [f"PSNR {runs[1].per_view[i].psnr:.2f} dB" for i in (0, 6)]
+    for view, colour in zip(views, colours[[0, 3]], strict=True):
+        data = base64.b64decode(view.render["7dgs"].partition(",")[2])
+        assert abs(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).mean() - 255 * colour) < 2
+
+
 def test_the_pictures_fit(tmp_path, monkeypatch):
     """Catches images that make the page too large: noise compresses worst, and the budget is for one view of three."""
     runs = frontier(("3dgs", "7dgs"), ("suzanne",), 1, (1000,))

@@ -10,15 +10,15 @@ from gsbench.report.section import COLUMNS, Column, Section, section
 def candidates(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table: a row for each candidate on a scene."""
     runs = chapter.finished.runs
-    runs = runs[runs.on_demand]
+    runs = runs.assign(is_timed=runs.machine == runs.timed_on)[runs.on_demand]  # on the machine of most runs
     rows = [
         {
             "scene": run.scene,
             "model": run.label,
             "candidate": candidate.name,
             "psnr_val_db": candidate.psnr_val,
-            "train_s": candidate.seconds if run.machine == run.timed_on else None,
-            "frame_ms": candidate.frame_ms if run.machine == run.timed_on else None,
+            "train_s": candidate.seconds if run.is_timed else None,
+            "frame_ms": candidate.frame_ms if run.is_timed else None,
             "chosen": candidate.name == comparison.chosen,
             "why": candidate.reason,
         }

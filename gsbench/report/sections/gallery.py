@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsbench.errors import printable
 from gsbench.measure.images import GAP, HEADER, Pixels
-from gsbench.measure.record import Record, ViewScore
+from gsbench.measure.record import Record
 from gsbench.report.frame import Results
 from gsbench.report.section import EMPTY, Section, number, section
 
@@ -138,40 +138,40 @@ def _has_blocks(image: Pixels, factor: int) -> bool:
 
 
 def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quality: int, most: int) -> list[View]:
-    """Encode the views that the image files of all models contain."""
-    models = dict(sorted(models.items()))
-    shared = min(len(strip) for _, strip in models.values())
-    record, strip = next(iter(models.values()))
-    names = [printable(view.name)[:60] for view in _spaced(record, shared)]
+    """Encode the first `most` views that the image files of all models contain, `side` pixels long."""
+    by_view = {
+        model: dict(zip(_names(record, len(strip)), strip, strict=False))
+        for model, (record, strip) in sorted(models.items())
+    }
+    first, *others = by_view.values()
     shown = []
-    for i in range(min(shared, most)):
+    for name in [name for name in first if all(name in rows for rows in others)][:most]:
         render, error = (  # columns 0 and 2 of a Strip
-            {model: _encode(rows[i][kind], side, quality) for model, (_, rows) in models.items()} for kind in (0, 2)
+            {model: _encode(rows[name][kind], side, quality) for model, rows in by_view.items()} for kind in (0, 2)
         )
-        scores = {model: _score(record_of_model, len(rows), i) for model, (record_of_model, rows) in models.items()}
-        truth, (height, width) = _encode(strip[i][1], side, quality), strip[i][1].shape[:2]
-        name = names[i] if i < len(names) else f"view {i + 1}"
-        shown.append(View(scene, name, truth, render, error, scores, width, height))
+        scores = {model: _score(models[model][0], name) for model in by_view}
+        truth, (height, width) = _encode(first[name][1], side, quality), first[name][1].shape[:2]
+        shown.append(View(scene, printable(name)[:60], truth, render, error, scores, width, height))
     return shown
 
 
-def _spaced(record: Record, rows: int) -> list[ViewScore]:
-    """Return the views in an image file, which are evenly spaced among the evaluated views."""
-    return record.per_view[:: max(1, len(record.per_view) // max(1, rows))][:rows]
+def _names(record: Record, rows: int) -> list[str]:
+    """Return the names of the views in an image file, which are evenly spaced among the evaluated views."""
+    return [view.name for view in record.per_view[:: max(1, len(record.per_view) // max(1, rows))]]
 
 
-def _score(record: Record, rows: int, i: int) -> str:
-    """Return the PSNR of row `i` of an image file as text; a region is left out if no view of the run has it."""
-    views = _spaced(record, rows)
-    if i >= len(views) or views[i].psnr is None:
+def _score(record: Record, name: str) -> str:
+    """Return the PSNR of a view as text; a region is left out if no view of the run has it."""
+    view = next(view for view in record.per_view if view.name == name)
+    if view.psnr is None:
         return ""
-    regions = {"moving": views[i].psnr_moving, "object": views[i].psnr_object}
+    regions = {"moving": view.psnr_moving, "object": view.psnr_object}
     texts = [
         f"{name} {EMPTY if psnr is None else number(psnr, 2)}"
         for name, psnr in regions.items()
         if name in record.regions
     ]
-    return ", ".join([f"PSNR {number(views[i].psnr or 0.0, 2)} dB", *texts])
+    return ", ".join([f"PSNR {number(view.psnr, 2)} dB", *texts])
 
 
 def _encode(image: Pixels, side: int, quality: int) -> str:

@@ -32,7 +32,7 @@ class Best(Hook):
     def after_measuring(self, finished: int, psnr: float) -> float:
         """Measure the evaluated split, and keep the scores that are the best so far; return `psnr` as it is."""
         scores, leaks = self.scores, self.training.config.protocol.best_on_test
-        is_best = psnr >= rank(scores.val)  # a NaN is never the best
+        is_best = psnr >= rank(scores.val)  # a NaN is never the best; rank of None or NaN is -inf
         if leaks or is_best:
             now = self.training.psnr(self.training.views)
             if is_best:
