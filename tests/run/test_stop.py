@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -73,6 +74,20 @@ def test_a_signal_is_noted_while_a_run_lasts(number: int, monkeypatch: pytest.Mo
             assert request.signal is None
     finally:
         signal.signal(number, before)
+
+
+def test_a_second_request_ends_a_process_that_had_no_handler() -> None:
+    """Catches a process that cannot be ended by its signal while it saves."""
+    code = """
+import os, signal
+from gsbench.run import stop
+stop.SAME_REQUEST = 0.0
+with stop.requested() as request:
+    os.kill(os.getpid(), signal.SIGTERM)
+    assert request.signal == signal.SIGTERM
+    os.kill(os.getpid(), signal.SIGTERM)
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGTERM
 
 
 def test_a_run_reports_once_an_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
