@@ -21,16 +21,19 @@ def clock(monkeypatch):
 
 
 def test_render_times_are_percentiles_after_warm_up(clock):
-    """Would catch warm-up calls in the figures, percentiles taken wrongly, an FPS that is not 1000 / median, and one of
-    a handful of frames."""
+    """Would catch warm-up calls in the figures or of one view only, percentiles taken wrongly, an FPS that is not
+    1000 / median, and one of a handful of frames."""
     costs = iter([100.0] * 5 + list(range(1, 32)))  # warm-up is slow, then 1..31 ms
+    rendered = []
 
-    def render(_: int) -> None:
+    def render(i: int) -> None:
+        rendered.append(i)
         clock[0] += next(costs) / 1000
 
     times = speed.time_renders(render, count=31, warmup=5)
     assert (times.p10, times.p50, times.p90) == pytest.approx((4, 16, 28))
     assert times.fps == pytest.approx(1000 / 16)
+    assert rendered == [*range(5), *range(31)]
     with pytest.raises(InputError, match="30"):
         speed.time_renders(lambda _: None, count=29)
 
