@@ -137,6 +137,7 @@ def test_kinds_of_tensors(backend: str) -> None:
         ({"colors": doubles(40, 2)}, "background: expected shape [2], got [3]"),
         ({"Ks": torch.eye(3).double().repeat(2, 1, 1)}, "Ks: expected shape [1, 3, 3], got [2, 3, 3]"),
         ({"colors": doubles(40, 0), "background": None}, "colors"),
+        ({"colors": 0.5, "background": None}, "colors: expected a tensor, got float"),
         ({"viewmats": doubles(0, 4, 4), "Ks": doubles(0, 3, 3)}, "viewmats"),
         ({"beta_exponents": 2.0}, "beta_exponents: expected a tensor, got float"),
         ({"beta_exponents": SHAPES[:1]}, "beta_exponents: expected shape [40], got [1]"),

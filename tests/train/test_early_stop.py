@@ -50,6 +50,7 @@ def test_a_training_stops_after_its_best_and_keeps_it(
     plain = train(trainer("7dgs", *PATIENT, *words, "train.patience=null", "effects.gate=off"), until=kept)
     assert_same_bits(*({**each.model.state_dict()} for each in (fitted, plain)))
     assert saved[-1]["hooks"]["early_stop"]["kept"] is None  # nothing is left to go back to
+    assert "early_stop" not in fitted.state_of_gaussians()["hooks"]  # or a kept state would hold the one before it
 
 
 def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
