@@ -321,19 +321,23 @@ def dnerf100_rivals(published: Path) -> str:
     return block(table, **columns)
 
 
-def dnerf100_signs(published: Path) -> str:
+def dnerf_signs(published: Path) -> str:
     """Return differences of models beside those in the paper, and on how many scenes both have the same sign."""
-    arrays = stats.grids(only(published, "dnerf100"))
     in_paper = paper.table1().psnr_db[DNERF].unstack()
+    variants = {"100 × 100": ("dnerf100", DNERF_VARIANT), "200 × 200": ("dnerf200", "recipe=quick")}
+    arrays = {size: stats.grids(only(published, study)) for size, (study, _) in variants.items()}
     rows = {}
     for a, b in (("7dgs", "4dgs"), ("7dgs_noagr", "4dgs"), ("7dgs", "7dgs_noagr")):
-        gains = stats.contrast_by_scene(arrays, minus(a, b, DNERF_VARIANT))
-        expected = (in_paper[a] - in_paper[b])[list(gains)]
-        same = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
+        expected, cells, same = in_paper[a] - in_paper[b], {}, []
+        for size, (_, variant) in variants.items():
+            gains = stats.contrast_by_scene(arrays[size], minus(a, b, variant))
+            cells[size] = gain_text(list(gains.values()))
+            same.append(sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items()))
+        paper_gain = number(expected[list(gains)].mean(), 2, signed=True)
         rows[f"`{a}` - `{b}`"] = {
-            "here": gain_text(list(gains.values())),
-            "paper": number(expected.mean(), 2, signed=True),
-            "same sign": f"{same}/{len(gains)}",
+            **cells,
+            "paper": paper_gain,
+            "same sign": ", ".join(f"{n}/{len(gains)}" for n in same),
         }
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
@@ -403,7 +407,7 @@ README: dict[str, Callable[[Path], str]] = {
     "cost": cost,
     "worth": worth,
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
-    "dnerf100_signs": dnerf100_signs,
+    "dnerf_signs": dnerf_signs,
 }
 _OF_RESULTS = (
     dnerf100,
