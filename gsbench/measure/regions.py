@@ -78,8 +78,8 @@ def moving(views: Sequence[View]) -> Regions:
             median[row : row + STRIP] = strip[(len(group) - 1) // 2]  # the lower one of an even number
         radius = round(sums.shape[1] / PIXELS_OF_A_RADIUS)
         for view, image_sums in zip(group, sums, strict=True):
-            changes = np.abs(image_sums.astype(np.int32) - median)  # of sums of 9 pixels
-            moved = (changes > 9 * THRESHOLD).any(-1).astype(np.uint8)
+            # Sums of 9 pixels are compared. The differences have no name, so that their memory is freed at once.
+            moved = (np.abs(image_sums.astype(np.int32) - median) > 9 * THRESHOLD).any(-1).astype(np.uint8)
             moved = cv2.morphologyEx(moved, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
             masks[view.name] = cv2.dilate(moved, np.ones((2 * radius + 1,) * 2, np.uint8)).astype(bool)
     return _large(masks, "images of one camera")

@@ -290,12 +290,8 @@ def dnerf100(published: Path) -> str:
 def dnerf200(published: Path) -> str:
     """Return PSNR of models on the scenes of D-NeRF at 200 x 200 pixels with `+recipe=quick`, and average costs."""
     runs, models = only(published, "dnerf200").runs, ["4dgs", "7dgs_noagr", "7dgs"]
-    costs = runs.assign(cpu_min=runs.train_cpu_s / 60).groupby("model")[["cpu_min", "frame_ms", "gaussians"]].mean()
-    columns = {
-        "cpu_min": Column("CPU min", 1),
-        "frame_ms": Column("ms a frame", 2),
-        "gaussians": Column("Gaussians", 0),
-    }
+    costs = runs.assign(cpu_min=runs.train_cpu_s / 60).groupby("model")[["cpu_min", "gaussians"]].mean()
+    columns = {"cpu_min": Column("CPU min", 1), "gaussians": Column("Gaussians", 0)}
     texts = Section("", "", "", costs.loc[models], columns).shown(bold).set_axis(models)
     return block(pd.concat([_by_scene(runs, models), texts.T]).rename_axis("scene"))
 
