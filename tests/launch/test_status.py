@@ -297,6 +297,16 @@ def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
     assert f"a plan is left out: {tmp_path}" in lines(experiment, [run])[1]
 
 
+def test_a_damaged_progress_file_hides_no_other_run(tmp_path: Path) -> None:
+    """Catches runs that are left out, because a file that is read before theirs is damaged."""
+    folder = traced(tmp_path, progress_of=HERE)
+    damaged = folder.parent / "another"  # its name comes first
+    damaged.mkdir()
+    (damaged / progress.FILE_NAME).write_text("{")
+    assert damaged.name < folder.name
+    assert only(tmp_path).state == "running"
+
+
 def test_only_what_differs_names_a_run() -> None:
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
     runs = [
