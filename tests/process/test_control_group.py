@@ -106,6 +106,14 @@ def test_the_group_counts_in_what_is_available(monkeypatch):
     assert memory.available() == 12345
 
 
+def test_the_address_space_counts_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a limit of the address space from which only the resident memory is taken."""
+    monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 50)
+    status = Path("/proc/self/status").read_text().splitlines()
+    used = next(1024 * int(line.split()[1]) for line in status if line.startswith("VmSize:"))
+    assert (1 << 50) - memory._address_space() == pytest.approx(used, rel=0.1)
+
+
 def test_what_cannot_be_read_is_no_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a system without /proc whose memory counts as used up."""
     monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 30)
