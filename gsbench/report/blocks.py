@@ -328,13 +328,10 @@ def dnerf_signs(published: Path) -> str:
         for size, (_, variant) in variants.items():
             gains = stats.contrast_by_scene(arrays[size], minus(a, b, variant))
             cells[size] = gain_text(list(gains.values()))
-            same.append(sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items()))
-        paper_gain = number(expected[list(gains)].mean(), 2, signed=True)
-        rows[f"`{a}` - `{b}`"] = {
-            **cells,
-            "paper": paper_gain,
-            "same sign": ", ".join(f"{n}/{len(gains)}" for n in same),
-        }
+            agree = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
+            same.append(f"{agree}/{len(gains)}")
+        mean = number(expected.mean(), 2, signed=True)
+        rows[f"`{a}` - `{b}`"] = {**cells, "paper": mean, "same sign": ", ".join(same)}
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
 

@@ -220,16 +220,16 @@ def read_images(file: ModelFile) -> list[PosedImage]:
     return list(by_name.values())
 
 
-def points_beside(root: Path) -> tuple[Points, Path] | None:
-    """Return the initial points of a folder that has its cameras elsewhere, and their file.
+def points_beside(root: Path) -> tuple[Points | None, dict[str, str]]:
+    """Return the initial points of a folder that has its cameras elsewhere, and the digest of their file by its name.
 
-    They are those of the COLMAP model in `sparse/0`, or of `points3d.ply`; None if neither exists.
+    They are those of the COLMAP model in `sparse/0`, or of `points3d.ply`. If neither exists, there are none.
     """
     if (root / "sparse" / "0").is_dir():
         file = read_part(root / "sparse" / "0", "points3D")
-        return read_points(file), file.path
+        return read_points(file), {file.path.relative_to(root).as_posix(): files.digest(file.data)}
     ply = root / "points3d.ply"
-    return (read_ply(ply), ply) if ply.exists() else None
+    return (read_ply(ply), {ply.name: files.digest(ply.read_bytes())}) if ply.exists() else (None, {})
 
 
 def read_points(file: ModelFile) -> Points:

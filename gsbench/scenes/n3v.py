@@ -97,7 +97,7 @@ def load(
     require(needed, f"{root}: frames while they are decoded and measured", "use a larger scene.downscale")
     cameras = [_camera(film, rows[film], size, source) for film in films]
     # Before frames are decoded, which takes minutes, because these files may be damaged.
-    points, points_file = colmap.points_beside(root) or (None, None)
+    points, points_file = colmap.points_beside(root)
     digests = {film.path.name: film.digest() for film in films} | {POSES: files.digest(data)}
     paths = _decoded_files(root, films, digests, (first, last), rendition, size)
     by_film = [
@@ -111,9 +111,7 @@ def load(
     )
     notes.append(f"{POSES}: depths are not read; no distortion is stated")
     notes += [f"cameras left out: {', '.join(leave_out)}"] if leave_out else []
-    if points_file:
-        digests[points_file.relative_to(root).as_posix()] = files.digest(points_file.read_bytes())
-    notes.append(f"initial points: {f'those of {points_file.relative_to(root)}' if points_file else 'random'}")
+    notes.append(f"initial points: {f'those of {next(iter(points_file))}' if points_file else 'random'}")
     test, *train = by_film  # the test camera is cam00, the first
     return standard_scene(
         name=name,
@@ -122,7 +120,7 @@ def load(
         test=test,
         background=rendition.background,
         points=points,
-        fingerprint=files.fingerprint(digests),
+        fingerprint=files.fingerprint(digests | points_file),
         notes=tuple(notes),
         up=None,
     )

@@ -74,9 +74,7 @@ def load(
     digests[CAMERAS] = files.digest(text)
     train = [view for image, view in zip(listed, views, strict=True) if image.camera != TEST_CAMERA]
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
-    points, points_file = colmap.points_beside(root) or (None, None)
-    if points_file:
-        digests[points_file.relative_to(root).as_posix()] = files.digest(points_file.read_bytes())
+    points, points_file = colmap.points_beside(root)
     return standard_scene(
         name=root.name,
         train=train,
@@ -84,7 +82,7 @@ def load(
         test=test,
         background=rendition.background,
         points=points,
-        fingerprint=files.fingerprint(digests),
+        fingerprint=files.fingerprint(digests | points_file),
         repaired=tuple(image.path.stem for image in replaced),
         up=None,
         notes=(*files.unread(CAMERAS, rows[0].keys() - {*COLUMNS, *DISTORTION}), *notes),

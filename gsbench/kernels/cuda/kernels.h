@@ -46,8 +46,8 @@ GSB_FIELDS(DensityState, OUTPUTS, gradient, times_visible, unseen)
 }  // namespace gsb
 
 // `draw` checks values, projects, lists the splats of each tile and blends; the inputs of blending are outputs of the
-// earlier kernels. If a value is bad, or `room` too small, each image gets a NaN, so that its loss is NaN. `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the
-// same.
+// earlier kernels. If a value is bad, or `room` too small, each image gets a NaN, so that its loss is NaN.
+// `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the same.
 #define GSB_CUDA_KERNELS(kernel)                                                                   \
     GSB_KERNELS(kernel)                                                                            \
     kernel(draw, ProjectArgs, Splats, BlendArgs, Picture, TileLists)                               \
