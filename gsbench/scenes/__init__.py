@@ -22,7 +22,8 @@ class _Layout:
 
     marker: str
     expected: str  # the files of the layout and where such data is published, for the error message
-    reader: str  # module.function of this package: (root, rendition) -> Scene; imported late
+    # module.function of this package: (root, name, rendition) -> Scene; imported late. The root is resolved.
+    reader: str
     reads_too: tuple[str, ...] = ()  # files by which other layouts are recognised, and which this reader reads too
     options: tuple[str, ...] = ()  # of `load` that only some layouts have
     beside: str = "*"  # a pattern of names, one of which is there too; other data has poses_bounds.npy as well
@@ -132,13 +133,14 @@ def load(
         raise InputError(f"{root}: {why}: looked for {layouts}", docs="data.md#what-is-read")
     layout = present[0]  # the order of _LAYOUTS decides
     options: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
-    options |= {} if repair is None else {"repair": _repair(repair, layout)}
-    options |= {} if leave_out is None else {"leave_out": _leave_out(leave_out, layout)}
+    options |= {} if repair is None else {"repair": _names("repair", repair, layout)}
+    options |= {} if leave_out is None else {"leave_out": _names("leave_out", leave_out, layout)}
     from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
 
     module, function = layout.reader.split(".")
     reader = getattr(importlib.import_module(f"gsbench.scenes.{module}"), function)
-    scene: Scene = reader(root, Rendition(downscale, background, resize), **options)
+    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
+    scene: Scene = reader(root.resolve(), name, Rendition(downscale, background, resize), **options)
     if others := ", ".join(other.marker for other in present[1:] if other.marker not in layout.reads_too):
         scene = replace(scene, notes=(f"{layout.marker} is read, and not {others}", *scene.notes))
     for note in scene.notes:
@@ -157,21 +159,19 @@ def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
     return frames[0], frames[1]
 
 
-def _repair(names: object, layout: _Layout) -> tuple[str, ...]:
-    """Check and return the names of images to replace; raise InputError for a layout without this option."""
-    if "repair" not in layout.options:
-        raise InputError(f"repair: {layout.marker} has no frame before an image, got {names!r:.80}: leave it out")
-    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"repair: expected names such as Birthday_undist_00173_09, got {names!r:.80}")
-    return tuple(names)
+_NAMES = {  # of an option that lists names: what a layout without it lacks, and an example of a name
+    "repair": ("frame before an image", "Birthday_undist_00173_09"),
+    "leave_out": ("names of cameras", "cam13"),
+}
 
 
-def _leave_out(names: object, layout: _Layout) -> tuple[str, ...]:
-    """Check and return the names of cameras to leave out; raise InputError for a layout without this option."""
-    if "leave_out" not in layout.options:
-        raise InputError(f"leave_out: {layout.marker} has no names of cameras, got {names!r:.80}: leave it out")
+def _names(option: str, names: object, layout: _Layout) -> tuple[str, ...]:
+    """Check and return the names that an option lists; raise InputError for a layout without this option."""
+    lacks, example = _NAMES[option]
+    if option not in layout.options:
+        raise InputError(f"{option}: {layout.marker} has no {lacks}, got {names!r:.80}: leave it out")
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"leave_out: expected names such as cam13, got {names!r:.80}")
+        raise InputError(f"{option}: expected names such as {example}, got {names!r:.80}")
     return tuple(names)
 
 

@@ -76,7 +76,7 @@ class PosedImage:
     camera: int  # id, a key of `read_cameras`
 
 
-def load(root: Path, rendition: Rendition) -> Scene:
+def load(root: Path, name: str, rendition: Rendition) -> Scene:
     """Load a scene from images and a COLMAP model.
 
     - `images/` has a PNG or a JPEG for each image that the model registers. If the one that the model names is missing,
@@ -90,8 +90,6 @@ def load(root: Path, rendition: Rendition) -> Scene:
     The distortion of lenses is undone by OpenCV. The principal point may lie anywhere. Every eighth image in the order
     of time and then of name is a test view, from the eighth on; the others are for training.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     folder, notes = largest_model(root / "sparse")
     model = cameras, posed, points = [read_part(folder, part) for part in ("cameras", "images", "points3D")]
     listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
@@ -105,13 +103,11 @@ def load(root: Path, rendition: Rendition) -> Scene:
     return standard_scene(
         name=name,
         train=train,
-        val=[],
         test=test,
         background=rendition.background,
         points=initial,
         fingerprint=files.fingerprint(digests),
         notes=(*time_notes, *notes, *loaded.notes),
-        up=None,
     )
 
 

@@ -65,6 +65,7 @@ class _Film:
 
 def load(
     root: Path,
+    name: str,
     rendition: Rendition,
     *,
     frames: tuple[int, int] | None = None,  # the first and the last, from 0
@@ -84,8 +85,6 @@ def load(
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     films, notes = _list_films(root)
     source = root / POSES
     data = read_file(source, str(source), _MAX_POSES)
@@ -116,13 +115,11 @@ def load(
     return standard_scene(
         name=name,
         train=[view for views in zip(*train, strict=True) for view in views],  # by frame, then by camera
-        val=[],
         test=test,
         background=rendition.background,
         points=points,
         fingerprint=files.fingerprint(digests | points_file),
         notes=tuple(notes),
-        up=None,
     )
 
 

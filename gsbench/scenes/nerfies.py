@@ -1,6 +1,5 @@
 """Load scenes of HyperNeRF's rig of two moving cameras (vrig) in the layout of Nerfies: a JSON file for each image."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +50,7 @@ class CameraFile:
     tangential: tuple[float, float] = (0.0, 0.0)  # the same, by the name that some files have
 
 
-def load(root: Path, rendition: Rendition) -> Scene:
+def load(root: Path, name: str, rendition: Rendition) -> Scene:
     """Load a scene of HyperNeRF (Park et al. 2021) that was taken by a rig of two cameras.
 
     - `dataset.json` has the names of the images: those of `val_ids` are the test split.
@@ -61,8 +60,6 @@ def load(root: Path, rendition: Rendition) -> Scene:
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file and the field.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     splits, digest, others = files.read_keys(_Splits, root / SPLITS)
     names = [*splits.train_ids, *splits.val_ids]
     if not splits.train_ids or not splits.val_ids or len({*names}) != len(names):
@@ -89,10 +86,8 @@ def load(root: Path, rendition: Rendition) -> Scene:
     return standard_scene(
         name=name,
         train=loaded.views[:count],
-        val=[],
         test=loaded.views[count:],
         background=rendition.background,
-        points=None,
         fingerprint=files.fingerprint(digests),
         notes=(
             *files.unread(SPLITS, others),
@@ -100,7 +95,6 @@ def load(root: Path, rendition: Rendition) -> Scene:
             *([f"{rest} images of {SPLITS} are in no split"] if (rest := len({*splits.ids} - {*names})) else []),
             *loaded.notes,
         ),
-        up=None,
     )
 
 

@@ -49,7 +49,7 @@ class _Split(NamedTuple):
     notes: list[str]
 
 
-def load(root: Path, rendition: Rendition) -> Scene:
+def load(root: Path, name: str, rendition: Rendition) -> Scene:
     """Load a scene in the layout of Dynamic 3D Gaussians (Luiten et al. 2024).
 
     - `train_meta.json` and `test_meta.json` have the cameras and the images of each time, the same number of times.
@@ -61,8 +61,6 @@ def load(root: Path, rendition: Rendition) -> Scene:
     Raises:
         InputError: something is missing, damaged or contradictory; the message names the file and the field.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     splits = {split: _read_split(root, root / f"{split}_meta.json") for split in ("train", "test")}
     train, test = splits["train"], splits["test"]
     if train.times != test.times:
@@ -82,13 +80,11 @@ def load(root: Path, rendition: Rendition) -> Scene:
     return standard_scene(
         name=name,
         train=list(islice(views, len(train.shots))),
-        val=[],
         test=list(views),
         background=rendition.background,
         points=points,
         fingerprint=files.fingerprint(digests),
         notes=(*notes, *loaded.notes),
-        up=None,
     )
 
 

@@ -6,6 +6,7 @@ and stay as they are, to the last bit.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.scenes.points import far_outside, is_seen
-from gsbench.scenes.scene import STANDARD, UP, Placement, Points, Scene, View, scene_extent, up_of
+from gsbench.scenes.scene import STANDARD, Placement, Points, Scene, View, scene_extent, up_of
 
 _SIZE_TOLERANCE = math.sqrt(2)  # a scene keeps its size if that differs by at most this factor ..
 _PLACE_TOLERANCE = 0.25  # .. and its place if cameras look at a point so near to the origin, in units of the size
@@ -33,14 +34,14 @@ _MOST_PAIRS = 1 << 22  # of points and cameras whose depths are computed
 def standard_scene(
     *,
     name: str,
-    train: list[View],  # with viewmats in float64 in the user's coordinates, as those of val and test
-    val: list[View],
+    train: list[View],  # with viewmats in float64 in the user's coordinates, as those of test and val
     test: list[View],
+    val: Sequence[View] = (),
     background: tuple[float, float, float],
-    points: Points | None,  # the data set's own, in float64, in the user's coordinates
+    points: Points | None = None,  # the data set's own, in float64, in the user's coordinates
     fingerprint: str,  # SHA-256 of the files
     repaired: tuple[str, ...] = (),  # names of damaged images that were replaced
-    up: tuple[float, float, float] | None = UP,  # None: it is estimated from the cameras
+    up: tuple[float, float, float] | None = None,  # None: it is estimated from the cameras
     notes: tuple[str, ...] = (),  # of the reader, a line each
 ) -> Scene:
     """Return a scene whose cameras and points are in single precision, in the standard place and size."""

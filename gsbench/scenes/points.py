@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.tensors import check_number, check_tensor
+from gsbench.kernels.tensors import check_tensor
 from gsbench.process.memory import require
 from gsbench.scenes.ply import columns, read_vertices
 from gsbench.scenes.scene import Camera, Points
@@ -20,6 +20,7 @@ SH_C0 = 0.5 / math.sqrt(math.pi)  # the constant spherical harmonic Y_00; 3DGS: 
 _POINT = 100  # least number of bytes that a point needs while it is drawn or its neighbours are searched
 NEAREST, FARTHEST = 2.0, 100.0  # range of depths of points in a frustum, in units of the radius of the cameras
 FAR = 4.0  # distance from the middle, beyond which a point lies far outside; three quarters of the points lie within 1
+NEIGHBOURS = 3  # whose distances are the initial scale
 ROUNDS = 50  # largest number of rounds in which points in a frustum are drawn
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -32,12 +33,9 @@ def random_points(count: int, half_width: float, generator: torch.Generator) -> 
     Colours are 0.5 + SH_C0 u / 255 with u uniform in [0, 1), so nearly grey, as in the code of 3DGS and 4DGS. The
     result is float32 on the device of the generator.
     """
-    if type(count) is not int or count < 1:
-        raise InputError(f"random points: expected a count of at least 1, got {count!r:.80}")
-    check_number(half_width, "random points: half width", 1e-30, 1e30)
     require(_POINT * count, f"{count} random points", "use fewer")
     draws = torch.rand(2, count, 3, generator=generator, device=generator.device)
-    return Points(means=(2 * draws[0] - 1) * float(half_width), colors=0.5 + SH_C0 * draws[1] / 255)
+    return Points(means=(2 * draws[0] - 1) * half_width, colors=0.5 + SH_C0 * draws[1] / 255)
 
 
 def frustum_points(
@@ -118,21 +116,22 @@ def read_ply(path: Path) -> Points:
     return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)), times)
 
 
-def nearest_distances(means: Tensor, k: int = 3) -> Tensor:  # [P, 3] -> [P] in the dtype and on the device of `means`
-    """Return the root mean square distance of each point to its `k` nearest neighbours, the initial scale of 3DGS.
+def nearest_distances(means: Tensor) -> Tensor:  # [P, 3] -> [P] in the dtype and on the device of `means`
+    """Return the root mean square distance of each point to its three nearest neighbours, the initial scale of 3DGS.
 
     The result is at least sqrt(1e-7), as in the code of 3DGS.
     """
     check_tensor(means, "points")
-    if type(k) is not int or k < 1 or means.dim() != 2 or means.shape[1] != 3:
-        raise InputError(f"points: expected [P, 3] and at least one neighbour, got {list(means.shape)} and {k!r:.80}")
-    if means.shape[0] <= k:
-        raise InputError(f"points: expected more than {k} to measure their spacing, got {means.shape[0]}")
+    if means.dim() != 2 or means.shape[1] != 3:
+        raise InputError(f"points: expected [P, 3], got {list(means.shape)}")
+    if len(means) <= NEIGHBOURS:
+        raise InputError(f"points: expected more than {NEIGHBOURS} to measure their spacing, got {len(means)}")
     require(_POINT * len(means), f"the neighbours of {len(means)} points", "use fewer")
     positions = means.detach().cpu().double().numpy()
     if not np.isfinite(positions).all():
         raise InputError("points: expected finite positions, some are not")
-    distances, _ = cKDTree(positions).query(positions, k=k + 1)  # the nearest is the point itself or a duplicate
+    # The nearest is the point itself or a duplicate.
+    distances, _ = cKDTree(positions).query(positions, k=NEIGHBOURS + 1)
     squared = np.square(distances[:, 1:]).mean(axis=1)
     return torch.from_numpy(np.sqrt(squared.clip(min=_MIN_SQUARED_DISTANCE))).to(means)
 

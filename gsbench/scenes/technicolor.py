@@ -38,6 +38,7 @@ class _Image:
 
 def load(
     root: Path,
+    name: str,
     rendition: Rendition,
     *,
     frames: tuple[int, int] | None = None,  # the first and the last
@@ -57,7 +58,6 @@ def load(
         InputError: something is missing, damaged or contradictory; the message names the file. An image in `repair` is
             whole, is not loaded, is one of the test camera, or the image before it is missing or damaged too.
     """
-    root = root.resolve()
     source = root / CAMERAS
     text = read_file(source, str(source), _MAX_TEXT)
     rows = _read_rows(text.decode("utf-8-sig", "replace"), source)
@@ -76,15 +76,13 @@ def load(
     test = [view for image, view in zip(listed, views, strict=True) if image.camera == TEST_CAMERA]
     points, points_file = colmap.points_beside(root)
     return standard_scene(
-        name=root.name,
+        name=name,
         train=train,
-        val=[],
         test=test,
         background=rendition.background,
         points=points,
         fingerprint=files.fingerprint(digests | points_file),
         repaired=tuple(image.path.stem for image in replaced),
-        up=None,
         notes=(*files.unread(CAMERAS, rows[0].keys() - {*COLUMNS, *DISTORTION}), *notes),
     )
 

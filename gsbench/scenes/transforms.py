@@ -25,7 +25,7 @@ from gsbench.scenes.files import ImageFinder
 from gsbench.scenes.images import Rendition, Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
-from gsbench.scenes.scene import HELD_OUT, Scene, View, hold_out
+from gsbench.scenes.scene import HELD_OUT, UP, Scene, View, hold_out
 from gsbench.scenes.shots import MASKS, Lens, Shot, Shots
 
 NERFSTUDIO = "transforms.json"
@@ -116,7 +116,7 @@ class Split:
     notes: list[str]
 
 
-def load_blender(root: Path, rendition: Rendition) -> Scene:
+def load_blender(root: Path, name: str, rendition: Rendition) -> Scene:
     """Load a scene in the Blender layout.
 
     Each file transforms_{train,val,test}.json has
@@ -132,8 +132,6 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
     each pixel (`View.regions`). Masks are measured with (`psnr_object`), not trained with.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     finder = ImageFinder(root)
     splits = {split: _read_split(root, f"transforms_{split}.json", finder) for split in ("train", "test")}
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
@@ -158,13 +156,13 @@ def load_blender(root: Path, rendition: Rendition) -> Scene:
         val=views.get("val", []),
         test=views["test"],
         background=rendition.background,
-        points=None,
         fingerprint=files.fingerprint(digests),
+        up=UP,
         notes=(*notes, *_shared_views(views, loaded)),
     )
 
 
-def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
+def load_nerfstudio(root: Path, name: str, rendition: Rendition) -> Scene:
     """Load a scene from transforms.json.
 
     The file has what `load_blender` reads from each of its files. `train_filenames`, `val_filenames` and
@@ -173,8 +171,6 @@ def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
     frames, otherwise from the names of the images (`gsbench.scenes.times`). The points of `ply_file_path` are the
     initial points.
     """
-    name = Path(os.path.abspath(root)).name  # if the folder is a link, the name of the link
-    root = root.resolve()
     finder = ImageFinder(root)
     split = _read_split(root, NERFSTUDIO, finder, _NERFSTUDIO_KEYS)
     if split.frames[0].time is None or times.table_of(root):
@@ -206,7 +202,6 @@ def load_nerfstudio(root: Path, rendition: Rendition) -> Scene:
         points=initial,
         fingerprint=files.fingerprint(digests | {NERFSTUDIO: split.digest}),
         notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes, *shared),
-        up=None,
     )
 
 

@@ -101,8 +101,7 @@ def targets() -> dict[str, Target]:
         "ssim": Target(ssim, images, ("a", "b")),
         "quantise": Target(quantise, {"image": rand(12, 13, 3)}, ("image",)),
         "evaluate": Target(_evaluate, {**images, "background": (0.0, 0.5, 1.0)}, ("a", "b")),
-        "random_points": Target(_random_points, {"count": 5, "half_width": 1.3}),
-        "nearest_distances": Target(nearest_distances, {"means": rand(N, 3), "k": 3}, ("means",)),
+        "nearest_distances": Target(nearest_distances, {"means": rand(N, 3)}, ("means",)),
     }
 
 
@@ -126,7 +125,3 @@ def _refine(a: Any, b: Any, **layers: Any) -> list[Tensor]:
 
 def _evaluate(a: Any, b: Any, background: Any) -> float | None:
     return evaluate([("view", a, b)], background=background).metrics["psnr"]
-
-
-def _random_points(count: Any, half_width: Any) -> Tensor:
-    return random_points(count, half_width, torch.Generator().manual_seed(0)).means
