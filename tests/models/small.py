@@ -17,6 +17,7 @@ from gsbench.schedule import ActiveComponents
 
 N = 24
 EXTENT = 2.0
+DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of vectors of other programs, which have eight digits
 CAMERA = torch.tensor([0.3, -0.2, -4.0], dtype=torch.float64)
 MODELS: dict[str, dict[str, Any]] = {
     "3dgs": {},
@@ -68,6 +69,14 @@ EVERY = VARIANTS | {
     for end in ("", "_agr")
     if name not in MODELS
 }
+
+
+def doubles(*numbers: Any) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def row(*numbers: float) -> Tensor:
+    return doubles(numbers)
 
 
 def seeded(seed: int) -> torch.Generator:

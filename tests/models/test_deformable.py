@@ -1,31 +1,22 @@
 """Deformable-3DGS: its equations by vectors of an independent numpy program, its warm-up, its bits and its rows."""
 
-import copy
 import math
 from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes, assert_same_bits
-from small import CAMERA, covariances, fresh, lively, raw, same, seeded
-from tiny_training import train, trainer
+from small import CAMERA, DIGITS, covariances, doubles, lively, seeded
+from tiny_training import trainer
 from torch import Tensor
 
 from gsbench.models import CameraTime
 from gsbench.models.deformable import DeformationField, encode
-from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.render import render
 from gsbench.schedule import ActiveComponents
-from gsbench.train.checkpoint import without_times
 
 WARM, FULL = (ActiveComponents(3, False, False, warms_up=warms_up) for warms_up in (True, False))
 QUERY = CameraTime.at(CAMERA, 0.45)
-DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vectors, which have eight digits
 POSITION, TIME = torch.tensor([[0.3, -0.7, 1.1]], dtype=torch.float64), torch.tensor(0.37, dtype=torch.float64)
-
-
-def doubles(*numbers: float) -> Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 # ---- the equations
@@ -137,66 +128,3 @@ def test_the_field_has_the_gradients_of_its_values(depth: int, time_network: boo
     model.slice(QUERY).means.sum().backward()
     torch.testing.assert_close(model.splats["means"].grad, torch.ones(5, 3).double())  # none through the field
     assert all(x.grad.any() for x in model.field.parameters())
-
-
-# ---- the warm-up
-
-
-def test_the_field_waits_for_the_end_of_the_warm_up() -> None:
-    """Catches a field that acts or learns in the warm-up, or never, and a warm-up of another share than 3,000 of 40,000
-    steps."""
-    fitted = trainer("deformable", "train.iterations=40")
-    model: Any = fitted.model
-    before, camera = copy.deepcopy(model.field.state_dict()), fitted.scene.train[0].camera
-
-    def image(time: float) -> Tensor:
-        return render(model, camera, time, torch.zeros(3)).detach()
-
-    train(fitted, until=3)
-    assert same(before, model.field.state_dict())
-    assert model.active.warms_up
-    assert torch.equal(image(0.1), image(0.9))
-    train(fitted, until=4)
-    assert not model.active.warms_up
-    assert not any(torch.equal(x, y) for x, y in zip(before.values(), model.field.state_dict().values(), strict=True))
-    assert not torch.equal(image(0.1), image(0.9))
-
-
-# ---- checkpoints, rows, bits
-
-
-def test_a_training_goes_on_from_its_checkpoint() -> None:
-    """Catches weights or moments of the field that a checkpoint lacks: the image of a loaded model is another one."""
-    whole, _ = assert_resumes(lambda: trainer("deformable"), 30)
-    loaded = trainer("deformable", "seed=1")
-    loaded.load_state_dict(whole.state_dict())
-    view = whole.scene.train[3]
-    assert torch.equal(whole.render(view), loaded.render(view))
-
-
-def test_clones_and_children_are_canonical_and_share_the_field() -> None:
-    """Catches children drawn from the deformed Gaussian, which the field would deform twice, and rows of the field."""
-    model, plain = (fresh(name, 40) for name in ("deformable", "3dgs"))
-    weights, rows = copy.deepcopy(model.field.state_dict()), torch.arange(40).repeat_interleave(2)
-    before = model.slice(CameraTime.at(CAMERA.float(), 0.45))
-    for each in (model, plain):
-        each.select(rows)
-    cloned = model.slice(CameraTime.at(CAMERA.float(), 0.45))
-    for x, y in zip(tensors_of(before), tensors_of(cloned), strict=True):
-        torch.testing.assert_close(x[rows], y)
-    for each in (model, plain):
-        each.split_rows(torch.arange(80), seeded(1))
-    assert same(raw(model), raw(plain))
-    assert same(weights, model.field.state_dict())
-
-
-@pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize("model", ["deformable", "hexplane", "scgs"])
-def test_a_field_trains_to_the_same_bits_for_any_number_of_threads(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a repetition of a recorded step, or a penalty, that uses all threads, only felt with one view."""
-    monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
-    ends = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        ends.append(without_times(train(trainer(model, "train.batch_size=1")).state_dict()))
-    assert_same_bits(*ends)

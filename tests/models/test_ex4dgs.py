@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from small import CAMERA, active, covariances, fresh, lively, raw, with_effect_sets
+from small import CAMERA, DIGITS, active, covariances, fresh, lively, raw, row, with_effect_sets
 from tiny_training import trainer
 from torch import Tensor
 
@@ -14,13 +14,8 @@ from gsbench.models import CameraTime
 from gsbench.models.ex4dgs import is_dynamic, slerp
 from gsbench.models.factors import rotation
 
-DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vectors, which have eight digits
 KEYS = [0.0, 0, 0, 0.1, 0.2, 0, 0.3, 0.1, 0.4, 0.2, -0.1, 0.5, 0.6, 0, 0.3]
 QUATS = [1.0, 0, 0, 0, 1, 0.1, 0, 0, 0.6, 0, 0.8, 0.1]
-
-
-def doubles(*numbers: float) -> Tensor:
-    return torch.tensor([numbers], dtype=torch.float64)
 
 
 def gaussian(*, tau: float = 2.9, rise: str = "text", **raw: Tensor) -> Any:
@@ -28,13 +23,13 @@ def gaussian(*, tau: float = 2.9, rise: str = "text", **raw: Tensor) -> Any:
     model = lively("ex4dgs", 4, intervals=2, rise=rise)
     model.select(torch.arange(1))
     parameters = {
-        "means": doubles(0.3, -0.7, 1.1),
-        "key_means": doubles(*KEYS),
-        "quats": doubles(0, 0, 0, 0),
-        "key_quats": doubles(*QUATS),
-        "velocities": doubles(0.3, 0, -0.6),
-        "windows": doubles(1.4, 2.6),
-        "fades": doubles(-0.5, 0.1),
+        "means": row(0.3, -0.7, 1.1),
+        "key_means": row(*KEYS),
+        "quats": row(0, 0, 0, 0),
+        "key_quats": row(*QUATS),
+        "velocities": row(0.3, 0, -0.6),
+        "windows": row(1.4, 2.6),
+        "fades": row(-0.5, 0.1),
     } | raw
     for name, value in parameters.items():
         model.splats[name].data = value
@@ -45,21 +40,21 @@ def test_positions_and_rotations_of_a_dynamic_gaussian() -> None:
     """Catches other keyframes, tangents of another interval, a path that is not relative to the mean, and quaternions
     of other keyframes."""
     sliced, model = gaussian()
-    expected = doubles(0.3, -0.7, 1.1) + doubles(0.19110000, -0.09170000, 0.50350000)
+    expected = row(0.3, -0.7, 1.1) + row(0.19110000, -0.09170000, 0.50350000)
     torch.testing.assert_close(sliced.means, expected, **DIGITS)
-    R = rotation(doubles(0.66871603, 0.01154505, 0.73768742, 0.09221093))
+    R = rotation(row(0.66871603, 0.01154505, 0.73768742, 0.09221093))
     S = model.splats["scales"].detach().exp()
     torch.testing.assert_close(covariances(sliced), R * S.square()[:, None] @ R.mT, rtol=0, atol=4e-8)
 
 
 def test_slerp() -> None:
     """Catches an interpolation that is not normalised, and one that takes the shorter way, as the authors' does not."""
-    first, last = (torch.nn.functional.normalize(doubles(*q)) for q in ((1, 0.1, 0, 0), (0.6, 0, 0.8, 0.1)))
+    first, last = (torch.nn.functional.normalize(row(*q)) for q in ((1, 0.1, 0, 0), (0.6, 0, 0.8, 0.1)))
     for sign, expected in (
         (1, (0.66871603, 0.01154505, 0.73768742, 0.09221093)),
         (-1, (-0.40828255, 0.02707733, -0.90540785, -0.11317598)),
     ):
-        torch.testing.assert_close(slerp(first, sign * last, doubles(0.9)), doubles(*expected), **DIGITS)
+        torch.testing.assert_close(slerp(first, sign * last, row(0.9)), row(*expected), **DIGITS)
 
 
 @pytest.mark.parametrize("backwards", [False, True])
@@ -77,19 +72,19 @@ def test_slerp() -> None:
 def test_opacities_fade_outside_of_the_window(rise: str, tau: float, factor: float, backwards: bool) -> None:
     """Catches a half in the exponent, a fade of the other side, one without its least value, and the distance of the
     text in the place of that of the code; windows may be stored in either order."""
-    windows = doubles(2.6, 1.4) if backwards else doubles(1.4, 2.6)
+    windows = row(2.6, 1.4) if backwards else row(1.4, 2.6)
     _, model = gaussian(rise=rise, windows=windows)
     values = {name: x.detach() for name, x in model.splats.items()}
     visibility = model.visibility(values, torch.tensor(tau, dtype=torch.float64))
-    torch.testing.assert_close(visibility, doubles(factor)[0], **DIGITS)
+    torch.testing.assert_close(visibility, row(factor)[0], **DIGITS)
 
 
 def test_a_static_gaussian_has_a_velocity_alone() -> None:
     """Catches a static Gaussian that follows its keyframes, turns or fades, or one whose velocity counts key intervals
     or begins in the middle of the clip."""
-    static = {"windows": doubles(-1e6, 1e6), "quats": doubles(1, 0, 0, 0)}
+    static = {"windows": row(-1e6, 1e6), "quats": row(1, 0, 0, 0)}
     sliced, model = gaussian(tau=1.2, **static)  # frame 30 of 300
-    torch.testing.assert_close(sliced.means, doubles(0.33, -0.7, 1.04), **DIGITS)
+    torch.testing.assert_close(sliced.means, row(0.33, -0.7, 1.04), **DIGITS)
     torch.testing.assert_close(sliced.opacities, torch.sigmoid(model.splats["opacities"]))
     torch.testing.assert_close(covariances(sliced)[0], model.splats["scales"].detach()[0].exp().square().diag())
 
@@ -99,8 +94,8 @@ def test_a_static_gaussian_has_a_velocity_alone() -> None:
 def test_both_kinds_have_the_gradients_of_their_values(rise: str, static: bool) -> None:
     """Catches a derivative that is wrong or lost, such as that of an arc cosine or of the beginning of a window, and
     parameters of one kind that learn by the other."""
-    windows = {"windows": doubles(-1e6, 1e6)} if static else {}
-    _, model = gaussian(rise=rise, quats=doubles(0.5, -0.2, 0.1, 0.3), **windows)
+    windows = {"windows": row(-1e6, 1e6)} if static else {}
+    _, model = gaussian(rise=rise, quats=row(0.5, -0.2, 0.1, 0.3), **windows)
     names = [name for name in model.splats if name not in ("sh0", "shN")]
     values = [model.splats[name].detach().clone().requires_grad_() for name in names]
     other = raw(model)
@@ -123,14 +118,14 @@ def test_the_penalty() -> None:
     its gradient, also at rest, and the mean over Gaussians that a gate left."""
     _, model = gaussian()
     model.splats["velocities"].data.fill_(9)
-    keys = doubles(*KEYS).view(5, 3)
+    keys = row(*KEYS).view(5, 3)
     expected = 0.5 * (keys[0] - keys).abs().mean() / 2.0  # the extent
     torch.testing.assert_close(model.penalty(), expected)
-    _, model = gaussian(windows=doubles(-1e6, 1e6), velocities=doubles(0.02, 0, -0.03))
+    _, model = gaussian(windows=row(-1e6, 1e6), velocities=row(0.02, 0, -0.03))
     speed = math.hypot(0.02, 0.03) / 2.0
     assert model.penalty().item() == pytest.approx(0.5 * math.log(speed + 1e-3))
     model.penalty().backward()
-    gradient = 0.5 / (speed + 1e-3) * doubles(0.02, 0, -0.03) / math.hypot(0.02, 0.03) / 2.0
+    gradient = 0.5 / (speed + 1e-3) * row(0.02, 0, -0.03) / math.hypot(0.02, 0.03) / 2.0
     torch.testing.assert_close(model.splats["velocities"].grad, gradient)
     assert not model.splats["key_means"].grad.any()
     model = fresh("ex4dgs")
@@ -148,7 +143,7 @@ def test_what_moves_most_becomes_dynamic() -> None:
     with torch.no_grad():
         model.splats["means"][:] = torch.arange(1.0, 13)[:, None] * torch.tensor([0.0, 0, 1])
         model.splats["velocities"][:, 0] = 1e-3
-        model.splats["velocities"][[0, 8, 9, 11], 0] = doubles(0.1, 0.7, 0.8, 9.0)[0]
+        model.splats["velocities"][[0, 8, 9, 11], 0] = row(0.1, 0.7, 0.8, 9.0)[0]
     centers = torch.zeros(2, 3, dtype=torch.float64)
     centers[1, 2] = 100.0  # from which all are as far away
     drawn = torch.tensor([True] * 11 + [False]).repeat(2, 1)
@@ -171,7 +166,7 @@ def test_children_of_dynamic_gaussians_lie_further_apart() -> None:
     kinds = is_dynamic(values)
     offsets = [
         model.split(values | {"windows": windows}, torch.Generator().manual_seed(3))["means"] - values["means"]
-        for windows in (values["windows"], doubles(-1e6, 1e6).expand(len(kinds), 2))
+        for windows in (values["windows"], row(-1e6, 1e6).expand(len(kinds), 2))
     ]
     torch.testing.assert_close(offsets[0], torch.where(kinds, 2.0, 1.0) * offsets[1])
     assert 0 < kinds.sum() < len(kinds)

@@ -1,14 +1,12 @@
 """4DGaussians: its equations by vectors of an independent numpy program, its warm-up, its penalty, bits and rows."""
 
-import copy
 import math
 from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes
-from small import CAMERA, fresh, lively, raw, same, seeded
-from tiny_training import train, trainer
+from small import CAMERA, DIGITS, doubles, lively, seeded
+from tiny_training import trainer
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -16,17 +14,11 @@ from gsbench.models import CameraTime
 from gsbench.models.appearance import sh_colors
 from gsbench.models.factors import sizes
 from gsbench.models.hexplane import Network, Planes
-from gsbench.models.render import render
 from gsbench.schedule import ActiveComponents
 from gsbench.view.slice_ply import harmonics_at
 
 FULL = ActiveComponents(3, False, False)
 QUERY = CameraTime.at(CAMERA, 0.25)
-DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vectors, which have eight digits
-
-
-def doubles(*numbers: float) -> Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 # ---- the equations of the vectors
@@ -151,8 +143,7 @@ def test_the_field_has_the_gradients_of_its_values() -> None:
 
 
 def test_points_in_a_plane_make_no_nan() -> None:
-    """Catches a division by the box's width of zero, a gradient that is infinite there, and a
-    crash at NaN."""
+    """Catches a division by the box's width of zero, a gradient that is infinite there, and a crash at NaN."""
     points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
     planes = Planes(points, (4, 4, 4, 4), 1, 2, seeded(1))
     positions = torch.cat([points, points + 1, torch.full((1, 3), math.nan)]).requires_grad_()
@@ -162,31 +153,6 @@ def test_points_in_a_plane_make_no_nan() -> None:
 
 
 # ---- a training
-
-
-def test_the_field_waits_for_the_end_of_the_warm_up() -> None:
-    """Catches a field that acts, learns or is penalised in the warm-up, or never, and a warm-up of another share than
-    3,000 of 23,000 steps."""
-    fitted = trainer("hexplane", "train.iterations=46")
-    model: Any = fitted.model
-    camera = fitted.scene.train[0].camera
-
-    def field() -> dict[str, Tensor]:
-        return {name: x for name, x in copy.deepcopy(model.state_dict()).items() if name.startswith(("pl", "net"))}
-
-    def image(time: float) -> Tensor:
-        return render(model, camera, time, torch.zeros(3)).detach()
-
-    before = field()
-    train(fitted, until=6)
-    assert same(before, field())
-    assert model.active.warms_up
-    assert torch.equal(image(0.1), image(0.9))
-    train(fitted, until=7)
-    after = field()
-    assert not model.active.warms_up
-    assert {name for name, x in before.items() if torch.equal(x, after[name])} == {"planes.low", "planes.high"}
-    assert not torch.equal(image(0.1), image(0.9))
 
 
 def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:
@@ -220,25 +186,3 @@ def test_views_of_a_step_share_what_time_does_not_change(monkeypatch: pytest.Mon
         assert len(calls) == expected
         gradients.append([x.grad.clone() for x in model.parameters()])
     torch.testing.assert_close(*gradients)
-
-
-def test_a_training_goes_on_from_its_checkpoint() -> None:
-    """Catches nodes, weights, moments or a box that a checkpoint lacks: the image of a loaded model is another one."""
-    whole, _ = assert_resumes(lambda: trainer("hexplane"), 30)
-    loaded = trainer("hexplane", "seed=1")
-    loaded.model.planes.high += 1  # type: ignore[operator, union-attr]
-    loaded.load_state_dict(whole.state_dict())
-    view = whole.scene.train[3]
-    assert torch.equal(whole.render(view), loaded.render(view))
-
-
-def test_clones_and_children_are_canonical_and_share_the_field() -> None:
-    """Catches children drawn from the changed Gaussian, which the field would change twice, and rows of the field."""
-    model, plain = (fresh(name, 40) for name in ("hexplane", "3dgs"))
-    rows, before = torch.arange(40).repeat_interleave(2), copy.deepcopy(model.state_dict())
-    for each in (model, plain):
-        each.select(rows)
-        each.split_rows(torch.arange(80), seeded(1))
-    assert same(raw(model), raw(plain))
-    after = model.state_dict()
-    assert all(torch.equal(x, after[name]) for name, x in before.items() if not name.startswith("splats."))

@@ -1,29 +1,20 @@
 """SC-GS: its equations by vectors of an independent numpy program, its nodes, its penalty, its warm-up and its rows."""
 
-import copy
 from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes
 from scipy.spatial.transform import Rotation
-from small import CAMERA, fresh, lively, raw, same, seeded
-from tiny_training import train, trainer
+from small import CAMERA, DIGITS, doubles, fresh, lively, seeded
 from torch import Tensor, nn
 
 from gsbench.models import CameraTime
 from gsbench.models.factors import rotation, sizes
-from gsbench.models.render import render
 from gsbench.models.scgs import Nodes, stretch
 from gsbench.schedule import ActiveComponents
 
 FULL = ActiveComponents(3, False, False)
 QUERY = CameraTime.at(CAMERA, 0.45)
-DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vectors, which have eight digits
-
-
-def doubles(*numbers: Any) -> Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 # ---- the equations of the vectors
@@ -216,56 +207,3 @@ def test_positions_of_nodes_learn_by_what_follows_them() -> None:
         return torch.cat([model.slice(QUERY).means.flatten(), 1e4 * model.penalty()[None]])
 
     assert torch.autograd.gradcheck(means, positions.detach().requires_grad_())
-
-
-# ---- a training
-
-
-def test_nodes_are_placed_at_the_end_of_the_warm_up() -> None:
-    """Catches nodes that stay at the initial points, or that are placed again later; a field that acts or learns in the
-    warm-up, or never; and a warm-up of another share than 10,000 of 80,000 steps."""
-    fitted = trainer("scgs", "train.iterations=40")
-    model: Any = fitted.model
-    camera = fitted.scene.train[0].camera
-
-    def shared() -> dict[str, Tensor]:
-        return {name: x for name, x in copy.deepcopy(model.state_dict()).items() if name.startswith(("field", "nodes"))}
-
-    before = shared()
-    train(fitted, until=5)
-    assert same(before, shared())
-    assert model.active.warms_up
-    expected = Nodes(16)
-    expected.place(model.splats["means"].detach())
-    train(fitted, until=6)
-    assert not model.active.warms_up
-    after = shared()
-    assert not any(torch.equal(x, after[name]) for name, x in before.items())
-    torch.testing.assert_close(after["nodes.positions"], expected.positions.detach(), rtol=0, atol=1e-2)
-    assert not torch.equal(*(render(model, camera, t, torch.zeros(3)) for t in (0.1, 0.9)))
-    train(fitted, until=20)
-    torch.testing.assert_close(model.nodes.positions.detach(), after["nodes.positions"], rtol=0, atol=0.05)
-
-
-@pytest.mark.parametrize("step", [5, 20])
-def test_a_training_goes_on_from_its_checkpoint(step: int) -> None:
-    """Catches nodes, weights or moments that a checkpoint lacks, and nodes that are placed twice or never where it is
-    of the last step of the warm-up."""
-    whole, _ = assert_resumes(lambda: trainer("scgs", "train.iterations=40"), step)
-    loaded = trainer("scgs", "seed=1", "train.iterations=40")
-    loaded.load_state_dict(whole.state_dict())
-    view = whole.scene.train[3]
-    assert torch.equal(whole.render(view), loaded.render(view))
-
-
-def test_clones_and_children_follow_the_nodes_of_their_parent() -> None:
-    """Catches children drawn from the moved Gaussian, which would move twice, and new features of a child."""
-    model, plain = (fresh(name, 40) for name in ("scgs", "3dgs"))
-    model.splats["features"].data += torch.rand(40, 8, generator=seeded(0))
-    features, rows = model.splats["features"].detach().clone(), torch.arange(40).repeat_interleave(2)
-    for each in (model, plain):
-        each.select(rows)
-        each.split_rows(torch.arange(80), seeded(1))
-    after = raw(model)
-    assert torch.equal(after.pop("features"), features[rows])
-    assert same(after, raw(plain))

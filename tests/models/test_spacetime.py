@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from interrupted import assert_resumes
-from small import CAMERA, covariances, fresh, lively, pinhole, raw, seeded
+from small import CAMERA, DIGITS, covariances, fresh, lively, pinhole, raw, row, seeded
 from tiny_training import trainer
 from torch import Tensor
 
@@ -23,11 +23,6 @@ from gsbench.stability.float32_error import psnr_float32
 from gsbench.train.density.blend_weights import WeighedImage
 
 QUERY = CameraTime.at(CAMERA, 0.62)
-DIGITS = {"rtol": 0, "atol": 5.001e-9}  # of the vector, which has eight digits
-
-
-def doubles(*numbers: float) -> Tensor:
-    return torch.tensor([numbers], dtype=torch.float64)
 
 
 def gaussian(name: str = "stg", **raw: Tensor) -> Any:
@@ -35,13 +30,13 @@ def gaussian(name: str = "stg", **raw: Tensor) -> Any:
     model = lively(name, 4, sh_degree=0)
     model.select(torch.arange(1))
     parameters = {
-        "means": doubles(0.3, -0.7, 1.1),
-        "times": doubles(0.4),
-        "durations": doubles(-1.0),
-        "opacities": doubles(0.5)[0],
-        "path": doubles(0.2, -0.1, 0.05, 0.4, 0.3, -0.2, -0.6, 0.1, 0.8),
-        "quats": doubles(1, 0.1, 0, -0.2),
-        "turns": doubles(0.3, -0.4, 0.5, 0.1),
+        "means": row(0.3, -0.7, 1.1),
+        "times": row(0.4),
+        "durations": row(-1.0),
+        "opacities": row(0.5)[0],
+        "path": row(0.2, -0.1, 0.05, 0.4, 0.3, -0.2, -0.6, 0.1, 0.8),
+        "quats": row(1, 0.1, 0, -0.2),
+        "turns": row(0.3, -0.4, 0.5, 0.1),
     } | raw
     for name, value in parameters.items():
         model.splats[name].data = value
@@ -52,9 +47,9 @@ def test_the_vector() -> None:
     """Catches a half in the exponent, coefficients by axis or in reversed order, and a turn before the mean time."""
     model = gaussian()
     sliced = model.slice(QUERY)
-    torch.testing.assert_close(sliced.opacities, doubles(0.43530545)[0], **DIGITS)
-    torch.testing.assert_close(sliced.means, doubles(0.35697120, -0.70641520, 1.10983840), **DIGITS)
-    R = rotation(doubles(0.98121447, 0.01104557, 0.10125102, -0.16384257))
+    torch.testing.assert_close(sliced.opacities, row(0.43530545)[0], **DIGITS)
+    torch.testing.assert_close(sliced.means, row(0.35697120, -0.70641520, 1.10983840), **DIGITS)
+    R = rotation(row(0.98121447, 0.01104557, 0.10125102, -0.16384257))
     S = model.splats["scales"].detach().exp()
     torch.testing.assert_close(covariances(sliced), R * S.square()[:, None] @ R.mT, rtol=0, atol=2e-8)
 
@@ -67,7 +62,7 @@ def test_a_mean_time_learns_from_the_opacity_alone() -> None:
         sliced.means.sum() + sliced.factors.sum(), model.splats["times"], retain_graph=True, allow_unused=True
     ) == (None,)
     (gradient,) = torch.autograd.grad(sliced.opacities.sum(), model.splats["times"])
-    before, after = (gaussian(times=doubles(0.4 + step)).slice(QUERY).opacities for step in (-1e-6, 1e-6))
+    before, after = (gaussian(times=row(0.4 + step)).slice(QUERY).opacities for step in (-1e-6, 1e-6))
     torch.testing.assert_close(gradient[0], (after - before).detach() / 2e-6, rtol=1e-8, atol=0)
 
 
@@ -87,7 +82,7 @@ def test_a_frozen_gaussian_has_the_mean_quaternion() -> None:
     model, queries = gaussian(), [CameraTime.at(CAMERA, time) for time in (0.2, 0.7)]
     weights = torch.tensor([[0.25], [0.75]])
     frozen = model.frozen(raw(model), queries, weights)["static"]
-    torch.testing.assert_close(frozen["quats"], doubles(1, 0.1, 0, -0.2) + (0.575 - 0.4) * doubles(0.3, -0.4, 0.5, 0.1))
+    torch.testing.assert_close(frozen["quats"], row(1, 0.1, 0, -0.2) + (0.575 - 0.4) * row(0.3, -0.4, 0.5, 0.1))
 
 
 @pytest.mark.parametrize("kind", ["clone", "split"])
@@ -112,8 +107,8 @@ def test_clones_and_children_have_new_times(kind: str) -> None:
 
 # ---- the full model
 
-BASE, VIEW, TIME = doubles(0.1, 0.2, 0.3), doubles(0.4, 0.5, 0.6), doubles(-0.3, 0.2, 0.7)
-NINE = doubles(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.066, 0.044, 0.154)
+BASE, VIEW, TIME = row(0.1, 0.2, 0.3), row(0.4, 0.5, 0.6), row(-0.3, 0.2, 0.7)
+NINE = row(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.066, 0.044, 0.154)
 
 
 def layer(number: int, rows: int, columns: int) -> Tensor:
@@ -125,8 +120,8 @@ def layer(number: int, rows: int, columns: int) -> Tensor:
 def seen_along(x: float, y: float, z: float) -> Camera:
     """A camera of one pixel at (.1, -.2, .3), which looks along z and whose pixel lies in a direction."""
     viewmat, K = torch.eye(4).double(), torch.eye(3).double()
-    viewmat[:3, 3] = doubles(-0.1, 0.2, -0.3)[0]
-    K[:2, 2] = 0.5 - doubles(x, y)[0] / z
+    viewmat[:3, 3] = row(-0.1, 0.2, -0.3)[0]
+    K[:2, 2] = 0.5 - row(x, y)[0] / z
     return Camera(viewmat, K, 1, 1)
 
 
@@ -147,13 +142,13 @@ def test_the_decoded_vector(saturate: bool, pixel: tuple[float, ...]) -> None:
     model: Any = lively("stg_full", saturate=saturate)
     model.decoder[0].weight.data, model.decoder[1].weight.data = layer(0, 6, 12), layer(1, 3, 6)
     image = model.decode(NINE[None, None], seen_along(0.3, 0.1, 0.95))
-    torch.testing.assert_close(image[0, 0], doubles(*pixel), **DIGITS)
+    torch.testing.assert_close(image[0, 0], row(*pixel), **DIGITS)
 
 
 def test_a_ray_meets_what_its_pixel_shows() -> None:
     """Catches pixels counted by columns or from their corners, and a rotation to the camera instead of from it."""
     camera = replace(pinhole(6, 4), viewmat=torch.eye(4).double())
-    camera.viewmat[:3, :3], camera.viewmat[:3, 3] = rotation(doubles(0.8, 0.3, -0.2, 0.5))[0], doubles(1, 2, 3)[0]
+    camera.viewmat[:3, :3], camera.viewmat[:3, 3] = rotation(row(0.8, 0.3, -0.2, 0.5))[0], row(1, 2, 3)[0]
     camera = replace(camera)  # at the centre that follows
     center, sight = pixel_rays(camera).split(3, -1)
     projected = (center + 7 * sight) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
@@ -180,7 +175,7 @@ def test_an_image_by_kernels_is_that_of_torch() -> None:
     """Catches channels that a kernel mixes up, a background behind features, and a decoder without portable layers."""
     model, camera = lively("stg_full", 24), pinhole(20, 16)
     single = lively("stg_full", 24).float()
-    background = doubles(0.3, 0.6, 0.1)[0]
+    background = row(0.3, 0.6, 0.1)[0]
     image = render(model, camera, 0.45, background).detach()
     at = Camera(camera.viewmat.float(), camera.K.float(), 20, 16)
     torch.testing.assert_close(render(single, at, 0.45, background.float()).double(), image, rtol=0, atol=2e-5)
