@@ -53,7 +53,6 @@ class Forked:
 
     @property
     def out(self) -> str:
-        """What it has written so far."""
         return self.files[0].read_text()
 
     @property
@@ -68,7 +67,6 @@ class Forked:
         return self.returncode
 
     def wait(self) -> int:
-        """Wait for the end and return the exit status."""
         if self.returncode is None:
             self.returncode = _ask({"pid": self.pid, "options": 0})
         assert self.returncode is not None

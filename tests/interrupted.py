@@ -79,7 +79,6 @@ def bits(folder: Path) -> dict[str, Any]:
 
 
 def assert_same_bits(a: Any, b: Any, where: str = "state") -> None:
-    """Compare two states bit by bit."""
     if isinstance(a, dict | list):
         assert type(a) is type(b), where
         assert len(a) == len(b), where

@@ -287,8 +287,7 @@ def test_a_warning_of_gsbench_is_one_line():
     "module", ["export", "score", *(f"{name}.__main__" for name in ("fetch", "gates", "launch", "stability", "view"))]
 )
 def test_the_help_is_what_a_user_types_and_needs(module, capsys):
-    """Catches a usage that begins with the name of a file, a help that does not say what the command is for, and an
-    argument without a text."""
+    """Catches a usage with a file's name, a help that does not say what for, and an argument without a text."""
     command = importlib.import_module(f"gsbench.{module}")
     with pytest.raises(SystemExit, match="0"):
         command.main(["--help"])

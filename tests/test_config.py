@@ -58,36 +58,6 @@ def test_values_out_of_a_range_or_no_choice_are_refused(dotted, config):
     check_settings(config)
 
 
-def test_rates_of_any_name_have_a_range(config):
-    """Catches a negative learning rate, and a log-linear decay from or to zero."""
-    broken = copy.deepcopy(config)
-    broken.model.lr["means"].start = -1
-    with pytest.raises(InputError, match=r"^model\.lr\.means\.start: expected at least 0, got -1"):
-        check_settings(broken)
-    for field in ("start", "end"):
-        broken = copy.deepcopy(config)
-        setattr(broken.model.lr["means"], field, 0.0)
-        with pytest.raises(InputError, match=r"^model\.lr\.means: expected start >= 0, and start > 0 with end > 0"):
-            check_settings(broken)
-
-
-def test_a_rate_that_ends_early_needs_an_end(config):
-    """Catches `until` that silently does nothing, because the rate is constant."""
-    broken = copy.deepcopy(config)
-    broken.model.lr["opacities"].until = 20_000
-    with pytest.raises(InputError, match=r"^model\.lr\.opacities: expected an end with until=20000"):
-        check_settings(broken)
-
-
-@pytest.mark.parametrize("key", ["train.cooldown_from", "train.average_from"])
-def test_steps_end_with_the_recipe(key, config):
-    """Catches an end of a training that begins after its last step, of the recipe's 30,000."""
-    broken = copy.deepcopy(config)
-    setattr(broken.train, key.removeprefix("train."), 30_000)
-    with pytest.raises(InputError, match=f"^{key}: expected a step below train.recipe_iterations=30000"):
-        check_settings(broken)
-
-
 def test_facts_are_those_of_the_code():
     """Catches a choice that the code does not have, and one that is refused though it has it."""
     choices = {"data.background": BACKGROUNDS, "scene.resize": RESIZES, "train.densify.kind": RULES}

@@ -13,12 +13,8 @@ from gsbench.report.frame import load
 from gsbench.report.render.text import terminal
 
 SHORT = (
-    "train.iterations=250",
-    "train.densify.every=25",
-    "train.curve_points=1",
-    "data.initial_points=500",
-    "protocol.renders=30",
-    "protocol.pictures=0",
+    *("train.iterations=250", "train.densify.every=25", "train.curve_points=1", "data.initial_points=500"),
+    *("protocol.renders=30", "protocol.pictures=0"),
 )
 
 

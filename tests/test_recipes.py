@@ -54,53 +54,79 @@ def test_rates_are_those_published(recipe, iterations, expected, agr, options):
     assert Schedule(config.train, 3, config.agr).densify_every == 100
 
 
-def test_deformable_learns_as_its_authors_have_it():
-    """Catches rates of another length than 40,000 steps, means that still learn faster after 30,000, and densification
-    or a warm-up that ends elsewhere."""
-    config = composed("model=deformable", "+recipe=authors_deformable")
-    for settings in (config, composed("model=deformable", "+recipe=authors_deformable", "train.iterations=4000")):
-        for share, means, field in ((0.0, 8e-4, 8e-4), (0.375, 8e-5, None), (0.75, 8e-6, None), (1.0, 8e-6, 1.6e-6)):
-            of_run = rates(settings, share)
-            assert of_run["means"] == pytest.approx(means)
-            assert field is None or of_run["field"] == pytest.approx(field)
-            assert (of_run["scales"], of_run["quats"]) == (5e-3, 1e-3)
-    s = Schedule(config.train, 3, config.agr, build(config).warm_up)
-    assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 15_000, 100)
+# Rates at all times; those that fall, by the share of the steps; warm-up, and start, stop and every of densification.
+# The positions' rates are those of an extent of 5.
+AUTHORS_RATES = {
+    "deformable": (
+        {"scales": 5e-3, "quats": 1e-3},
+        {
+            0.0: {"means": 8e-4, "field": 8e-4},
+            0.375: {"means": 8e-5},
+            0.75: {"means": 8e-6},
+            1.0: {"means": 8e-6, "field": 1.6e-6},
+        },
+        (3000, 500, 15_000, 100),
+    ),
+    "hexplane": (
+        {"scales": 5e-3, "quats": 1e-3},
+        {
+            n / 23: {"planes": 5 * rate, "network": 5 * rate / 10}
+            for n, rate in ((3, 1.6e-3), (13, 1.6e-4), (23, 1.6e-5))
+        },
+        (3000, 500, 18_000, 100),
+    ),
+    "scgs": (
+        {"nodes": 8e-4, "features": 2.5e-3, "scales": 5e-3},
+        {
+            0.0: {"means": 8e-4, "field": 8e-4},
+            0.375: {"means": 8e-6},
+            0.5: {"means": 8e-6, "field": 1.6e-6},
+            1.0: {"means": 8e-6, "field": 1.6e-6},
+        },
+        (10_000, 500, 50_000, 100),
+    ),
+    "stg": (
+        {"path": 1.75 * 8e-4, "times": 1e-4, "turns": 1e-4, "durations": 3e-2, "scales": 1.5e-3},
+        {},
+        None,
+    ),
+    "ex4dgs": (
+        {"velocities": 1e-4, "key_quats": 1e-3, "windows": 1e-3, "fades": 1e-4, "quats": 1e-5, "scales": 5e-3}
+        | {"key_means": 8e-4},
+        {},
+        None,
+    ),
+}
 
 
-def test_hexplane_learns_as_its_authors_have_it():
-    """Catches rates of the field that fall from the first static step, and a schedule of another length than 23,000
-    steps, of which the last 20,000 have the field."""
-    config = composed("model=hexplane", "+recipe=authors_hexplane")
-    for share, planes in ((3 / 23, 1.6e-3), (13 / 23, 1.6e-4), (1.0, 1.6e-5)):
-        of_run = rates(config, share)
-        assert (of_run["planes"], of_run["network"]) == pytest.approx((5 * planes, 5 * planes / 10), rel=1e-3)
-        assert (of_run["scales"], of_run["quats"]) == (5e-3, 1e-3)
-    s = Schedule(config.train, 3, config.agr, build(config).warm_up)
-    assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (3000, 500, 18_000, 100)
+@pytest.mark.parametrize("words", [(), ("train.iterations=4000",)])
+@pytest.mark.parametrize("model", AUTHORS_RATES)
+def test_a_model_learns_as_its_authors_have_it(model, words):
+    """Catches rates of another length of run, in static steps or of another extent, rates that fall where the authors'
+    do not or go on falling where theirs end, and densification or a warm-up that ends elsewhere."""
+    fixed, falling, steps = AUTHORS_RATES[model]
+    config = composed(f"model={model}", f"+recipe=authors_{model}", *words)
+    for share in (0.0, 0.5, 1.0, *falling):
+        of_run, expected = rates(config, share), fixed | falling.get(share, {})
+        assert {name: of_run[name] for name in expected} == pytest.approx(
+            expected, rel=1e-3 if model == "hexplane" else 1e-6
+        )
+    if steps and not words:
+        s = Schedule(config.train, 3, config.agr, build(config).warm_up)
+        assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == steps
 
 
-def test_scgs_learns_as_its_authors_have_it():
-    """Catches a field that learns after 40,000 of 80,000 steps, means after 30,000, or nodes that learn ever slower."""
-    config = composed("model=scgs", "+recipe=authors_scgs")
-    for share, means, field in ((0.0, 8e-4, 8e-4), (0.375, 8e-6, None), (0.5, 8e-6, 1.6e-6), (1.0, 8e-6, 1.6e-6)):
-        of_run = rates(config, share)
-        assert of_run["means"] == pytest.approx(means)
-        assert field is None or of_run["field"] == pytest.approx(field)
-        assert (of_run["nodes"], of_run["features"], of_run["scales"]) == (8e-4, 2.5e-3, 5e-3)
-    s = Schedule(config.train, 3, config.agr, build(config).warm_up)
-    assert (s.warm_up, s.densify_start, s.densify_stop, s.densify_every) == (10_000, 500, 50_000, 100)
-
-
-def test_stg_learns_as_its_authors_have_it():
-    """Catches rates of a short run or of gsbench's recipe, and rounds at other steps."""
-    config = composed("model=stg", "+recipe=authors_stg", "train.iterations=15000", "train.recipe_iterations=15000")
-    for share in (0.0, 1.0):
-        of_run = rates(config, share)
-        assert of_run["path"] == pytest.approx(1.75 * 1.6e-4 * 5)  # 5: the extent
-        assert (of_run["times"], of_run["turns"], of_run["durations"], of_run["scales"]) == (1e-4, 1e-4, 3e-2, 1.5e-3)
-    s = Schedule(config.train, config.model.sh_degree, config.agr)
+def test_rounds_are_those_of_the_authors():
+    """Catches rounds at other steps, another number of dynamic Gaussians at the end, and opacities that are reset."""
+    stg = composed("model=stg", "+recipe=authors_stg", "train.iterations=15000", "train.recipe_iterations=15000")
+    s = Schedule(stg.train, stg.model.sh_degree, stg.agr)
     assert [step + 1 for step in range(15_000) if s.densifies(step)] == [600, 700, 800, 900, 1000, 1100]
+    config = composed("model=ex4dgs", "+recipe=authors_ex4dgs")
+    s = Schedule(config.train, 3, config.agr)
+    rounds = [step for step in range(40_000) if s.densifies(step)]
+    assert (rounds[0] + 1, rounds[-1] + 1, len(rounds), list(s.resets_after)) == (600, 30_000, 99, [])
+    assert (1 - config.model.options["dynamic_share"]) ** len(rounds) == pytest.approx(0.98**36, abs=0.01)
+    assert config.raster.antialias
 
 
 def test_an_authors_recipe_is_for_their_model():
@@ -180,20 +206,3 @@ def test_a_published_name_stays_below_the_data_root(folder):
     """Catches a config that reads files outside of data.root."""
     with pytest.raises(InputError, match="scene: expected a name"):
         scene_folder(composed(f"scene.released_as={folder}"))
-
-
-def test_ex4dgs_learns_as_its_authors_have_it():
-    """Catches rates that depend on the run's length or the scene's size where the authors' do not, or that fall,
-    another number of dynamic Gaussians at the end, and opacities that are reset."""
-    config = composed("model=ex4dgs", "+recipe=authors_ex4dgs")
-    fixed = {"velocities": 1e-4, "key_quats": 1e-3, "windows": 1e-3, "fades": 1e-4, "quats": 1e-5, "scales": 5e-3}
-    for settings in (config, composed("model=ex4dgs", "+recipe=authors_ex4dgs", "train.iterations=4000")):
-        for share in (0.0, 0.5):
-            of_run = rates(settings, share)
-            assert {name: of_run[name] for name in fixed} == fixed
-            assert of_run["key_means"] == pytest.approx(5 * 1.6e-4)
-    s = Schedule(config.train, 3, config.agr)
-    rounds = [step for step in range(40_000) if s.densifies(step)]
-    assert (rounds[0] + 1, rounds[-1] + 1, len(rounds), list(s.resets_after)) == (600, 30_000, 99, [])
-    assert (1 - config.model.options["dynamic_share"]) ** len(rounds) == pytest.approx(0.98**36, abs=0.01)
-    assert config.raster.antialias

@@ -182,8 +182,7 @@ def test_multiscale_ssim():
 
 
 def test_flow_is_that_of_whole_films():
-    """Catches frames that a film loses, views of no film, and the sum of films: one of two renders stands still, and a
-    third film is too short."""
+    """Catches frames that a film loses, views of no film, and a sum of films: one stands still, one is too short."""
     texture = torch.rand(1, 1, 96, 160, generator=torch.Generator().manual_seed(0)).mul(255).int().float()
     wide = (torch.nn.functional.avg_pool2d(texture, 9, 1, 4)[0, 0] * 3 - 256).clamp(0, 255) / 255
     cameras = [Camera(torch.eye(4) * (1 + x), torch.eye(3), 128, 96) for x in range(4)]

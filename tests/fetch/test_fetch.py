@@ -100,8 +100,7 @@ def raw(answer: str) -> str:
 def test_a_file_arrives_whole_and_once(
     path: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a redirect that is taken for the file, a file that is fetched twice, another file taken for it, and
-    messages of pooch."""
+    """Catches a redirect taken for the file, a file fetched twice, another file taken for it, and messages of pooch."""
     log = io.StringIO()
     monkeypatch.setattr(pooch.get_logger().handlers[0], "stream", log)
     weights = source(address + path, tmp_path, hashlib.sha256(PAYLOAD).hexdigest()[:8])
@@ -149,7 +148,6 @@ def test_a_proxy_of_the_environment_is_asked(address: str, tmp_path: Path, monke
 
 
 def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    """Run the command against a mirror."""
     monkeypatch.setenv("GSBENCH_MIRROR", address)
     monkeypatch.setenv("TORCH_HOME", str(to / "torch"))
     return main([*words, "--to", str(to / "data")])

@@ -18,7 +18,7 @@ from gsbench.measure.exact_views import capped
 from gsbench.measure.quality import psnr
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import EffectSets
-from gsbench.models.gaussian_batch import Gaussians3D, tensors_of
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.render import render
 from gsbench.models.simplifications import simplifications_of
 
@@ -66,11 +66,6 @@ def test_a_static_gaussian_changes_with_nothing() -> None:
     assert (after.splats["log_diagonal"][:, [*after.rows["t"], *after.rows["d"]]] == LOG_SIZE_MAX).all()
 
 
-def _up_to_turns(gaussians: Gaussians3D) -> Gaussians3D:
-    """A slice with covariances for factors: freezing 4DGS turns a factor."""
-    return gaussians._replace(factors=gaussians.factors @ gaussians.factors.mT)
-
-
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_gated_model_is_gated_again(name: str) -> None:
     """Catches rows sorted into the wrong effect set: with the effect sets forgotten the images stay the same; a gate
@@ -95,7 +90,10 @@ def test_a_gated_model_is_gated_again(name: str) -> None:
         changing = simplification.rows
         for query, before in zip(queries, live, strict=True):
             changed = slice_of(after, simplification, before, query)
-            for a, b in zip(*(tensors_of(_up_to_turns(batch)) for batch in (before, changed)), strict=True):
+            slices = (
+                x._replace(factors=x.factors @ x.factors.mT) for x in (before, changed)
+            )  # freezing turns a factor
+            for a, b in zip(*map(tensors_of, slices), strict=True):
                 torch.testing.assert_close(a[changing:], b[changing:], atol=1e-5, rtol=1e-5)
         errors = sensitivity.errors[simplification.name]
         assert (errors[changing:] == 0).all()

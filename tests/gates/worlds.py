@@ -110,12 +110,10 @@ def rigged(
 
 
 def still(_: float) -> Gaussians3D:
-    """Nothing changes."""
     return blobs()
 
 
 def moving(moment: float) -> Gaussians3D:
-    """Half of the balls move."""
     world = blobs()
     means = world.means.clone()
     means[::2, 0] += 0.6 * math.sin(2 * math.pi * moment)

@@ -40,7 +40,6 @@ def test_the_name_and_hash_of_a_run_are_kept(command):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The bits of all trainings, made now."""
     return write.trainings(tmp_path_factory.mktemp("trainings"))
 
 

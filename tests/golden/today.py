@@ -97,7 +97,6 @@ def identity(words: Sequence[str]) -> dict[str, str]:
 
 
 def train(words: Sequence[str]) -> tuple[Record, Path]:
-    """Train and measure a run in this process."""
     return run_here(*words)
 
 

@@ -51,7 +51,7 @@ TRAININGS: dict[str, tuple[str, ...]] = {
         *("train.average_from=25000", "effects.gate=both", "train.checkpoint_minutes=0.003"),
     ),
 }
-RESUMED = ("7dgs", 2)  # killed after so many checkpoints, again and again
+RESUMED = ("7dgs", 8)  # killed after so many checkpoints, again and again
 COMMANDS = (
     "+exp=mini scene=suzanne",
     "+exp=mini scene=suzanne seed=2 results=elsewhere resume=false log=tensorboard",
@@ -85,7 +85,6 @@ COMMANDS = (
 
 
 def trainings(folder: Path) -> dict[str, Any]:
-    """The bits of the trainings, made in a folder."""
     data = write_moving_square(folder / "data")
     return {name: today.bits(*today.train(words_of(name, data, folder / name))) for name in TRAININGS}
 
@@ -97,7 +96,6 @@ def words_of(name: str, data: Path, results: Path) -> list[str]:
 
 
 def in_a_folder() -> dict[str, Any]:
-    """The bits of the trainings."""
     with tempfile.TemporaryDirectory() as folder:
         return trainings(Path(folder))
 
@@ -110,7 +108,6 @@ TEXTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def keep_numbers(name: str) -> None:
-    """Write numbers by key as CSV, sorted."""
     with (KEPT / f"{name}.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerows([key, f"{value:.{DIGITS}g}"] for key, value in sorted(NUMBERS[name]().items()))
@@ -136,7 +133,6 @@ def differing(kept: today.Numbers, present: today.Numbers) -> list[str]:
 
 
 def main(names: list[str]) -> None:
-    """Write the goldens of these names, or all."""
     for name in names or [*NUMBERS, *TEXTS]:
         if name in NUMBERS:
             keep_numbers(name)

@@ -47,7 +47,6 @@ class Target:
 
 
 def targets() -> dict[str, Target]:
-    """Every function by its name."""
     g = torch.Generator().manual_seed(0)
 
     def rand(*shape: int) -> Tensor:

@@ -65,7 +65,6 @@ def keys() -> list[str]:
 
 
 def case(seed: int, known: list[str]) -> list[str]:
-    """The overrides of a case."""
     draw = random.Random(seed)
     words = []
     for key in draw.sample(known, draw.choice((1, 1, 2, 3))):

@@ -130,7 +130,6 @@ def _call(function: Callable[..., Any], target: Target, arguments: dict[str, Any
 
 
 def _tensors(result: Any) -> Iterable[Tensor]:
-    """The tensors of a result."""
     if isinstance(result, RasterOutput):
         return [result.image, result.alpha, result.info.means2d, result.info.depths]
     if isinstance(result, float | int):

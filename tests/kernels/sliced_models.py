@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.models import CameraTime, GaussianModel, build
 from gsbench.models.cholesky import CholeskyModel
-from gsbench.models.gaussian_batch import Geometry, tensors_of
+from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.gaussians4d import Gaussians4DModel
 from gsbench.models.moving import MovingGaussians3D
 from gsbench.scenes.scene import Points
@@ -35,13 +35,15 @@ OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {  # the options of each model 
     **dict.fromkeys(("freetime", "freetime_plus", "sharptime", "stg", "stg_full"), ({},)),
     "ex4dgs": ({"dynamic_share": 0.5, "intervals": 2},),
 }
+LAMBDAS = {"7dgs": {"lambda_d": 0.3, "lambda_t": 0.5}, "6dgs": {"lambda_d": 0.3}, "7dgs_nodir": {"lambda_t": 0.5}}
+LAMBDAS["4dgs"] = {"lambda_t": 0.7}
 CASES = [(name, options) for name, every in OPTIONS.items() for options in every]
 SPREADS = {"betas": 0.7, "coupling": 0.5, "velocities": 0.5, "skew": 0.3, "directions": 0.7, "opacities": 2.0}
 
 
 def sliced_model(name: str, options: dict[str, Any], dtype: torch.dtype, times: int = 1) -> tuple[GaussianModel, Raw]:
     """A model, and raw parameters of about 40 Gaussians or of many times as many, the same numbers in every dtype."""
-    model = build(name, **options, **_lambdas(name))
+    model = build(name, **options, **LAMBDAS.get(name, {}))
     raw = _raw_of(model, name, options)
     model.log_lambda.requires_grad_(True)
     if isinstance(model, Gaussians4DModel):
@@ -51,15 +53,6 @@ def sliced_model(name: str, options: dict[str, Any], dtype: torch.dtype, times: 
     return model.to(dtype), {
         key: x.repeat(times, *[1] * (x.dim() - 1)).to(dtype).requires_grad_() for key, x in raw.items()
     }
-
-
-def _lambdas(name: str) -> dict[str, float]:
-    return {
-        "7dgs": {"lambda_d": 0.3, "lambda_t": 0.5},
-        "6dgs": {"lambda_d": 0.3},
-        "7dgs_nodir": {"lambda_t": 0.5},
-        "4dgs": {"lambda_t": 0.7},
-    }.get(name, {})
 
 
 def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
@@ -129,17 +122,11 @@ def _moving(model: MovingGaussians3D, g: torch.Generator) -> Raw:
 def slice_of(model: GaussianModel, raw: Raw) -> list[Tensor]:
     """A slice, with F F^T in the place of F where several square factors F are right."""
     at = raw["opacities"]
-    geometry = model.slice_geometry(raw, CameraTime(CENTER.to(at), TIME.to(at)))
-    return _covariances(geometry) if "lower" in raw else tensors_of(geometry)
-
-
-def _covariances(geometry: Geometry) -> list[Tensor]:
-    means, factors, *rest = tensors_of(geometry)
-    return [means, factors @ factors.mT, *rest]
+    means, factors, *rest = tensors_of(model.slice_geometry(raw, CameraTime(CENTER.to(at), TIME.to(at))))
+    return [means, factors @ factors.mT if "lower" in raw else factors, *rest]
 
 
 def moved(model: GaussianModel, device: str) -> GaussianModel:
-    """A copy of a model in float32 on a device."""
     return deepcopy(model).to(device, torch.float32)
 
 

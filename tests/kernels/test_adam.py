@@ -128,8 +128,7 @@ X, ONE = torch.zeros(4, 2), torch.ones(())
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(changed: dict[int, Any], message: str) -> None:
-    """Catches a mask or an array of another size or type, and a parameter with gaps, whose address reaches the
-    kernel."""
+    """Catches a mask or an array of another size or type, and a parameter with gaps, whose address a kernel gets."""
     listed = {i: X.clone() for i in range(4)} | {4: ONE.clone(), 5: ONE.clone(), 6: None, 7: None} | changed
     *arrays, drawn, skip = listed.values()
     with pytest.raises(InputError, match=message):

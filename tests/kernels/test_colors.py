@@ -131,8 +131,7 @@ def test_several_views_in_one_call(gaussian_per_view: bool, time_per_view: bool,
 
 
 def test_views_that_do_not_fit_are_refused(place: Place) -> None:
-    """Catches centres and times that a kernel would read past their end, and views that the CPU's kernel would leave
-    out."""
+    """Catches centres and times that are read past their end, and views that the CPU's kernel would leave out."""
     sh0, shN, means, times = [place.move(x) for x in color_inputs(2, torch.float32)]
     centers, time, opacities = place.move(torch.rand(4, 3)), place.move(torch.tensor(0.5)), place.move(torch.ones(21))
     several = means.expand(4, 21, 3), opacities.expand(4, 21)

@@ -39,7 +39,6 @@ def called_again(call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
 
 @pytest.fixture
 def device(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where replays run."""
     if cuda_device == "cpu":
         monkeypatch.setattr("gsbench.models.render.capture", called_again)
         monkeypatch.setattr("gsbench.models.render.resolve", lambda *_: CUDA)
@@ -54,7 +53,6 @@ def large(name: str, device: str, agr: bool = False) -> GaussianModel:
 def both(
     device: str, name: str, agr: bool = False
 ) -> tuple[GaussianModel, GraphedFrames, Callable[[Camera, float], Tensor]]:
-    """A model, its replay, and its launched render."""
     fitted, background = large(name, device, agr), torch.tensor(BACKGROUND, device=device)
 
     def launched(camera: Camera, time: float) -> Tensor:

@@ -60,12 +60,10 @@ class Call(NamedTuple):
     shapes: list[tuple[int, ...]]  # of the outputs
 
     def with_(self, **changes: Any) -> list[Any]:
-        """The arguments with some of them changed."""
         return [changes.get(name, x) for name, x in (self.tensors | self.numbers).items()]
 
 
 def declared() -> list[Operation]:
-    """Every operation of gsbench.kernels."""
     modules = [
         importlib.import_module(f"gsbench.kernels.{m.name}")
         for m in pkgutil.iter_modules(kernels.__path__)

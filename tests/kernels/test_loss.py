@@ -27,7 +27,6 @@ def pictures(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torc
 
 
 def value_and_gradient(image: torch.Tensor, target: torch.Tensor, weight: float = 0.2) -> list[torch.Tensor]:
-    """The loss, and the gradient of three times the loss."""
     leaf = image.clone().requires_grad_()
     loss = l1_ssim(leaf, target, weight)
     (3 * loss).backward()

@@ -23,8 +23,7 @@ def layer(rows: int, inputs: int, outputs: int) -> list[Tensor]:
 
 @LAYERS
 def test_a_layer_and_its_gradients_are_torch_s(rows: int, inputs: int, outputs: int, relu: bool) -> None:
-    """Catches a row, column or product that a tile of the matrices leaves out or takes twice, and a ReLU that does not
-    stop a gradient."""
+    """Catches a row, column or product that a tile leaves out or takes twice, and a ReLU that stops no gradient."""
     tensors = layer(rows, inputs, outputs)
     upstream = torch.randn(rows, outputs, generator=torch.Generator().manual_seed(1))
     (y,) = linear(*tensors, relu)

@@ -203,8 +203,7 @@ def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
     ],
 )
 def test_bad_values_are_named(name: str, value: float, message: str, place: Place) -> None:
-    """Catches a value that shows late, as a picture of NaN: on a GPU the check does not wait for the device; and one of
-    the last camera's Gaussians."""
+    """Catches a value that shows late, as a picture of NaN, on a GPU, or one of the last camera's Gaussians."""
     arguments = with_background("beta_of_three_cameras_of_their_own_gaussians", device=place.device)
     arguments[name].view(-1)[0 if name == "Ks" else -1] = value
     with pytest.raises(InputError, match=f"^{message}"):

@@ -67,8 +67,7 @@ def intervals_around(time: Tensor, count: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.98, 1.0])
 @pytest.mark.parametrize("rests", [False, True])
 def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, place: Place) -> None:
-    """Catches a row past the prefix, or outside its visible interval, that is moved, counted in a weight's gradient, or
-    not copied, forth or back."""
+    """Catches a row past the prefix, or outside its interval, that is moved, counted in a weight's gradient or lost."""
     N = N if place.name != "cuda" else min(N, 300)
     parts, count = [3, 1, 2, 7], round(share * N)
     exact, values = exact_network(N, [3, 1, 9], parts)

@@ -54,7 +54,6 @@ def fitted(name: str, N: int = 300, *, agr: bool = False, classed: bool = False)
 
 
 def gradients(of: GaussianModel) -> dict[str, Tensor]:
-    """Take the gradients from the parameters."""
     taken = {name: p.grad for name, p in of.named_parameters() if p.grad is not None}
     of.zero_grad(set_to_none=True)
     return taken
@@ -306,8 +305,7 @@ def test_a_network_is_differentiated_once() -> None:
 
 
 def test_two_views_may_share_a_gradient() -> None:
-    """Catches sums of which two are one tensor: torch gives both terms of a sum the same gradient, and the second
-    view's would be added to it twice."""
+    """Catches two sums that are one tensor, as torch gives both terms of a sum: another view's would be added twice."""
     g = torch.Generator().manual_seed(5)
     a, b = torch.randn(20, 3, generator=g).requires_grad_(), torch.randn(20, 3, generator=g).requires_grad_()
     quats = torch.randn(20, 4, generator=g)

@@ -76,7 +76,6 @@ def start(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> Start:
 
 
 def launched(fitted: Training) -> Training:
-    """Return a training none of whose steps is recorded."""
     fitted.gradients._signature = lambda *_: None
     return fitted
 

@@ -146,7 +146,6 @@ def test_configs_of_the_user_are_found_in_their_folder(tmp_path: Path) -> None:
 
 @functools.cache
 def settings(ablation: str) -> dict[str, Any]:
-    """All keys of a run of an ablation, flat."""
     config = compose_run(["+exp=ablation", "scene=suzanne", f"+ablation={ablation}"]).config
     return dict(flat(OmegaConf.to_container(config, resolve=True)))
 

@@ -28,7 +28,6 @@ def words(data: Path, results: Path, iterations: int) -> list[str]:
 
 
 def workers(results: Path) -> list[int]:
-    """The processes of the runs that train."""
     try:
         claims = [progress.read(path) for path in results.rglob(progress.FILE_NAME)]
     except ValueError:  # a file was replaced or removed just now

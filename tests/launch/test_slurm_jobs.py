@@ -65,8 +65,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_each_run_is_a_job_in_the_image(log: Path, square: Path, tmp_path: Path) -> None:
-    """Catches an array whose jobs run outside of the image, results or data that the image does not see, and settings
-    that Slurm does not get."""
+    """Catches jobs outside of the image, results or data that it does not see, and settings that Slurm does not get."""
     image, results = tmp_path / "gsbench.sif", tmp_path / "results"
     image.touch()
     of_jobs = ["+launch=slurm", f"launch.container={image}", "launch.gpus=1", "launch.at_once=3", "launch.minutes=7"]

@@ -261,8 +261,7 @@ def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> 
 def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
     tmp_path: Path, of: dict[str, Any], state: str
 ) -> None:
-    """Catches a live training that no status shows, and a killed one that is not lost: they were taken for the planned
-    one, which has no record either."""
+    """Catches a live or a killed training that was taken for the planned one, which has no record either."""
     planned(tmp_path)
     other = tmp_path / "lego" / "7dgs" / "seed1"
     other.mkdir(parents=True)

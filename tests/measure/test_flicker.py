@@ -26,8 +26,7 @@ def in_color(image: np.ndarray) -> Tensor:  # [H, W]
     [(np.full_like(STEPS, 0.02, float), 0.0, 0.0), (0.01 * STEPS, 2.55, 10.2), (0.02 * (-1.0) ** STEPS, 10.2, 0.0)],
 )
 def test_the_numbers_of_the_sheet(error, flicker, drift):
-    """Catches a constant error that counts, a drift of frames in place of thirds, moving pixels, and another unit
-    (RIVALS.md, section 10)."""
+    """Catches a constant error, a drift of frames for thirds, moving pixels, another unit (RIVALS.md, section 10)."""
     film = Film(FRAMES, STILL)
     for frame, truth in zip(TRUTH + error, TRUTH, strict=True):
         film.add(in_color(frame), in_color(truth))

@@ -12,7 +12,6 @@ from gsbench.measure.images import ERROR_SCALE, GAP, HEADER
 
 
 def cells(picture: np.ndarray, height: int, width: int, row: int = 0) -> list[np.ndarray]:
-    """The three images of a row."""
     top = HEADER + row * (height + GAP)
     return [picture[top : top + height, i * (width + GAP) :][:, :width] for i in range(3)]
 
@@ -62,8 +61,7 @@ def test_errors_of_float32_have_a_log_scale():
 
 
 def test_small_images_are_enlarged_without_smoothing_and_nan_is_seen():
-    """Would catch interpolated pixels, every pixel of a 110-wide image becomes 3 x 3 equal ones, and broken pixels that
-    look like a perfect black."""
+    """Catches interpolated pixels (of a 110-wide image each becomes 3 x 3), and broken ones that look black."""
     image = np.random.default_rng(0).random((5, 110, 3))
     shown = cells(pictures.strip([(image, image)]), 15, 330)[0]
     assert (shown.reshape(5, 3, 110, 3, 3).min((1, 3)) == shown.reshape(5, 3, 110, 3, 3).max((1, 3))).all()

@@ -171,8 +171,7 @@ def test_workers_share_the_time_they_took_together():
 
 
 def test_stages_add_up_to_the_wall_clock(clock):
-    """Would catch work between stages that no stage has, work of threads that counts twice, and time outside of
-    `running` that counts at all."""
+    """Catches work between stages that none has, work of threads that counts twice, and time outside of `running`."""
 
     def work(seconds):
         clock[0] += seconds

@@ -182,5 +182,4 @@ def joint(model: GaussianModel) -> Tensor:
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    """Whether two states have the same bits."""
     return a.keys() == b.keys() and all(torch.equal(x, b[key]) and x.dtype == b[key].dtype for key, x in a.items())

@@ -154,8 +154,7 @@ def rotor_factor(left: np.ndarray, right: np.ndarray, scales: np.ndarray) -> np.
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_4dgs(scheme: str) -> None:
-    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is ignored or not 1 by default, and the opacity
-    factor's exponent."""
+    """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is ignored or not 1, and the opacity's exponent."""
     assert build("4dgs").lambda_of("time") == 1
     model = lively("4dgs", scheme=scheme)
     model.clock.fill_(0.8)  # world units that correspond to the time range
@@ -277,7 +276,6 @@ PROFILES = ("ubs", "ubs_static", "dbs", "dbs_static")
 
 
 def profiles(name: str, count: int = 30, **options: Any) -> tuple[BetaModel, Raw]:
-    """A model of Beta profiles in the midst of a training, and its raw parameters."""
     model = lively(name, count, **options)
     return model, {key: value.detach() for key, value in model.splats.items()}
 

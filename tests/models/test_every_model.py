@@ -339,8 +339,7 @@ def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
 @REGISTERED
 @pytest.mark.parametrize("kind", [MeanOpacity, MeanSize])
 def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Penalty]) -> None:
-    """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes: it is printed and acts on
-    nothing."""
+    """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes, which acts on nothing."""
     model = active(name)
     penalty = kind(model, 0, 1)
     penalty(QUERY, 0).backward()

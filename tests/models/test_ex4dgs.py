@@ -37,8 +37,7 @@ def gaussian(*, tau: float = 2.9, rise: str = "text", **raw: Tensor) -> Any:
 
 
 def test_positions_and_rotations_of_a_dynamic_gaussian() -> None:
-    """Catches other keyframes, tangents of another interval, a path that is not relative to the mean, and quaternions
-    of other keyframes."""
+    """Catches other keyframes, tangents of another interval, and a path that is not relative to the mean."""
     sliced, model = gaussian()
     expected = row(0.3, -0.7, 1.1) + row(0.19110000, -0.09170000, 0.50350000)
     torch.testing.assert_close(sliced.means, expected, **DIGITS)

@@ -76,8 +76,7 @@ def test_the_network() -> None:
 
 
 def test_a_changed_gaussian() -> None:
-    """Catches scales that change after the exp, a quaternion that is normalised before the sum, and colours, in a slice
-    or its export, that do not change."""
+    """Catches scales changed after the exp, a quaternion normalised before the sum, and colours that do not change."""
     model: Any = lively("hexplane", 4, appearance=True)
     model.set_active(FULL)
     model.select(torch.arange(1))

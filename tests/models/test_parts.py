@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor, nn
 
-from gsbench.errors import InputError
 from gsbench.models.appearance import (
     MOST_PACKED,
     ColorOrder,
@@ -79,12 +78,6 @@ def test_kinds_of_entries(letters: str, expected: dict[str, str]) -> None:
     layout, n = CholeskyLayout(letters, "raw"), len(letters)
     names = torch.tensor([10 * i + j for i in range(n) for j in range(i)])[None]
     assert {kind: " ".join(map(str, x[0].tolist())) for kind, x in layout.split(names).items()} == expected
-
-
-def test_unknown_form() -> None:
-    """Catches a misspelt form that is taken for another."""
-    with pytest.raises(InputError, match="relative"):
-        CholeskyLayout("ppp", "relativ")
 
 
 def test_row_scaled_cuts_what_it_cannot_reach() -> None:

@@ -133,8 +133,7 @@ def test_a_rigid_motion_is_not_penalised() -> None:
 
 
 def test_the_penalty_is_the_least_energy() -> None:
-    """Catches weights that are lost, an energy of other neighbours or times, and a rotation that is not the best: SciPy
-    finds the same."""
+    """Catches lost weights, other neighbours or times, and a rotation that is not the best, which SciPy finds."""
     paths = torch.randn(3, 10, 3, generator=seeded(0)).double()
     near = torch.stack([torch.randperm(10, generator=seeded(i))[:5] for i in range(10)])
     weights = torch.rand(10, 5, generator=seeded(11)).double()

@@ -112,7 +112,6 @@ NINE = row(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.066, 0.044, 0.154)
 
 
 def layer(number: int, rows: int, columns: int) -> Tensor:
-    """The weights of a layer in the vector."""
     i, j = (torch.arange(n, dtype=torch.float64) for n in (rows, columns))
     return torch.sin(0.37 * number + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
 

@@ -17,7 +17,6 @@ QUERY = CameraTime.at(CAMERA.float(), 0.3)
 
 
 def trained(degree: int = 3) -> TrainedGaussians:
-    """Gaussians of every shape."""
     g, K = seeded(3), (degree + 1) ** 2
     shapes = ((N, 3), (N, 3), (N, 4), (N,), (N, 3), (N, K - 1, 3))
     return TrainedGaussians(*(torch.randn(shape, generator=g) for shape in shapes))

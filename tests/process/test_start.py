@@ -101,8 +101,7 @@ def test_malloc_is_asked_for_what_the_user_has_not_set(monkeypatch):
 
 
 def test_an_openmp_that_is_not_loaded_reads_the_variable(monkeypatch):
-    """Catches a variable of another name or value, one that is set over the user's, and libgomp loaded into a process
-    that does without it."""
+    """Catches a variable of another name or value, one set over the user's, and libgomp where it is not needed."""
 
     def load(name, mode):
         assert (name, mode) == ("libgomp.so.1", os.RTLD_NOLOAD)
@@ -139,8 +138,7 @@ def test_idle_threads_sleep():
     ],
 )
 def test_vectors_are_chosen_as_gsbench_is_imported(imports, capability, code, variables):
-    """Catches a setting that comes after torch or MKL has read it, a variable that they do not know, and one that is
-    set over the user's."""
+    """Catches a setting after torch or MKL has read it, a variable that they do not know, and one over the user's."""
     text = printed(imports, VECTORS, MKL_VERBOSE="1", **variables)
     assert not start._has_avx512() or capability in text.splitlines()
     assert not HAS_MKL or code in text

@@ -54,10 +54,6 @@ def _rand(g: torch.Generator, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=g, dtype=torch.float64)
 
 
-def _rotations(g: torch.Generator, N: int) -> Tensor:
-    return torch.linalg.qr(torch.randn(N, 3, 3, generator=g, dtype=torch.float64))[0]
-
-
 def _repeated(rows: list[Any], N: int) -> Tensor:
     """N rows that are these in turn."""
     values = torch.tensor(rows, dtype=torch.float64)
@@ -70,7 +66,8 @@ def _repeated(rows: list[Any], N: int) -> Tensor:
 def _flattened(g: torch.Generator, N: int, axes: list[list[float]], width: int = 33, height: int = 17) -> Arguments:
     """N Gaussians of these axes in turn, turned at random."""
     scene = gaussians(g, N) | camera(width, height)
-    return scene | {"factors": _rotations(g, N) * _repeated(axes, N)[:, None]}
+    rotations = torch.linalg.qr(torch.randn(N, 3, 3, generator=g, dtype=torch.float64))[0]
+    return scene | {"factors": rotations * _repeated(axes, N)[:, None]}
 
 
 def _near_plane(g: torch.Generator) -> Arguments:

@@ -27,7 +27,6 @@ class Page(HTMLParser):
         assert inside <= {*ids}, "a link to nothing"
 
     def values(self, *names: str) -> list[str]:
-        """The values of attributes with these names."""
         return [value for name, value in self.attributes if name in names]
 
     @property

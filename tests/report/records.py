@@ -120,7 +120,6 @@ def elsewhere(record: Record, model: str, **costs: float | None) -> Record:
 
 
 def lost(record: Record, reason: str = "out of memory", status: str = "failed") -> Record:
-    """The same run, not finished."""
     nothing: dict[str, Any] = {"metrics": None, "missing": {}, "cost": None, "per_view": [], "curve": []}
     return dataclasses.replace(record, status=status, reason=reason, **nothing)
 

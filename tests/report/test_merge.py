@@ -21,7 +21,6 @@ SCENES = ("suzanne", "moving-matte")
 
 
 def published(root: Path, **people: list[Record]) -> list[Path]:
-    """The folders of studies, one of each person."""
     for name, records in people.items():
         study.write(records, root / name)
     return [root / name for name in people]
@@ -95,8 +94,7 @@ def test_protocols_and_data_are_told_apart(tmp_path):
 
 
 def test_a_run_that_two_publish_counts_once_and_other_numbers_are_told(tmp_path):
-    """Catches a run that counts twice, one that hides another with other numbers, and a repetition elsewhere that
-    passes for the same run."""
+    """Catches a run that counts twice or hides one of other numbers, and a repetition that passes for the same run."""
     first, second, third = runs_of("4dgs", 24.0)[:3]
     elsewhere_run = but(second, provenance={"device": "GPU"}, cost={"train_s": 1.0})
     forged = but(third, metrics={"ssim": 0.95})

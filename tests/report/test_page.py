@@ -54,7 +54,6 @@ def html(*runs):
 
 
 def charts_of(*runs):
-    """The charts of a page."""
     return json.loads(re.search(r'id="specs">(.*?)</script>', html(*runs), re.S)[1])
 
 
@@ -65,7 +64,6 @@ def small():
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder of results with every kind of row."""
     for i, run in enumerate((*every_row(), make(experiment="other", psnr=11.5))):
         files.write(run, tmp_path / "results" / str(i) / files.FILE_NAME)
     return tmp_path / "results"

@@ -64,8 +64,6 @@ def test_a_record_that_no_table_can_hold_is_refused(tmp_path):
 
 
 def edited(before: str, after: str) -> Callable[[Path], object]:
-    """Replace a text of runs.csv."""
-
     def edit(folder: Path) -> None:
         path = folder / study.RUNS_FILE
         assert before in path.read_text()

@@ -23,7 +23,6 @@ CROWD, ROUNDS = 6, 15
 
 
 def names(folder: Path) -> list[str]:
-    """The files of a folder."""
     return sorted(path.name for path in folder.iterdir())
 
 

@@ -37,7 +37,6 @@ class Finished:
         return run_here(*overrides(self.data, self.results, *WORDS, *words))[0]
 
     def lose_checkpoint(self) -> None:
-        """Delete its checkpoint."""
         (self.folder / checkpoint.FILE_NAME).unlink()
 
     def change(self, **changed: Any) -> None:

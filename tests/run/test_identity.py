@@ -64,8 +64,7 @@ TRAINING = (
 
 @pytest.mark.parametrize("word", [*MEASURING, *TRAINING])
 def test_what_changes_the_training_changes_its_hash_and_nothing_else_does(word: str) -> None:
-    """Catches a training that is repeated because its images are measured in another way, and a checkpoint that is
-    taken by a run with other numbers."""
+    """Catches a training repeated because it is measured in another way, and another run's checkpoint that is taken."""
     assert (training_hash(named(word).plain) == training_hash(named().plain)) == (word in MEASURING)
     assert word in TRAINING or named(word).variant == ""
 

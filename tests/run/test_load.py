@@ -18,7 +18,6 @@ from gsbench.train.checkpoint import Checkpoint
 
 @pytest.fixture(scope="module")
 def folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a finished run of 7DGS with AGR."""
     return run_here(*overrides(square, tmp_path_factory.mktemp("r"), "model=7dgs", "train.iterations=20"))[1]
 
 

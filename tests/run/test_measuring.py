@@ -73,8 +73,7 @@ def test_the_line_of_a_run_begins_with_its_psnr() -> None:
 
 
 def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> None:
-    """Catches numbers of renders in 8 bits in place of floats, a film that leaves no picture, and a static model whose
-    Gaussians move."""
+    """Catches numbers of 8 bits in place of floats, a film without a picture, and a static model that moves."""
     data = shutil.copytree(square, tmp_path / "data")
     path = data / "square/transforms_test.json"
     content = json.loads(path.read_text())

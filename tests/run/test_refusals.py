@@ -44,7 +44,15 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("7dgs", "scene.eval_split=val", None),
         # a schedule or a penalty
         ("3dgs", "train.average_from=30000", "train.average_from: expected a step below train.recipe_iterations=30000"),
-        ("3dgs", "train.cooldown_from=30000", "train.cooldown_from: expected a step below"),
+        (
+            "3dgs",
+            "train.cooldown_from=30000",
+            "train.cooldown_from: expected a step below train.recipe_iterations=30000",
+        ),
+        ("7dgs", "model.lr.means.start=-1", "model.lr.means.start: expected at least 0, got -1"),
+        ("7dgs", "model.lr.means.start=0", "model.lr.means: expected start >= 0, and start > 0 with end > 0"),
+        ("7dgs", "model.lr.means.end=0", "model.lr.means: expected start >= 0, and start > 0 with end > 0"),
+        ("7dgs", "model.lr.opacities.until=20000", "model.lr.opacities: expected an end with until=20000"),
         ("3dgs", "train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
         ("3dgs", "train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
         ("3dgs", "train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),

@@ -96,7 +96,6 @@ def overfitting() -> Iterator[None]:
 
 @pytest.fixture(scope="module", params=[MODELS, LENGTHS], ids=["models", "lengths"])
 def choice(request: pytest.FixtureRequest) -> Choice:
-    """What a run chooses among."""
     chosen: Choice = request.param
     return chosen
 
@@ -118,7 +117,6 @@ def chosen_in(record: Record) -> tuple[str, int, list[Candidate]]:
 
 
 def logged(folder: Path) -> list[int]:
-    """The iterations in the curve.jsonl of a run."""
     return [json.loads(line)["iteration"] for line in (folder / "curve.jsonl").read_text().splitlines()]
 
 

@@ -19,7 +19,6 @@ from gsbench.scenes.sample import folder
 
 
 def project(view: scenes.View, point: list[float]) -> tuple[float, float, float]:
-    """Pixel coordinates and depth of a world point."""
     camera = view.camera
     x, y, depth = camera.viewmat[:3, :3] @ torch.tensor(point, dtype=torch.float32) + camera.viewmat[:3, 3]
     u, v, _ = camera.K @ torch.stack([x / depth, y / depth, torch.tensor(1.0)])
@@ -59,8 +58,7 @@ def test_camera_of_a_known_frame(downscale: int) -> None:
 
 
 def test_axes(tiny: Path) -> None:
-    """Catches a flipped or swapped axis: right is +u, up is -v, ahead is +depth, for two cameras by hand; sides that
-    are swapped on another device."""
+    """Catches a flipped or swapped axis: right is +u, up is -v, ahead is +depth; sides swapped on another device."""
     scene = scenes.load(tiny)
     f = 4 / math.tan(0.4)
     front, side = (view.to("cpu") for view in scene.train)

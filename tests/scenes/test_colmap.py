@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_run import main_here
-from tiny_scene import check_message, write_image
+from tiny_scene import assert_refused, write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -373,10 +373,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_fault_is_one_line_that_says_what_is_wrong(taken: Path, fault: str) -> None:
     """Catches a fault let through, missing rows that are read as grey, and a stack trace from the depths."""
     apply, message = FAULTS[fault]
-    apply(taken)
-    with pytest.raises(InputError, match=message) as caught:
-        scenes.load(taken)
-    check_message(caught.value)
+    assert_refused(taken, apply, message)
 
 
 @pytest.mark.parametrize(

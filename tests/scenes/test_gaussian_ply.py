@@ -238,8 +238,7 @@ def test_another_file_says_what_opens_it(
 
 
 def test_the_share_of_gaussians_that_a_camera_sees() -> None:
-    """Catches Gaussians behind all cameras, beside the image, too transparent, smaller than a pixel or nearer
-    than a camera draws that count."""
+    """Catches Gaussians behind all cameras, beside the image, too transparent, too small or too near that count."""
     eye = torch.eye(4)
     ahead = Camera(eye, torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 60)
     aside = Camera(torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]), ahead.K, 100, 60)

@@ -25,7 +25,6 @@ def write(root: Path, file: dict[str, Any], frame: dict[str, Any]) -> None:
 
 
 def numbers(view: scenes.View) -> tuple[float, float, float, float]:
-    """The focal lengths and the principal point."""
     K = view.camera.K.tolist()
     return K[0][0], K[1][1], K[0][2], K[1][2]
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 from scenes.capture import circle, has_estimated_up
-from scenes.tiny_scene import write_image
+from scenes.tiny_scene import assert_refused, write_image
 
 from gsbench import scenes
-from gsbench.errors import InputError
 from gsbench.reading import parse
 from gsbench.scenes.nerfies import CameraFile, camera_of
 
@@ -98,8 +97,6 @@ def test_cameras_times_and_splits(root: Path) -> None:
 
 
 def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
-    """Change the content of a JSON file."""
-
     def apply(root: Path) -> None:
         content = json.loads((root / name).read_text())
         change(content)
@@ -130,7 +127,4 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
 def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
     """Catches scenes without a test camera, images without a time, and lenses that are not undone."""
-    apply(root)
-    with pytest.raises(InputError, match=message) as error:
-        scenes.load(root)
-    assert "\n" not in str(error.value)
+    assert_refused(root, apply, message)

@@ -110,8 +110,6 @@ def test_fingerprint(root: Path) -> None:
 
 
 def frames(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], None]:
-    """Change the list of frames."""
-
     def apply(root: Path) -> None:
         content = content_of(root)
         change(content["frames"])

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scenes.capture import COLOR, Capture, has_estimated_up
-from scenes.tiny_scene import write_image
+from scenes.tiny_scene import assert_refused, write_image
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -105,7 +106,6 @@ def test_what_is_not_read_is_told(root: Path) -> None:
 
 
 def table(change: Callable[[str], str]) -> Callable[[Path], object]:
-    """Change the text of the cameras' parameters."""
     return lambda root: (root / CAMERAS).write_text(change((root / CAMERAS).read_text()))
 
 
@@ -131,9 +131,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
     """Catches distorted originals taken for undistorted ones, tables that are read askew, a missing view, one of
     another size, and two scenes in one folder."""
-    apply(root)
-    with pytest.raises(InputError, match=message):
-        scenes.load(root)
+    assert_refused(root, apply, message)
 
 
 def damage(root: Path, name: str) -> Path:
@@ -167,32 +165,24 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("damaged", "name", "message"),
+    ("damaged", "repair", "message"),
     [
-        ([], "Tiny_undist_00101_09", "is whole: leave it out"),
-        (["Tiny_undist_00100_09"], "Tiny_undist_00100_09", "frame 99, it is not loaded"),
-        (["Tiny_undist_00101_09", "Tiny_undist_00100_09"], "Tiny_undist_00101_09", "00100_09.png: truncated"),
-        (["Tiny_undist_00101_10"], "Tiny_undist_00101_10", "is a test image"),
-        (["Tiny_undist_00101_09"], "Tiny_undist_00108_09", "expected an image that is loaded"),
-        (["Tiny_undist_00101_09"], "00101_09", "expected names such as"),
+        ("", ["Tiny_undist_00101_09"], "is whole: leave it out"),
+        ("00100_09", ["Tiny_undist_00100_09"], "frame 99, it is not loaded"),
+        ("00101_09 00100_09", ["Tiny_undist_00101_09"], "00100_09.png: truncated"),
+        ("00101_10", ["Tiny_undist_00101_10"], "is a test image"),
+        ("00101_09", ["Tiny_undist_00108_09"], "expected an image that is loaded"),
+        ("00101_09", ["00101_09"], "expected names such as"),
+        ("00101_09", "Tiny_undist_00101_09", "repair: expected names such as"),
     ],
 )
-def test_what_cannot_be_replaced_is_refused(root: Path, damaged: list[str], name: str, message: str) -> None:
-    """Catches a whole image that is thrown away, a test on another frame's image, and an image made of nothing."""
-    for single in damaged:
-        damage(root, single)
+def test_what_cannot_be_replaced_is_refused(root: Path, damaged: str, repair: Any, message: str) -> None:
+    """Catches a whole image that is thrown away, a test on another frame's image, an image made of nothing, and one
+    name that is read as a list of letters."""
+    for single in damaged.split():
+        damage(root, f"Tiny_undist_{single}")
     with pytest.raises(InputError, match=message):
-        scenes.load(root, repair=[name])
-
-
-def test_repair_is_of_this_layout(tmp_path: Path) -> None:
-    """Catches an option that other data sets ignore, and one name that is read as a list of letters."""
-    (tmp_path / "transforms_train.json").write_text("{}")
-    with pytest.raises(InputError, match=r"repair: transforms_train\.json has no frame before"):
-        scenes.load(tmp_path, repair=["Tiny_undist_00101_09"])
-    (tmp_path / "transforms_train.json").rename(tmp_path / CAMERAS)
-    with pytest.raises(InputError, match="repair: expected names such as"):
-        scenes.load(tmp_path, repair="Tiny_undist_00101_09")
+        scenes.load(root, repair=repair)
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])

@@ -7,7 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from gsbench import scenes
 from gsbench.errors import InputError
 
 # An OpenGL camera at (0, 0, 4) that looks down its own -z axis at the origin.
@@ -41,7 +43,6 @@ def edit(root: Path, change: Callable[[dict[str, Any]], object], *splits: str) -
 
 
 def write_tiny(root: Path) -> Path:
-    """Write the data set into `root`; return `root`."""
     random = np.random.default_rng(0)
     for split, count in COUNTS.items():
         frames = []
@@ -52,6 +53,14 @@ def write_tiny(root: Path) -> Path:
         content = {"camera_angle_x": 0.8, "frames": frames}
         (root / f"transforms_{split}.json").write_text(json.dumps(content))
     return root
+
+
+def assert_refused(root: Path, apply: Callable[[Path], object], message: str) -> None:
+    """Assert that a scene with a fault is refused in one line that matches a pattern."""
+    apply(root)
+    with pytest.raises(InputError, match=message) as caught:
+        scenes.load(root)
+    check_message(caught.value)
 
 
 def check_message(error: InputError, *parts: str) -> None:

@@ -57,7 +57,6 @@ class Sweep:
         self._start("gsbench", "-m", *SLURM, f"results={results}", *overrides)
 
     def retry(self, *launch: str) -> None:
-        """Put back what broke, and wait for it."""
         self._start("gsbench.launch", "retry", str(self.results / "mini"), *launch)
         self.wait()
 
@@ -74,7 +73,6 @@ class Sweep:
         return json.loads(done.stdout) if done.stdout else []
 
     def states(self) -> list[str]:
-        """The state of each run, sorted."""
         return sorted(run["state"] for run in self.status())
 
     def training(self) -> list[Progress]:

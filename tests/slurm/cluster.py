@@ -127,7 +127,6 @@ class Cluster:
             )
 
     def start_node(self, node: str) -> None:
-        """Start the slurmd of a node."""
         self.start(node, "slurmd", "-D", "-N", node, "-f", str(self.folder / "slurm.conf"))
 
     def kill_node(self, node: str) -> None:
@@ -257,6 +256,5 @@ def free_ports(count: int) -> list[int]:
 
 
 def send(pid: int, number: int) -> None:
-    """Send a signal to a process, if it still lives."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)

@@ -165,8 +165,7 @@ def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pyte
 
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a stack trace for a folder without a run, a file that is no PLY, an --out that is a file, and options
-    that are not read."""
+    """Catches a stack trace for no run, no PLY, an --out that is a file, and options that are not read."""
     (tmp_path / "broken.ply").write_text("no")
     for arguments, expected in (
         ([tmp_path], "expected the folder of a run"),
@@ -284,8 +283,7 @@ def test_the_first_gaussian_counts() -> None:
 
 
 def test_the_worst_gaussians_have_the_largest_sums() -> None:
-    """Catches the least ones, a Gaussian twice, one of a view in which it is less hard, and another sum than that of
-    its pixels."""
+    """Catches the least ones, a Gaussian twice, one of a view in which it is less hard, and a sum of other pixels."""
     model = small_model()
     double, sums = float32_error.float64_model(model), []
     for view in VIEWS[:2]:
@@ -391,8 +389,7 @@ def test_it_is_the_largest_change_of_three_spaced_views(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("kind", [RuntimeError, TypeError])
 def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an error of a user's model in float64 that ends a trained run, and a backend whose images are compared
-    with those of another one."""
+    """Catches an error of a user's model in float64 that ends a trained run, and images of two backends compared."""
     assert psnr_float32(small_model(backend="reference"), VIEWS)[0] is None
     assert "needs raster.backend=cpu" in psnr_float32(small_model(backend="reference"), VIEWS)[1]
     model = small_model()
@@ -409,8 +406,7 @@ def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatc
 
 
 def test_equal_images_have_no_change() -> None:
-    """Catches an infinity, or no number at all, where an image equals its view, whose PSNR is capped, and two images
-    of which one is not filtered."""
+    """Catches an infinity where an image equals its view, whose PSNR is capped, and one of two images not filtered."""
     model = small_model()
     double = float32_error.float64_model(model)
     rendered = [

@@ -25,16 +25,14 @@ from gsbench.train.hooks.average import Average
 from gsbench.train.loop import Trainer
 
 RUN = (
-    "model=7dgs",
-    "train.iterations=60",
-    "train.densify.every=10",
-    "train.checkpoint_minutes=0",
+    *("model=7dgs", "train.iterations=60", "train.densify.every=10", "train.checkpoint_minutes=0"),
     "data.initial_points=60",
 )
 ROUNDS = (
     *("train.densify.start=0", "train.densify.stop=50", "train.densify.every=10"),
     *("train.iterations=60", "train.recipe_iterations=60", "train.refine_from=0"),
 )
+MULTIVIEW = ("train.densify.kind=multiview", "train.densify.grad_threshold=1e-6")
 
 
 def final_state(results: Path) -> dict[str, object]:
@@ -84,16 +82,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
     ("start", "step"),
     [
         (lambda: trainer("7dgs", *ROUNDS, "train.densify.kind=mcmc", "train.average_from=40"), 55),
-        (
-            lambda: trainer(
-                "7dgs",
-                *ROUNDS,
-                "train.densify.kind=multiview",
-                "train.densify.grad_threshold=1e-6",
-                "model.min_opacity=0.09",
-            ),
-            25,
-        ),
+        (lambda: trainer("7dgs", *ROUNDS, *MULTIVIEW, "model.min_opacity=0.09"), 25),
         (lambda: trainer("7dgs", *ROUNDS, "train.penalties.strain.weight=1.0", "train.batch_size=2"), 25),
         (lambda: with_val({60: 50.0}, "effects.gate=off"), 67),
     ],

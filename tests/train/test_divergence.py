@@ -100,8 +100,7 @@ def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
 
 
 def test_without_harmonics() -> None:
-    """Catches a diagnosis that takes the largest of no coefficients, so that the run leaves no record, and one without
-    any Gaussian to blame."""
+    """Catches a diagnosis of no coefficients, which leaves no record, and one without any Gaussian to blame."""
     model, points = models.build("3dgs", sh_degree=0), moving_square().points
     model.initialise(points, 4.4, generator(0))
     for p in model.splats.values():

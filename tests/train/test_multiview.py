@@ -62,8 +62,7 @@ def wrong_on_the_left(model: GaussianModel, view: View, by: float) -> View:
 
 
 def test_scores_are_the_sums_by_hand() -> None:
-    """Catches weights of pixels that are not flagged, errors of another range, losses of other views, and a mean that
-    is a sum."""
+    """Catches pixels that are not flagged, errors of another range, losses of other views, and a mean that is a sum."""
     model = four_gaussians()
     views = [wrong_on_the_left(model, *pair) for pair in zip(moving_square().train[:3], (0.2, 0.5, 1.0), strict=True)]
     importance, badness = scores_of(model, views)(generator(5))
@@ -84,8 +83,7 @@ def test_scores_are_the_sums_by_hand() -> None:
 
 
 def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
-    """Catches a division by the range of errors that are all equal, and the least of no numbers: all Gaussians of a
-    training may have been pruned."""
+    """Catches a division by a range of equal errors, and the least of no numbers: all Gaussians may be pruned."""
     model = four_gaussians()
     exact = [
         replace(view, pixels=render(model, view.camera, view.time, GREY).detach()) for view in moving_square().train[:2]

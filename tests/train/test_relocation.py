@@ -76,8 +76,7 @@ def test_nothing_moves_without_the_living_or_the_dead() -> None:
 
 
 def test_a_training_with_relocation_continues_from_its_state() -> None:
-    """Catches gradients that a checkpoint does not have, a number of Gaussians that changes, and a rule that no
-    training calls."""
+    """Catches gradients that a checkpoint lacks, a number of Gaussians that changes, and a rule that is not called."""
     whole, stopped = assert_resumes(lambda: trainer("freetime", *ROUNDS), 25)
     assert len(whole.model) == len(stopped.model) == len(trainer("freetime").model)
     assert stopped.density.rule.gradient.any()

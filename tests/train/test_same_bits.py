@@ -27,24 +27,8 @@ WITHOUT_AVX512 = {
     "OPENBLAS_CORETYPE": "Zen",
 }
 SLOW = (
-    "3dgs",
-    "4dgs",
-    "6dgs",
-    "7dgs_noagr",
-    "auto",
-    "dbs",
-    "deformable_narrow",
-    "dgs",
-    "ex4dgs",
-    "freetime",
-    "freetime_plus",
-    "hexplane",
-    "ndgs",
-    "scgs",
-    "sharptime",
-    "stg",
-    "stg_full",
-    "ubs",
+    *("3dgs", "4dgs", "6dgs", "7dgs_noagr", "auto", "dbs", "deformable_narrow", "dgs", "ex4dgs", "freetime"),
+    *("freetime_plus", "hexplane", "ndgs", "scgs", "sharptime", "stg", "stg_full", "ubs"),
 )
 
 

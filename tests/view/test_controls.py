@@ -125,8 +125,7 @@ def test_two_runs_open_side_by_side(viewer: Viewer) -> None:
 def test_the_bound_on_float32_is_shown_when_nothing_moves(
     page: Visitor, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a bound that is not shown or saved, is left of another view, or keeps the viewer waiting; and a silent
-    refusal."""
+    """Catches a bound that is not shown or saved, is of another view, or keeps the viewer waiting; a silent refusal."""
     start, legend = page.look(image_height=67), page.controls.legend
     bound = page.set("colours", "float32")
     assert "largest bound" in legend.content
@@ -157,8 +156,7 @@ def test_the_bound_on_float32_is_shown_when_nothing_moves(
 
 
 def test_the_error_against_the_nearest_training_view_is_shown(page: Visitor) -> None:
-    """Catches a view that stays when the camera moves on, an error of another model or of other effects, and one of
-    the user's background."""
+    """Catches a view that stays when the camera moves, and an error of another model, effects or background."""
     text = page.controls.comparison
 
     def captions() -> tuple[str, ...]:

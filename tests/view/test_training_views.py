@@ -44,8 +44,7 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
 
 
 def test_the_nearest_view_in_a_rig_and_in_extents() -> None:
-    """Catches metres added to radians, a rig whose first frame is always shown, a time that outweighs the place, and
-    one that has to be there."""
+    """Catches metres added to radians, a rig whose first frame is always shown, and a time that outweighs the place."""
     views = scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0))
     assert nearest_view(views, camera(0.4), 0.0).view.name == "0"  # 0.6 of an extent of 4 is less than 17 degrees
     views = scene(*[(camera(x), time) for time in (0.0, 0.5, 1.0) for x in (0.0, 1.0)])

@@ -63,11 +63,6 @@ def renderer(
     return FrameRenderer(run, "7dgs", most_cost(model))
 
 
-def of_every_effect_set() -> EffectSets:
-    """Of 80 Gaussians, 16 that AGR changes, 16 that change without it, and 48 static ones."""
-    return EffectSets(16, 32, torch.full((80,), 3, dtype=torch.int32))
-
-
 @pytest.fixture(scope="module")
 def agr() -> FrameRenderer:
     return renderer()
@@ -120,7 +115,7 @@ def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
 
 @pytest.mark.parametrize(
     ("variant", "effect_sets"),
-    [("7dgs_agr", None), ("7dgs_agr", of_every_effect_set()), ("stg_full", None)],
+    [("7dgs_agr", None), ("7dgs_agr", EffectSets(16, 32, torch.full((80,), 3, dtype=torch.int32))), ("stg_full", None)],
     ids=["without effect sets", "with effect sets", "decoded"],
 )
 def test_colours_are_those_of_the_picture_of_effect_sets(variant: str, effect_sets: EffectSets | None) -> None:
