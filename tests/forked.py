@@ -30,6 +30,16 @@ IMPORTED = (
 _servers: list[subprocess.Popen[str]] = []  # one, from the first command on; its input ends with this process
 
 
+def ended(*command: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A command of any kind, at its end, with what it wrote; options are those of subprocess.run."""
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def python(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """This Python, started anew, at its end."""
+    return ended(sys.executable, *arguments, **options)
+
+
 def python_m(module: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a module as a command to its end, in the root of the project and in this process's environment."""
     with tempfile.TemporaryDirectory() as folder:

@@ -3,11 +3,11 @@
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from forked import ended, python
 from tiny_run import ROOT, environment
 
 from benchmarks.against import WITHOUT_EDITABLE
@@ -96,15 +96,8 @@ def test_the_worked_example_builds_and_differentiates(tmp_path):
         ["cmake", "-S", str(project), "-B", str(build), *options],
         ["cmake", "--build", str(build), "--target", "_native", *shim],
     ):
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = ended(*command)
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     shutil.copy(next(build.glob("_native*.so")), project / "gsbench/kernels")
-    done = subprocess.run(
-        [sys.executable, "-c", CHECK],
-        capture_output=True,
-        text=True,
-        cwd=project,
-        check=False,
-        env={**environment(), "PYTHONPATH": os.fspath(project)},
-    )
+    done = python("-c", CHECK, cwd=project, env=environment() | {"PYTHONPATH": os.fspath(project)})
     assert done.returncode == 0, done.stderr

@@ -4,11 +4,11 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
 import pytest
+from forked import python
 from tiny_run import ROOT, environment, overrides, write_moving_square
 
 from benchmarks.against import WITHOUT_EDITABLE
@@ -64,14 +64,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(project: Path, module: str, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a module of the copy."""
-    return subprocess.run(
-        [sys.executable, "-c", START, module, *words],
-        capture_output=True,
-        text=True,
-        cwd=project,
-        check=False,
-        env={**environment(), "PYTHONPATH": os.fspath(project)},
-    )
+    return python("-c", START, module, *words, cwd=project, env=environment() | {"PYTHONPATH": os.fspath(project)})
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +130,5 @@ def test_the_example_passes_the_linters(tmp_path):
     """Catches an example that a reader's `make lint` would refuse."""
     source = tmp_path / "balls.py"
     source.write_text(next(text for path, text in blocks().items() if path.endswith(".py")))
-    done = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "--config", str(ROOT / "pyproject.toml"), str(source)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = python("-m", "ruff", "check", "--config", str(ROOT / "pyproject.toml"), str(source))
     assert done.returncode == 0, done.stdout

@@ -108,9 +108,6 @@ def test_blended_alphas_are_those_of_the_image():
     assert 3 * 32 * 24 < full < 6 * 32 * 24
 
 
-# ---- --against
-
-
 @pytest.fixture
 def commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A commit of a repository whose benchmarks read their results from its gsbench."""

@@ -3,11 +3,10 @@
 import importlib
 import itertools
 import json
-import subprocess
-import sys
 
 import pytest
 import torch
+from forked import python
 from tiny_run import ROOT, gsbench, main_here, overrides, write_moving_square
 
 from gsbench import __main__ as command
@@ -28,7 +27,7 @@ def test_help_describes_what_there_is_without_torch():
         "try: main()\n"
         "finally: sys.stderr.write('torch imported' if 'torch' in sys.modules else 'no torch')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    done = python("-c", code, cwd=ROOT)
     assert done.stderr == "no torch"
     assert "  4dgs          4DGS (Yang et al. 2023): Gaussians in space and time\n" in done.stdout
     assert "  mini          The three embedded scenes, on a laptop\n" in done.stdout

@@ -2,14 +2,13 @@
 
 import copy
 import math
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import yaml
+from forked import python
 from tiny_run import ROOT
 from tiny_training import compose
 
@@ -174,7 +173,6 @@ def test_the_schema_needs_no_library():
     )
     hooks = [f"gsbench.train.hooks.{path.stem}" for path in (ROOT / "gsbench/train/hooks").glob("[!_]*.py")]
     for first in ("gsbench.config", *hooks):
-        command = [sys.executable, "-c", program.format(first)]
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        ran = python("-c", program.format(first))
         assert ran.stdout.split() == [*KEYS], f"{first}: {ran.stderr}"
         assert ran.returncode == 0, f"{first}: {ran.stderr}"

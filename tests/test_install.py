@@ -3,13 +3,13 @@
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tarfile
 import zipfile
 from pathlib import Path
 
 import pytest
+from forked import python
 from tiny_run import ROOT, environment
 
 from gsbench.version import __version__
@@ -25,14 +25,7 @@ print(getattr(build, hook)(out, dict(setting.split("=", 1) for setting in settin
 
 def built(hook: str, project: Path, out: Path, *settings: str, **environment: str) -> tuple[Path, str]:
     """Call a hook of the build backend as pip does; returns the file it made and what it said."""
-    done = subprocess.run(
-        [sys.executable, "-c", HOOK, hook, str(out), *settings],
-        cwd=project,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, **environment},
-    )
+    done = python("-c", HOOK, hook, str(out), *settings, cwd=project, env=os.environ | environment)
     assert done.returncode == 0, done.stderr + done.stdout
     return out / done.stdout.splitlines()[-1], done.stderr + done.stdout
 
@@ -77,7 +70,7 @@ def test_without_a_compiler_it_installs_and_says_that_it_is_slow(sdist, tmp_path
     assert wheel.stat().st_size < 15 * MB
     # Without `site`, as an editable install would come before the wheel.
     path = os.pathsep.join([str(tmp_path / "site"), *[entry for entry in sys.path if entry.endswith("-packages")]])
-    smoke = [sys.executable, "-S", str(ROOT / "tests/smoke.py"), "reference"]
-    done = subprocess.run(smoke, capture_output=True, text=True, check=False, env=environment() | {"PYTHONPATH": path})
+    smoke = ("-S", str(ROOT / "tests/smoke.py"), "reference")
+    done = python(*smoke, env=environment() | {"PYTHONPATH": path})
     assert done.returncode == 0, done.stderr
     assert "steps by reference" in done.stdout

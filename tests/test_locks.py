@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 import re
-import subprocess
 import sys
 import tomllib
 import zipfile
@@ -11,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from forked import ended
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from tiny_run import ROOT
@@ -104,12 +104,7 @@ def test_a_file_with_another_hash_is_refused(tmp_path):
     right = hashlib.sha256(wheel.read_bytes()).hexdigest()
     for digest, message in (("0" * 64, "DO NOT MATCH THE HASHES"), (right, "")):
         lock.write_text(f"trial==1 --hash=sha256:{digest}\n")
-        done = subprocess.run(
-            [*pip, "--target", str(tmp_path / "out"), "--requirement", str(lock)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = ended(*pip, "--target", str(tmp_path / "out"), "--requirement", str(lock))
         assert bool(done.returncode) == bool(message), done.stderr
         assert message in done.stderr
         assert (tmp_path / "out").exists() != bool(message)

@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from html import unescape
@@ -12,6 +11,7 @@ from urllib.parse import unquote
 
 import pytest
 import tables
+from forked import python
 from report.records import but
 from tiny_run import ROOT, environment
 
@@ -118,14 +118,9 @@ def test_code_that_a_page_shows_is_where_the_page_looks():
 def test_the_site_builds_offline_without_a_broken_link(tmp_path):
     """Catches a warning of Sphinx, a link to a page, a heading or a file that is gone, and what needs a network."""
     site = tmp_path / "site"
-    command = [sys.executable, "-m", "sphinx", "-q", "-E", "-W", "--keep-going", "-b", "html"]
-    done = subprocess.run(
-        [*command, "-d", str(tmp_path / "trees"), str(ROOT / "docs"), str(site)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**environment(), "http_proxy": DEAD, "https_proxy": DEAD, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
+    words = ("-m", "sphinx", "-q", "-E", "-W", "--keep-going", "-b", "html", "-d", str(tmp_path / "trees"))
+    offline = {"http_proxy": DEAD, "https_proxy": DEAD, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = python(*words, str(ROOT / "docs"), str(site), env=environment() | offline)
     assert done.returncode == 0, done.stderr
     assert broken(site) == []
     written = {path.stem for path in (ROOT / "docs").glob("*.md")}

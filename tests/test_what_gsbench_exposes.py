@@ -3,11 +3,10 @@
 import ast
 import doctest
 import inspect
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from forked import python
 from tiny_run import ROOT, environment, run_here
 
 import gsbench
@@ -68,7 +67,7 @@ def test_import_gsbench_is_quick():
         "gsbench.psnr\n"
         "assert 'torch' in sys.modules\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True)
+    done = python("-c", program, env=environment(), cwd=ROOT)
     assert done.returncode == 0, done.stderr
 
 
@@ -100,12 +99,7 @@ def test_mypy_reads_the_types(tmp_path):
     """Catches public names that are `Any` to the code of others, and a misspelt one that no checker refuses."""
     user = tmp_path / "user.py"
     user.write_text("import gsbench\n\nreveal_type(gsbench.ssim)\ngsbench.rasterise\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), str(user)],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=environment(),
-    )
+    words = ("-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), str(user))
+    done = python(*words, cwd=ROOT, env=environment())
     assert 'Revealed type is "def (a: ' in done.stdout, done.stdout
     assert 'Module has no attribute "rasterise"' in done.stdout, done.stdout

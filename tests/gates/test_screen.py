@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from forked import python
 from worlds import brightening, filmed, moving, small_mover, still
 
 from gsbench import scenes
@@ -158,8 +158,7 @@ screen_time(filmed(still))
 print(len([name for name in loaded[-1] - loaded[0] if name.startswith("torch._dynamo")]))
 """
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    environment = os.environ | {"PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    done = python("-c", code, env=os.environ | {"PYTHONPATH": path})
     assert done.stdout == "0\n", done.stderr
 
 

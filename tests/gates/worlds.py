@@ -146,8 +146,6 @@ def brightening(moment: float) -> Gaussians3D:
     return world._replace(colors=colors)
 
 
-# ---- models that gates are to simplify
-
 N, MODEL_SIZE, VIEWS = 60, 24, 30
 BLACK = torch.zeros(3)
 OPTIONS = {

@@ -6,7 +6,6 @@ import json
 import os
 import random
 import resource
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import cv2
 import pytest
 import torch
+from forked import ended
 from tiny_run import ROOT, command, environment, overrides
 
 from gsbench.errors import InputError
@@ -206,9 +206,7 @@ def test_too_little_memory_is_one_line(megabytes: int, square: Path, tmp_path: P
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (megabytes << 20, megabytes << 20))
 
-    done = subprocess.run(
-        command(*words), capture_output=True, text=True, cwd=ROOT, env=environment(), preexec_fn=limit, check=False
-    )
+    done = ended(*command(*words), cwd=ROOT, env=environment(), preexec_fn=limit)
     assert done.returncode in (0, 1), done.stderr
     assert "Traceback" not in done.stderr
     for path in record.find(tmp_path / "r"):

@@ -7,7 +7,6 @@ import faulthandler
 import os
 import random
 import resource
-import subprocess
 import sys
 import warnings
 from collections import Counter
@@ -17,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from forked import python
 from targets import Target, targets
 from tensors import disturb, disturb_layout, plain
 from torch import Tensor
@@ -39,9 +39,7 @@ MEMORY = 8 << 30  # bytes of address space beyond those that torch takes
 def test_any_call_works_or_is_an_input_error(count: int) -> None:
     """Catches a crash in a kernel, a stack trace from torch, and a result or gradient that depends on strides."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, __file__, str(count)], capture_output=True, text=True, env=environment, check=False
-    )
+    done = python(__file__, str(count), env=environment)
     assert done.returncode == 0, f"{done.stdout[-600:]}\nexit status {done.returncode}: {done.stderr[-3000:]}"
 
 

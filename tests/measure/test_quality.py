@@ -4,14 +4,13 @@ import hashlib
 import math
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from forked import python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -124,7 +123,7 @@ def test_lpips_agrees_with_the_lpips_package():
     """Would catch any difference from lpips 0.1.4 on one random trunk, AlexNet and VGG16, to the last bit."""
     pytest.importorskip("scipy")
     script = Path(__file__).parent / "lpips_agreement.py"
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    done = python(str(script))
     assert done.stdout == "agree\n", done.stderr[-2000:]
 
 

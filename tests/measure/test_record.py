@@ -6,11 +6,11 @@ import math
 import os
 import random
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+from forked import ended, python
 from hostile.mutations import damage_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -276,10 +276,7 @@ def test_git_ignores_what_this_machine_measured_and_nothing_that_is_published():
     ignored = [f"results/{name}" for name in ("table1.md", "mini/table.md", "mini/suzanne/7dgs/seed0/record.json")]
     ignored.append("results/published/new/table.csv")
     ours = [f"results/published/{name}" for name in ("new/table.md", "new/runs.csv", "new/views.csv.gz")]
-    done = subprocess.run(
-        ["git", "check-ignore", *ignored, *ours], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.split() == ignored
+    assert ended("git", "check-ignore", *ignored, *ours, cwd=ROOT).stdout.split() == ignored
 
 
 def test_a_record_has_the_commit_of_the_code_that_ran(monkeypatch):
@@ -296,7 +293,7 @@ def test_records_and_tables_do_not_import_torch():
         "from gsbench.measure.provenance import versions; versions();"
         "sys.exit('torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert python("-c", code).returncode == 0
 
 
 def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

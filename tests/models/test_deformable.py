@@ -19,9 +19,6 @@ QUERY = CameraTime.at(CAMERA, 0.45)
 POSITION, TIME = torch.tensor([[0.3, -0.7, 1.1]], dtype=torch.float64), torch.tensor(0.37, dtype=torch.float64)
 
 
-# ---- the equations
-
-
 def test_the_encoding() -> None:
     """Catches a factor of pi, another order of sine and cosine or of octaves and coordinates, and a lost input."""
     e, moment = encode(POSITION, 10)[0], encode(TIME.reshape(1, 1), 6)[0]
@@ -105,9 +102,6 @@ def test_a_scale_may_be_negative_or_zero() -> None:
         gradients = [x.grad for x in (*model.splats.values(), *model.field.outputs)]
         assert all(x is not None and x.isfinite().all() for x in gradients)
     assert negative.field.outputs[1].grad.all()
-
-
-# ---- gradients
 
 
 @pytest.mark.parametrize(("depth", "time_network"), [(1, True), (3, False)])

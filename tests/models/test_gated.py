@@ -39,9 +39,6 @@ OBSERVING = [name for name in VARIANTS if not name.startswith("3dgs") and "agr" 
 QUERY = CameraTime.at(CAMERA, 0.45)
 
 
-# ---- effect sets
-
-
 @pytest.mark.parametrize("variant", GATED)
 def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
     """Catches effect sets cut at another row: what is static is the same everywhere, what AGR leaves is as it was; and
@@ -128,9 +125,6 @@ def test_turn_of_space() -> None:
     assert torch.equal(turn_of_space(turn_of_space(left)), left)
 
 
-# ---- simplifications
-
-
 @pytest.mark.parametrize("variant", ["3dgs", "4dgs"])
 @torch.no_grad()
 def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
@@ -167,9 +161,6 @@ def test_time_goes_on_as_it_did_where_direction_is_frozen(variant: str) -> None:
     )
     assert (before - 1).abs().amax() > 0.1
     torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
-
-
-# ---- which models gates can simplify: a `GatedModel` with its methods, whatever a checkpoint says
 
 
 class Half(GatedModel, Balls):

@@ -21,8 +21,6 @@ FULL = ActiveComponents(3, False, False)
 QUERY = CameraTime.at(CAMERA, 0.25)
 
 
-# ---- the equations of the vectors
-
 POSITION, TIME = doubles(0.2, 0.5, 1)[None], doubles(0.25)[0]
 FEATURES = doubles(0.00920011, 0.01193819, 0.01502319, 0.01906886)
 CHANGES = doubles(
@@ -119,9 +117,6 @@ def test_the_penalty() -> None:
     )
 
 
-# ---- gradients and bits
-
-
 def test_the_field_has_the_gradients_of_its_values() -> None:
     """Catches a lost or wrong derivative on the way from any number of the field, or a position, to the changes."""
     model: Any = lively("hexplane", 5, channels=2, resolution=3, width=3, appearance=True, sh_degree=1)
@@ -149,9 +144,6 @@ def test_points_in_a_plane_make_no_nan() -> None:
     planes.products(positions).sum().backward()
     assert positions.grad is not None
     assert positions.grad.isfinite().all()
-
-
-# ---- a training
 
 
 def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:

@@ -38,9 +38,6 @@ def directions(seed: int, N: int) -> Tensor:
     return nn.functional.normalize(normal(seed, N, 3), dim=-1)
 
 
-# ---- factors
-
-
 def test_triangular_row_scaled() -> None:
     """Catches another scaling than (2 sigmoid(x) - 1) times the diagonal of the entry's own row."""
     layout = CholeskyLayout("ddd", "row_scaled")
@@ -117,9 +114,6 @@ def test_rotation4d(seed: int) -> None:
     torch.testing.assert_close((R @ v[..., None])[..., 0], hamilton(hamilton(left, v), conjugate))
 
 
-# ---- colours
-
-
 def test_spherical_harmonics_are_scipy_s() -> None:
     """Catches a wrong constant, order or sign. 3DGS' real basis is sqrt(2) Re / Im of Y_lm, phase (-1)^m included."""
     d = directions(0, 50)
@@ -185,9 +179,6 @@ def test_an_order_is_one_number(packed: int, others: list[int]) -> None:
     assert mask.tolist() == expected
 
 
-# ---- refinement
-
-
 def test_time_encoding() -> None:
     """Catches another octave, order or factor than (sin 2^k pi t, cos 2^k pi t), k = 0..K-1; the paper's K is 10."""
     t = 0.37
@@ -240,9 +231,6 @@ def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
         first.weight.data, first.bias.data = refinement.weight_in.data[rows], refinement.bias_in.data[rows]
         last.weight.data, last.bias.data = refinement.weight_out.data[outputs], refinement.bias_out.data[outputs]
         torch.testing.assert_close(moved, value + perceptron(f))
-
-
-# ---- directions
 
 
 def test_unit() -> None:

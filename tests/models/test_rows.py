@@ -45,9 +45,6 @@ def gain(model: GaussianModel) -> Tensor:
     return S[:, :3, 3:] @ torch.linalg.inv(S[:, 3:, 3:])
 
 
-# ---- the start
-
-
 @pytest.mark.parametrize("variant", ["4dgs", "7dgs", "7dgs_paper", "7dgs_nodir", "ndgs"])
 def test_start_in_time(variant: str) -> None:
     """Catches times outside [-0.1, 1.1], or not uniform, a time scale other than sqrt(T/5) or sqrt(T/10), and times of
@@ -75,9 +72,6 @@ def test_start_in_direction(variant: str) -> None:
     torch.testing.assert_close((d.mT @ d) / 4000, torch.eye(3) / 3, rtol=0, atol=0.02)
     torch.testing.assert_close(model.factors(raw(model))[:, 3:6].square().sum(-1), torch.ones(4000, 3))
     assert not any(raw(model)[kind].any() for kind in KINDS)
-
-
-# ---- density control
 
 
 @pytest.mark.parametrize("variant", EVERY)

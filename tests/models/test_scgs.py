@@ -17,8 +17,6 @@ FULL = ActiveComponents(3, False, False)
 QUERY = CameraTime.at(CAMERA, 0.45)
 
 
-# ---- the equations of the vectors
-
 POSITION, FEATURES = doubles(0.4, 0.3, 0.2)[None], doubles(-1e-2, 0)[None]
 WEIGHTS = doubles(0.35802218, 0.40319289, 0.23878493)
 
@@ -83,9 +81,6 @@ def test_a_gaussian_follows_its_nodes(turns: bool, expected: Tensor) -> None:
     assert torch.equal(sliced.opacities, torch.sigmoid(model.splats["opacities"]))
 
 
-# ---- the start
-
-
 def test_nodes_are_placed_far_from_each_other() -> None:
     """Catches the nearest point in place of the farthest, a radius of another range, and a crash with few points."""
     points = torch.rand(200, 3, generator=seeded(0)) * 2.6 - 1.3
@@ -116,9 +111,6 @@ def test_the_field_starts_next_to_zero() -> None:
     torch.testing.assert_close(
         model.slice(CameraTime.at(CAMERA.float(), 0.3)).means, model.splats["means"], atol=2e-3, rtol=0
     )
-
-
-# ---- the penalty
 
 
 def test_a_rigid_motion_is_not_penalised() -> None:
@@ -159,9 +151,6 @@ def test_the_weight_of_the_penalty() -> None:
     model.rigidity = 0.5
     model.set_active(ActiveComponents(3, False, False, warms_up=True))
     assert model.penalty() is None
-
-
-# ---- gradients
 
 
 def test_field_and_nodes_have_the_gradients_of_their_values() -> None:

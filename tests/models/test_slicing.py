@@ -103,9 +103,6 @@ def test_reduction_of_what_is_nearly_reduced(size: float, sign: int) -> None:
     assert relative(T @ T.mT, (F @ F.mT).numpy()).max() < 2e-6
 
 
-# ---- gradients
-
-
 @pytest.mark.parametrize("k", [0, 1, 3, 4])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_gradients(scheme: str, k: int) -> None:

@@ -105,8 +105,6 @@ def test_clones_and_children_have_new_times(kind: str) -> None:
         assert all(torch.equal(after[name][N:], x) for name, x in before.items() if name != "times")
 
 
-# ---- the full model
-
 BASE, VIEW, TIME = row(0.1, 0.2, 0.3), row(0.4, 0.5, 0.6), row(-0.3, 0.2, 0.7)
 NINE = row(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.066, 0.044, 0.154)
 

@@ -4,12 +4,12 @@ Each program runs in a process of its own, and prints a number or what torch and
 """
 
 import os
-import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
+from forked import python
 from tiny_run import ROOT
 
 from gsbench import kernels
@@ -58,14 +58,7 @@ GLIBC = pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason
 def printed(imports: str, program: str, **variables: str) -> str:
     """What a program prints that first imports some modules, with these variables of the environment."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith(SETTLED)}
-    done = subprocess.run(
-        [sys.executable, "-c", f"import {imports}\n{program}"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=plain | variables,
-        check=False,
-    )
+    done = python("-c", f"import {imports}\n{program}", cwd=ROOT, env=plain | variables)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -60,9 +60,6 @@ def _repeated(rows: list[Any], N: int) -> Tensor:
     return values.repeat(N // len(rows), *[1] * (values.dim() - 1))
 
 
-# ---- the cases
-
-
 def _flattened(g: torch.Generator, N: int, axes: list[list[float]], width: int = 33, height: int = 17) -> Arguments:
     """N Gaussians of these axes in turn, turned at random."""
     scene = gaussians(g, N) | camera(width, height)

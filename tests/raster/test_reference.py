@@ -104,9 +104,6 @@ def test_any_scene_is_drawn_as_by_brute_force(
     assert (single.info.radii >= 0).all()
 
 
-# ---- gradients
-
-
 def smooth(name: str) -> dict[str, Any]:
     """Six Gaussians of a case, whose picture has no decision so close that a finite difference would flip it."""
     arguments = case(name)

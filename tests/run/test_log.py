@@ -61,9 +61,6 @@ def run_in(folder: Path, log: str | None = None) -> Any:
     )
 
 
-# ---- curve.jsonl
-
-
 def test_a_resumed_run_repeats_no_line(tmp_path: Path) -> None:
     """Catches lines after the last checkpoint that come twice, a half-written line, and a loss that a resume loses."""
     killed = trainer((10, 1.0, 20.0))
@@ -98,9 +95,6 @@ def test_lines_that_cannot_be_written_cost_no_run(tmp_path: Path) -> None:
     training.curve.add(10, 1.0, 20.0)
     log.follow()
     log.end(None)
-
-
-# ---- trackers
 
 
 def sent_to(name: str, packages: dict[str, MagicMock]) -> tuple[dict[int, dict[str, float]], str, object]:

@@ -1,11 +1,11 @@
 """A training has the same bits on processors with and without AVX-512, and of another vendor."""
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from forked import ended
 from interrupted import assert_same_bits
 from test_checkpoint import comparable_state
 from tiny_run import command, environment
@@ -41,9 +41,7 @@ def test_a_training_has_the_same_bits_without_avx512(model: str, tmp_path: Path)
     wanted += NARROW.get(model, [])  # a field of the authors' size takes minutes
     plain = {name: value for name, value in environment().items() if name not in WITHOUT_AVX512}
     for folder, more in (("with", {}), ("without", WITHOUT_AVX512)):
-        done = subprocess.run(
-            command(*wanted, f"results={tmp_path / folder}"), env=plain | more, capture_output=True, text=True
-        )
+        done = ended(*command(*wanted, f"results={tmp_path / folder}"), env=plain | more)
         assert done.returncode == 0, done.stderr
     assert_same_bits(comparable_state(tmp_path / "with"), comparable_state(tmp_path / "without"))
 

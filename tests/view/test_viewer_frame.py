@@ -198,9 +198,6 @@ def test_two_models_share_an_image() -> None:
     assert (wiped(left, right, 8).image == 10).all()
 
 
-# ---- the bound on the error of float32
-
-
 @needs_kernels
 def test_the_bound_is_that_of_the_stability_command(agr: FrameRenderer) -> None:
     """Catches a bound of another view, time or unit, and a summary of other pixels."""
