@@ -97,9 +97,7 @@ def raw(answer: str) -> str:
 
 
 @pytest.mark.parametrize("path", ["/file.bin", moved("/file.bin")])
-def test_a_file_arrives_whole_and_once(
-    path: str, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_arrives_whole_and_once(path, address, tmp_path, monkeypatch):
     """Catches a redirect taken for the file, a file fetched twice, another file taken for it, and messages of pooch."""
     log = io.StringIO()
     monkeypatch.setattr(pooch.get_logger().handlers[0], "stream", log)
@@ -127,9 +125,7 @@ NO_FILE: list[tuple[str, str | None, str]] = [  # an address, the SHA-256 that i
 
 
 @pytest.mark.parametrize(("path", "sha256", "message"), NO_FILE)
-def test_what_is_not_the_file_is_not_kept(
-    path: str, sha256: str | None, message: str, address: str, tmp_path: Path
-) -> None:
+def test_what_is_not_the_file_is_not_kept(path, sha256, message, address, tmp_path):
     """Catches half a file, another file or a page of words in the place of weights."""
     with pytest.raises(InputError, match=message) as caught:
         download(source(address + path, tmp_path, sha256), tmp_path)
@@ -137,7 +133,7 @@ def test_what_is_not_the_file_is_not_kept(
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_proxy_of_the_environment_is_asked(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_proxy_of_the_environment_is_asked(address, tmp_path, monkeypatch):
     """Catches the stack trace of four libraries offline, and a download past the only way out of a cluster."""
     with pytest.raises(InputError, match=r"is this machine online.*by hand"):
         download(source("http://127.0.0.1:9/file.bin", tmp_path), tmp_path)
@@ -154,9 +150,7 @@ def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str
 
 
 @pytest.mark.parametrize("mode", [0o100644, 0])
-def test_an_archive_is_unpacked_and_its_scenes_named(
-    mode: int, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_archive_is_unpacked_and_its_scenes_named(mode, address, tmp_path, monkeypatch, capsys):
     """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again.
 
     Also files without a kind, as Windows zips them, that count as devices, and data that are there and are missed.
@@ -198,13 +192,13 @@ def test_an_archive_is_unpacked_and_its_scenes_named(
     ],
 )
 def test_a_hostile_or_damaged_archive_is_refused(
-    archive: bytes,
-    message: str,
-    address: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    archive,
+    message,
+    address,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     """Catches a file that is written beside the folder, and half a data set in it."""
     Handler.files["dnerf.zip"] = archive
     assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
@@ -215,9 +209,7 @@ def test_a_hostile_or_damaged_archive_is_refused(
     assert not (tmp_path / "evil").exists()
 
 
-def test_an_archive_without_scenes_says_so(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_archive_without_scenes_says_so(address, tmp_path, monkeypatch, capsys):
     """Catches a line that ends in the middle where an archive has other files than it should."""
     Handler.files["dnerf.zip"] = zipped({"a.txt": b"a"})
     for _ in ("unpacked", "there"):
@@ -225,9 +217,7 @@ def test_an_archive_without_scenes_says_so(
         assert capsys.readouterr().out.endswith("; no scene with a transforms_train.json is in it\n")
 
 
-def test_weights_go_where_they_are_looked_for(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_go_where_they_are_looked_for(address, tmp_path, monkeypatch, capsys):
     """Catches other weights under the right name, and a place that gsbench.measure does not read."""
     from gsbench.measure import perceptual
 
@@ -241,9 +231,7 @@ def test_weights_go_where_they_are_looked_for(
         perceptual.load.__wrapped__("alex")
 
 
-def test_a_dry_run_fetches_nothing(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_fetches_nothing(address, tmp_path, monkeypatch, capsys):
     """Catches a dry run that is none, and a plan that does not say from where, to where and what is checked."""
     assert fetched(f"{address}/", tmp_path, monkeypatch, "dnerf", "lpips-vgg", "--dry-run") == 0
     plans = capsys.readouterr().out.splitlines()
@@ -259,9 +247,7 @@ def test_a_dry_run_fetches_nothing(
     assert listed["dnerf"] == (f"{tmp_path}/data/dnerf", False)
 
 
-def test_what_a_mirror_lacks_is_fetched_by_hand(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_mirror_lacks_is_fetched_by_hand(address, tmp_path, monkeypatch, capsys):
     """Catches advice that names no place where the file can be found, with an address that a program follows or not."""
     Handler.files = {}
     assert fetched(address, tmp_path, monkeypatch, "dnerf", "pbr") == 2
@@ -280,7 +266,7 @@ def test_what_a_mirror_lacks_is_fetched_by_hand(
     ("words", "error"),
     [([], "expected a NAME, or --list"), (["dnerf", "--json"], "--json: expected --list beside it")],
 )
-def test_a_command_without_sense_is_refused(words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_without_sense_is_refused(words, error, capsys):
     """Catches a command that does nothing and ends as a success, and a usage that names no module."""
     with pytest.raises(SystemExit, match="2"):
         main(words)
@@ -289,9 +275,7 @@ def test_a_command_without_sense_is_refused(words: list[str], error: str, capsys
     assert "[NAME ...]" in err
 
 
-def test_what_cannot_be_fetched_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_fetched_is_told(tmp_path, monkeypatch, capsys):
     """Catches a name, a mirror or a folder that is typed wrong, and a folder of Google Drive taken for a file."""
     assert fetched("", tmp_path, monkeypatch, "pbr", "dnrf") == 2
     err = capsys.readouterr().err.splitlines()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from worlds import World, appearing, brightening, camera, filmed, moving, rigged, small_mover, still
+from worlds import appearing, brightening, camera, filmed, moving, rigged, small_mover, still
 
 from gsbench.gates import fixed_camera_test
 from gsbench.gates.screen import screen_time
@@ -45,7 +45,7 @@ def darkening(image: Tensor, moment: float) -> Tensor:
 
 
 @pytest.mark.parametrize("exposure", [None, noisy(), drifting, flickering, noisy(drifting), noisy(flickering)])
-def test_exposure_is_no_change(exposure: Exposure | None) -> None:
+def test_exposure_is_no_change(exposure):
     """Catches noise, rounding to 8 bits, an exposure that drifts (and saturates) or flickers, taken for a change; and
     a gain and an offset that take a mover out with the exposure."""
     still_rig = screen_time(rigged(still, exposure=exposure))
@@ -60,7 +60,7 @@ def test_exposure_is_no_change(exposure: Exposure | None) -> None:
 @pytest.mark.parametrize(
     ("places", "views", "together"), [(6, 8, False), (4, 12, False), (6, 16, True), (4, 70, False)]
 )
-def test_a_rig_sees_motion(world: World, places: int, views: int, together: bool) -> None:
+def test_a_rig_sees_motion(world, places, views, together):
     """Catches "off" or "undecided" on a rig, one of four cameras, one whose cameras fire together, or one with so many
     views that only some of them are compared: their times must be those of these views."""
     screen = screen_time(rigged(world, places, views, together=together))
@@ -100,7 +100,7 @@ def _shuffled(scene: Scene) -> Scene:
         (lambda: rigged(still, 6, 10, shake=0.005), ("undecided",), ""),
     ],
 )
-def test_hard_cases(scene: Callable[[], Scene], decisions: tuple[str, ...], reason: str) -> None:
+def test_hard_cases(scene, decisions, reason):
     """Catches a scene that is called static though it may change, and a test that ignores a part of the views."""
     screen = screen_time(scene())
     assert screen.decision in decisions, screen
@@ -108,7 +108,7 @@ def test_hard_cases(scene: Callable[[], Scene], decisions: tuple[str, ...], reas
 
 
 @pytest.mark.parametrize("together", [False, True])
-def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_level_on_rigs(together, monkeypatch):
     """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave, and a
     camera that sees nothing but black, which is 0 / 0."""
     monkeypatch.setattr(fixed_camera_test, "PERMUTATIONS", 199)
@@ -130,7 +130,7 @@ def test_the_level_on_rigs(together: bool, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(("width", "height"), [(24, 48), (48, 24)])
-def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
+def test_a_shift_is_one_of_the_longer_side(width, height):
     """Catches shifts in units of the width alone: in a portrait image they would be twice as large, and no camera held.
 
     A camera that turns around the scene by a moves by sqrt(2) a f / side in these units, here by 0.045 of at most 0.05.
@@ -147,7 +147,7 @@ def test_a_shift_is_one_of_the_longer_side(width: int, height: int) -> None:
     assert [len(place) for place in group_by_viewpoint(turned, scene.extent).held] == [3] * 4
 
 
-def test_viewpoints_are_those_of_the_cameras() -> None:
+def test_viewpoints_are_those_of_the_cameras():
     """Catches viewpoints that are split by rounding, or joined though the lens differs; a film has none."""
     shaken = rigged(still, 6, 10, shake=0.005)
     viewpoints = group_by_viewpoint(shaken.train, shaken.extent)
@@ -169,7 +169,7 @@ def test_viewpoints_are_those_of_the_cameras() -> None:
         assert len(group_by_viewpoint(before, film.extent).other) == 59
 
 
-def test_a_channel_with_too_few_pixels_has_the_gain_of_the_others() -> None:
+def test_a_channel_with_too_few_pixels_has_the_gain_of_the_others():
     """Catches a mean over all channels, also those that were fitted to nothing."""
     values = np.float32([[[2.0], [4.0], [9.0]], [[5.0], [6.0], [7.0]]])
     enough = np.array([[[True], [True], [False]], [[False], [False], [False]]])

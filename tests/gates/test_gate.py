@@ -33,7 +33,7 @@ def assert_same_images(first: GaussianModel, second: GaussianModel, atol: float)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_more_budget_buys_more(name: str) -> None:
+def test_more_budget_buys_more(name):
     """Catches a gate that changes an image though its budget is zero, a price of error with the wrong sign, a sum of
     errors that is not held, and numbers of what is frozen that stay as they were."""
     before, free = gated(name, 0.0)
@@ -50,7 +50,7 @@ def test_more_budget_buys_more(name: str) -> None:
         assert key == "right_quats" or (unused == after.constant(key)).all(), key  # which are left ones' partners
 
 
-def test_a_static_gaussian_changes_with_nothing() -> None:
+def test_a_static_gaussian_changes_with_nothing():
     """Catches a Gaussian that still moves with time or direction after both were frozen."""
     model, sensitivity = probed("7dgs")
     here = CameraTime.at(torch.tensor([0.0, 0.0, -4.0]), 0.2)
@@ -67,7 +67,7 @@ def test_a_static_gaussian_changes_with_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_a_gated_model_is_gated_again(name: str) -> None:
+def test_a_gated_model_is_gated_again(name):
     """Catches rows sorted into the wrong effect set: with the effect sets forgotten the images stay the same; a gate
     that undoes or pays again for what an earlier one did; a simplification of a gated model that changes Gaussians
     whose errors the probe does not look at."""
@@ -100,7 +100,7 @@ def test_a_gated_model_is_gated_again(name: str) -> None:
         assert changing == 0 or (errors[:changing] > 0).any()
 
 
-def test_the_share_with_direction_is_of_rows_that_change_with_it() -> None:
+def test_the_share_with_direction_is_of_rows_that_change_with_it():
     """Catches static rows that count as seen from each side: 20 of 60 are conditioned."""
     model = trained_a_little("7dgs", 0)
     assert share_with_direction(model) == 1
@@ -108,7 +108,7 @@ def test_the_share_with_direction_is_of_rows_that_change_with_it() -> None:
     assert share_with_direction(model) == 20 / 60
 
 
-def test_the_loss_is_measured_and_not_only_predicted() -> None:
+def test_the_loss_is_measured_and_not_only_predicted():
     """Catches a gate that goes by its prediction where the views it is checked on say otherwise."""
     model = trained_a_little("7dgs", 0)
     views = views_of(model, 1)

@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import tiny_training
@@ -59,7 +58,7 @@ def few_steps_recover(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", 10)
 
 
-def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gated_training_resumes_with_the_same_bits(monkeypatch):
     """Catches a checkpoint that lacks what a gate decided: broken off after the gate, and gone on from there."""
     monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 3.0)
     whole = trainer("effects.gate=both")
@@ -77,7 +76,7 @@ def test_a_gated_training_resumes_with_the_same_bits(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("model", ["4dgs", "7dgs", "stg"])
-def test_long_lived_gaussians_become_static(model: str) -> None:
+def test_long_lived_gaussians_become_static(model):
     """Catches a rule that acts at another step, on short lives or anew, and a checkpoint that lacks what it did."""
     words = ("effects.static_above=0.3",)
     first = trainer(*words, model=model)
@@ -99,7 +98,7 @@ def test_long_lived_gaussians_become_static(model: str) -> None:
         trainer(*words, model="3dgs")
 
 
-def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch):
     """Catches a gate that acts where none was asked for, one in training of a model that needs all of its Gaussians,
     and one that is left out in silence."""
     training = trainer("effects.gate=both")
@@ -113,7 +112,7 @@ def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch: pyt
     assert plain.model.effect_sets is None
 
 
-def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_frozen_stays(monkeypatch):
     """Catches momentum that moves on what a gate froze, and kept entries that no longer learn."""
     monkeypatch.setattr("gsbench.gates.hook.LOSS_WITH_AGR", 20.0)
     monkeypatch.setattr("gsbench.gates.gate.SHARES", (0.2,))
@@ -130,7 +129,7 @@ def test_what_is_frozen_stays(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not mask.any() or not torch.equal(value[mask], before[name][mask]), name
 
 
-def test_when_a_model_is_gated() -> None:
+def test_when_a_model_is_gated():
     """Catches a gate while Gaussians are still cloned and split, or with no steps left to recover."""
 
     def due(*words: str) -> list[int]:
@@ -143,7 +142,7 @@ def test_when_a_model_is_gated() -> None:
 
 
 @pytest.mark.parametrize(("model", "loss"), [("7dgs", LOSS_WITH_AGR), ("7dgs_noagr", LOSS_IN_TRAINING)])
-def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_gate_in_training_may_cost(model, loss, monkeypatch):
     """Catches models without AGR, which do not make up for it, gated as freely as those with it."""
     asked: list[tuple[int | None, float]] = []
     monkeypatch.setattr(Gating, "simplify", lambda _, step, db, __: asked.append((step, db)))
@@ -152,7 +151,7 @@ def test_what_a_gate_in_training_may_cost(model: str, loss: float, monkeypatch: 
 
 
 @pytest.mark.parametrize("words", [(), ("effects.gate=both",)])
-def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
+def test_agr_slows_down_after_a_gate(words):
     """Catches a gated training whose AGR swings to the end, an ungated training that is slowed, and rates of others."""
     training, rates = trainer(*words), []
 
@@ -171,7 +170,7 @@ def test_agr_slows_down_after_a_gate(words: tuple[str, ...]) -> None:
     assert agr[-1] == pytest.approx(2e-4 * LAST_RATE ** (39 / 40) if gated else 2e-4)
 
 
-def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch):
     """Catches a loss measured on the views that the gate was fitted to, or on those that the run is evaluated by."""
     probed: list[list[View]] = []
     checked: list[list[View]] = []
@@ -203,9 +202,7 @@ def test_a_gate_is_checked_on_views_that_the_probe_did_not_look_at(monkeypatch: 
         ([math.nan], "a PSNR of nan dB on val cannot show a loss"),
     ],
 )
-def test_a_psnr_that_cannot_show_a_loss_removes_nothing(
-    scores: list[float], line: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_psnr_that_cannot_show_a_loss_removes_nothing(scores, line, monkeypatch):
     """Catches effects that are removed because all views are exact before and after, and a loss of inf - inf."""
     training = trainer("effects.gate=end")
     shown = iter([*scores, *[scores[-1]] * 20, scores[0]])
@@ -220,7 +217,7 @@ def fit(x: float) -> Gate:
     return Gate(share=x, predicted_db=0.0, measured_db=0.0, rows={}, orders={}, bytes_before=2, bytes=1)
 
 
-def test_what_a_gate_costs_is_what_the_images_lost() -> None:
+def test_what_a_gate_costs_is_what_the_images_lost():
     """Catches a loss with the wrong sign, or of the wrong model: of the gate at the end, and of freezing direction."""
     training = trainer()
     ungated, training.hook(Gating).gates = gaussians_of(training.model), [fit(0.1)]
@@ -237,7 +234,7 @@ def test_what_a_gate_costs_is_what_the_images_lost() -> None:
     assert direction.loss_db != 0
 
 
-def test_auto_and_a_gate_after_the_fact(square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_auto_and_a_gate_after_the_fact(square, tmp_path, capsys):
     """Catches model=auto that says nothing of what it chose, a loaded run of another model, a gate that spoils the old.
 
     The scene has six views, which are too few to tell: it is simulated, and that is said.

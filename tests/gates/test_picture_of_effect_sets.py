@@ -52,7 +52,7 @@ def panel(image: Pixels, number: int) -> list[list[int]]:
     return [image[row, number * (ENLARGED * 100 + picture.GAP) + ENLARGED * x].tolist() for x in CENTRES]
 
 
-def test_each_class_has_its_colour() -> None:
+def test_each_class_has_its_colour():
     """Catches rows taken for those of another effect set, swapped red and blue, panels in another order, and a file of
     many megabytes for a scene of full size."""
     model = one_of_each()
@@ -70,7 +70,7 @@ def test_each_class_has_its_colour() -> None:
     assert wide.shape[:2] == (160 + 2 * picture.LINE, 3 * picture.MOST_WIDTH + 2 * picture.GAP)
 
 
-def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_legend_counts(monkeypatch):
     """Catches a count beside the wrong name, a swatch of another colour than its Gaussians, and one of none."""
     written = []
     monkeypatch.setattr(cv2, "putText", lambda *arguments: written.append(arguments[1]))
@@ -85,7 +85,7 @@ def test_the_legend_counts(monkeypatch: pytest.MonkeyPatch) -> None:
         assert legend[i // 3 * picture.LINE + 10, left + 10].tolist() == list(picture.COLOURS[name])
 
 
-def test_what_a_pixel_pays_for() -> None:
+def test_what_a_pixel_pays_for():
     """Catches costs of other Gaussians than those that are seen, without colours, or on a scale of their own."""
     model = one_of_each()
     geometry = [REFINING + SLICING, SLICING, SLICING, COSTS[STATIC], COSTS[STATIC]]
@@ -102,7 +102,7 @@ def test_what_a_pixel_pays_for() -> None:
 @pytest.mark.parametrize(
     ("name", "agr", "kind"), [("7dgs", True, "refined"), ("7dgs", False, "conditioned"), ("3dgs", False, "static")]
 )
-def test_a_model_without_classes_is_of_one_class(name: str, agr: bool, kind: str) -> None:
+def test_a_model_without_classes_is_of_one_class(name, agr, kind):
     """Catches a model that was not gated and cannot be drawn, or is drawn as what it is not."""
     model = five(name, agr=agr)
     assert picture.kinds_of(model).tolist() == [NAMES.index(kind)] * 5
@@ -110,7 +110,7 @@ def test_a_model_without_classes_is_of_one_class(name: str, agr: bool, kind: str
     assert np.abs(np.array(shown) - picture.COLOURS[kind]).max() < 6
 
 
-def test_the_page_has_the_same_colours() -> None:
+def test_the_page_has_the_same_colours():
     """Catches an effect set that has one colour in the picture and another in the figure above it."""
     page = dict(zip(on_demand.SETS, (THEMES[variable][0] for variable in SETS), strict=False))
     for name, (r, g, b) in picture.COLOURS.items():
@@ -129,7 +129,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path.parent
 
 
-def test_a_gated_run_leaves_a_picture(folder: Path) -> None:
+def test_a_gated_run_leaves_a_picture(folder):
     """Catches a run that leaves no picture, or not where the report looks, and one of another view than the first."""
     assert record.read(folder / record.FILE_NAME).on_demand
     run = load_run(folder)

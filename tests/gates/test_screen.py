@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,7 +60,7 @@ def timeless() -> Scene:
         (timeless, "off", "no times"),
     ],
 )
-def test_known_scenes(scene: Callable[[], Scene], decision: str, reason: str) -> None:
+def test_known_scenes(scene, decision, reason):
     """Catches time in a static scene, motion in 2 % of the image or slow light that is missed, a test of brightness
     instead of slow waves, and an answer where the camera moves along with time or there is too little to say."""
     screen = screen_time(scene())
@@ -77,19 +76,19 @@ def test_known_scenes(scene: Callable[[], Scene], decision: str, reason: str) ->
         assert screen.p is None
 
 
-def test_a_scene_without_views_is_refused() -> None:
+def test_a_scene_without_views_is_refused():
     """Catches a stack trace where a split is empty."""
     with pytest.raises(InputError, match="expected training views"):
         screen_time(replace(timeless(), train=[]))
 
 
 @pytest.mark.parametrize(("decision", "kept"), [("on", ""), ("undecided", ", so time is kept"), ("off", "")])
-def test_the_answer_in_words(decision: str, kept: str) -> None:
+def test_the_answer_in_words(decision, kept):
     """Catches time that is said to be kept where it is not."""
     assert of_screen(TimeScreen(decision, "why", None, None, None, 0.0)) == f"time is {decision}{kept}: why"
 
 
-def test_a_gate_in_words() -> None:
+def test_a_gate_in_words():
     """Catches removed Gaussians that count as left, and a loss in PSNR that reads as a gain."""
     rows = {"refined": 1, "conditioned": 2, "static": 3, "removed": 4}
     gate = Gate(0.1, 0.1, 0.01, rows, {}, 3_000_000, 1_000_000, 100, "val", 0.0, 0.02, 2.0, 1.0, 0.5)
@@ -104,7 +103,7 @@ def test_a_gate_in_words() -> None:
     ]
 
 
-def test_directions_of_cameras_side_by_side() -> None:
+def test_directions_of_cameras_side_by_side():
     """By hand: two cameras 2 apart that look along z, seen from 3 in front. Catches a point behind them or beside."""
     poses = [torch.eye(4), torch.eye(4)]
     poses[0][0, 3], poses[1][0, 3] = 1, -1  # at x = -1 and x = 1
@@ -117,7 +116,7 @@ def test_directions_of_cameras_side_by_side() -> None:
 @pytest.mark.parametrize(
     ("miss", "depth", "meets"), [(0.0, 4, True), (1.9, 4, True), (2.1, 4, False), (0.0, -4, False)]
 )
-def test_the_centre_is_where_optical_axes_nearly_meet(miss: float, depth: float, meets: bool) -> None:
+def test_the_centre_is_where_optical_axes_nearly_meet(miss, depth, meets):
     """Catches a centre of cameras that look past each other, or away from it: each of two axes passes it at `miss`."""
     poses = [torch.eye(4), torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])]  # along z and x
     for pose, side in zip(poses, (1, -1), strict=True):
@@ -128,7 +127,7 @@ def test_the_centre_is_where_optical_axes_nearly_meet(miss: float, depth: float,
     assert center is None or torch.allclose(center, torch.zeros(3), atol=1e-6)
 
 
-def test_small_columns_count_as_large_ones() -> None:
+def test_small_columns_count_as_large_ones():
     """Catches a threshold that is not relative to the largest singular value."""
     columns = torch.randn(8, 3, generator=torch.Generator().manual_seed(1)).double().numpy()
     columns = np.concatenate([columns, columns[:, :1]], axis=1)
@@ -136,7 +135,7 @@ def test_small_columns_count_as_large_ones() -> None:
     assert permutation_test._range(0 * columns).shape == (8, 0)
 
 
-def test_initial_points_of_a_fit_follow_the_seed() -> None:
+def test_initial_points_of_a_fit_follow_the_seed():
     """Catches a random subset that is another one each time, and colours of other points."""
     means = torch.rand(2 * static_fit_residuals.POINTS, 3)
     scene = SimpleNamespace(points=Points(means, 1 - means))
@@ -146,7 +145,7 @@ def test_initial_points_of_a_fit_follow_the_seed() -> None:
     assert torch.equal(first.colors, 1 - first.means)
 
 
-def test_imports_are_no_seconds_of_the_screen() -> None:
+def test_imports_are_no_seconds_of_the_screen():
     """Catches a screen that is charged for what torch imports with a process's first optimizer, once 1.1 s of 1.5."""
     code = """
 import sys, time
@@ -162,7 +161,7 @@ print(len([name for name in loaded[-1] - loaded[0] if name.startswith("torch._dy
     assert done.stdout == "0\n", done.stderr
 
 
-def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_level_of_the_test(monkeypatch):
     """Catches a permutation test that is wrong too often, of residuals that only the camera explains."""
     monkeypatch.setattr(permutation_test, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
@@ -174,7 +173,7 @@ def test_the_level_of_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("wave", "is_slow"), [(1, True), (2, True), (3, True), (4, True), (5, False)])
-def test_the_waves_that_are_looked_for(wave: int, is_slow: bool) -> None:
+def test_the_waves_that_are_looked_for(wave, is_slow):
     """Catches a constant among the slow waves in place of the fastest, and faster ones: cos(pi k t), k = 1 to 4."""
     times = (np.arange(40) + 0.5) / 40
     gradients = np.cos(np.pi * wave * times)[:, None] + 0.1 * np.random.default_rng(0).standard_normal((40, 20))
@@ -182,7 +181,7 @@ def test_the_waves_that_are_looked_for(wave: int, is_slow: bool) -> None:
     assert p == 0.001 if is_slow else p > 0.05
 
 
-def test_only_those_that_can_be_chosen_tie() -> None:
+def test_only_those_that_can_be_chosen_tie():
     """Catches a tie with a training that exceeds the budget, and one that is not told."""
     fast, slow = Candidate("3dgs", 30.0, 1.0), Candidate("7dgs", 30.0, 9.0, "9 ms a frame")
     assert "cannot decide" not in of_comparison(ModelComparison(7, "3dgs", [fast, slow]))
@@ -190,7 +189,7 @@ def test_only_those_that_can_be_chosen_tie() -> None:
     assert "after 7 iterations: PSNR cannot decide between 3dgs, 6dgs, so the last of them is taken\n" in tie
 
 
-def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(capsys):
     """Catches a command whose JSON is not what the page promises, another seed, and a stack trace for bad input."""
     assert command.main([str(EMBEDDED / "moving-matte"), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)["time"]
@@ -215,7 +214,7 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert error.count("\n") == 1
 
 
-def test_a_long_film_takes_no_more_than_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_film_takes_no_more_than_its_share(monkeypatch):
     """Catches a screen that draws the views of a long film more often: a fit of the same steps, and each view once."""
     drawn, counts = [], []
     draw = static_fit_residuals.rasterize_slice

@@ -49,7 +49,7 @@ def ranks(x: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     "name", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in OPTIONS if name != "7dgs")]
 )
-def test_prediction_against_brute_force(name: str) -> None:
+def test_prediction_against_brute_force(name):
     """Catches a probe that mistakes which Gaussians need an effect, or by how much, and one that draws no filter."""
     model = trained_a_little(name, 0)
     views = views_of(model, 1)
@@ -70,7 +70,7 @@ def test_prediction_against_brute_force(name: str) -> None:
             assert float(guess.sum() / true.sum()) == pytest.approx(1, abs=0.05), simplification.name
 
 
-def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
+def test_an_opaque_gaussian_is_no_harder_to_predict():
     """Catches a simplification drawn behind or within its own opaque Gaussian, and so predicted too cheap."""
     random = torch.Generator().manual_seed(0)
     points = Points(
@@ -93,7 +93,7 @@ def test_an_opaque_gaussian_is_no_harder_to_predict() -> None:
     assert ratios["opaque"].mean() / ratios["transparent"].mean() == pytest.approx(1, abs=0.15)
 
 
-def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
+def test_a_removal_is_priced_by_what_it_does_to_the_residual():
     """Catches the sign of <r, x>: half of what a removal changes is missing in the image, or is too much in it.
 
     The image is linear in an opacity: with r = x / 2 the removal adds <x, x> to what it adds without a residual, and
@@ -117,7 +117,7 @@ def test_a_removal_is_priced_by_what_it_does_to_the_residual() -> None:
         assert float(removed(image + x / 2)[i]) == pytest.approx(float(plain[i]), rel=1e-3)
 
 
-def test_what_is_hidden_is_not_taken() -> None:
+def test_what_is_hidden_is_not_taken():
     """Catches a Gaussian that is removed because none of the views that were looked at shows it."""
     model = trained_a_little("3dgs", 0)
     views = views_of(model, 1)
@@ -130,7 +130,7 @@ def test_what_is_hidden_is_not_taken() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_the_same_seed_gives_the_same_bits() -> None:
+def test_the_same_seed_gives_the_same_bits():
     """Catches a draw that is not the seed's, and an order of views that depends on the threads."""
     model = trained_a_little("7dgs", 0)
     views = views_of(model, 1)[:6]

@@ -25,7 +25,7 @@ def fleeting() -> GaussianModel:
     return model
 
 
-def test_when_a_gaussian_is_seen() -> None:
+def test_when_a_gaussian_is_seen():
     """Catches a visible interval that leaves out a view which shows the Gaussian, moved or not, or that is too long."""
     model = fleeting()
     views = views_of(model, 1)
@@ -51,7 +51,7 @@ def test_when_a_gaussian_is_seen() -> None:
     )
 
 
-def test_a_scene_without_times() -> None:
+def test_a_scene_without_times():
     """Catches a Gaussian of a still scene that is taken for hidden because there is no time."""
     model = trained_a_little("6dgs", 0)
     still = [replace(view, time=None) for view in views_of(model, 1)[:8]]
@@ -60,7 +60,7 @@ def test_a_scene_without_times() -> None:
     assert set(intervals[:, 0].tolist()) <= {0.0, math.inf}
 
 
-def test_agr_rests_unseen() -> None:
+def test_agr_rests_unseen():
     """Catches intervals of other rows than their own, that change a training view, or that no checkpoint holds."""
     model = fleeting()
     views = views_of(model, 1)
@@ -87,7 +87,7 @@ def test_agr_rests_unseen() -> None:
 
 
 @pytest.mark.parametrize("most", [30, 10])
-def test_what_no_view_shows_is_removed(most: int) -> None:
+def test_what_no_view_shows_is_removed(most):
     """Catches a Gaussian that is kept, and refined, because the views that were probed are not all there are."""
     model = fleeting()
     views = views_of(model, 1)

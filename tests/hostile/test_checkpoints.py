@@ -80,7 +80,7 @@ def harm(draw: random.Random, value: Any) -> Any:
 
 
 @pytest.mark.parametrize("seeds", [range(SAMPLE), pytest.param(range(SAMPLE, ALL), marks=pytest.mark.slow)])
-def test_misshapen_states_are_refused(seeds: range, folder: Path) -> None:
+def test_misshapen_states_are_refused(seeds, folder):
     """Catches Adam moments of another shape (a segmentation fault in the kernel), and states of other types."""
     whole = checkpoint.read(folder / checkpoint.FILE_NAME)
     paths, fitted, refused = leaves(whole.state), trainer(folder), 0
@@ -99,7 +99,7 @@ def test_misshapen_states_are_refused(seeds: range, folder: Path) -> None:
     assert refused > 0.8 * len(seeds)
 
 
-def test_every_flipped_bit_is_noticed(folder: Path, tmp_path: Path) -> None:
+def test_every_flipped_bit_is_noticed(folder, tmp_path):
     """Catches a training that goes on from numbers that a disk has damaged, as no bit of the file may change; and a
     process that hangs at a pipe or reads /dev/zero without end."""
     content = (folder / checkpoint.FILE_NAME).read_bytes()
@@ -145,7 +145,7 @@ def endless(state: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", HOSTILE_STATES)
-def test_hostile_states_with_the_right_hash_are_one_line(name: str, folder: Path, tmp_path: Path) -> None:
+def test_hostile_states_with_the_right_hash_are_one_line(name, folder, tmp_path):
     """Catches what a hash does not: someone else has written the file, hash and all."""
     fitted, whole = trainer(folder), checkpoint.read(folder / checkpoint.FILE_NAME)
     path = rewritten(folder, tmp_path, state=HOSTILE_STATES[name](whole.state)) / checkpoint.FILE_NAME
@@ -167,7 +167,7 @@ def is_refused(folder: Path, what: str) -> bool:
     return False
 
 
-def test_any_byte_of_a_pickle_is_one_line(folder: Path, tmp_path: Path) -> None:
+def test_any_byte_of_a_pickle_is_one_line(folder, tmp_path):
     """Catches an opcode that makes the reader of pickles raise an error of its own."""
     payload = (folder / checkpoint.FILE_NAME).read_bytes()[len(checkpoint.MAGIC) + checkpoint.DIGEST + 1 :]
     path, draw = tmp_path / checkpoint.FILE_NAME, random.Random(1)
@@ -187,7 +187,7 @@ def test_any_byte_of_a_pickle_is_one_line(folder: Path, tmp_path: Path) -> None:
         is_refused(tmp_path, f"case {case}")
 
 
-def test_a_checkpoint_names_no_package_to_import(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_names_no_package_to_import(folder, tmp_path, monkeypatch):
     """Catches data.root=pkg://MODULE of a checkpoint, which imported that module, and names that leave the data."""
     (tmp_path / "evil").mkdir()
     (tmp_path / "evil" / "__init__.py").write_text("raise SystemExit('imported')")
@@ -224,7 +224,7 @@ WRONG: list[tuple[str, tuple[Any, ...], Any]] = [  # part of a checkpoint, where
 ]
 
 
-def test_any_value_in_a_config_or_a_scene_is_one_line(folder: Path) -> None:
+def test_any_value_in_a_config_or_a_scene_is_one_line(folder):
     """Catches a division by recipe_iterations=0, and every other value that no run of gsbench has written."""
     whole, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
     cases = [

@@ -1,7 +1,5 @@
 """Hostile command lines: each ends in one line and the exit status of docs/runs.md, and never in a stack trace."""
 
-from pathlib import Path
-
 import pytest
 from tiny_run import main_here, overrides
 
@@ -47,9 +45,7 @@ from gsbench.measure import record
         (["-m", "seed=0,1", "+launch=parallel", "launch.at_once=0"], 2, "launch.at_once: expected at least 1"),
     ],
 )
-def test_bad_words_are_one_line_and_a_known_status(
-    words: list[str], status: int, message: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_words_are_one_line_and_a_known_status(words, status, message, square, tmp_path, capsys):
     """Catches a stack trace of gsbench's or of Hydra's, one exit status for bad input and for failed runs, and a fault
     that costs a whole training before it is noticed."""
     assert main_here(*overrides(square, tmp_path, "model=3dgs"), *words) == status
@@ -60,22 +56,20 @@ def test_bad_words_are_one_line_and_a_known_status(
     assert not list(tmp_path.rglob("checkpoint.pt")), "refused after the training"
 
 
-def test_a_scene_without_a_name_says_which_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scene_without_a_name_says_which_key(tmp_path, capsys):
     """Catches a message that names a missing value of OmegaConf's and not what to type."""
     words = ["+exp=dnerf", "scene=custom", f"data.root={tmp_path}", f"results={tmp_path}"]
     assert main_here(*words) == 2
     assert "scene.name=FOLDER" in capsys.readouterr().err
 
 
-def test_the_version_is_that_of_gsbench(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_that_of_gsbench(capsys):
     """Catches the version of Hydra."""
     assert main_here("--version") == 0
     assert capsys.readouterr().out == f"gsbench {gsbench.__version__}\n"
 
 
-def test_a_reader_who_has_gone_costs_no_record(
-    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_reader_who_has_gone_costs_no_record(square, tmp_path, monkeypatch, capsys):
     """Catches `python -m gsbench ... | head`, which put a failed record in the place of a finished run's."""
     words = [*overrides(square, tmp_path, "model=3dgs", "train.iterations=3"), "protocol.pictures=0"]
     words.remove("train.iterations=30")
@@ -94,9 +88,7 @@ def test_a_reader_who_has_gone_costs_no_record(
     capsys.readouterr()
 
 
-def test_a_training_that_diverges_without_harmonics_has_a_record(
-    square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_training_that_diverges_without_harmonics_has_a_record(square, tmp_path, capsys):
     """Catches the largest of no coefficients, which took the record with it."""
     words = overrides(square, tmp_path, "model=3dgs", "model.sh_degree=0", "model.lr.means.start=1e38")
     assert main_here(*words) == 1
@@ -107,9 +99,7 @@ def test_a_training_that_diverges_without_harmonics_has_a_record(
     capsys.readouterr()
 
 
-def test_an_error_that_nobody_foresaw_is_a_record(
-    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_that_nobody_foresaw_is_a_record(square, tmp_path, monkeypatch, capsys):
     """Catches a fault of gsbench's own, as in a new model, that ends the sweep and leaves neither a row nor a stack."""
 
     def fault(*_: object) -> None:

@@ -31,9 +31,7 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_disk_that_is_full_while_a_checkpoint_is_written_is_named(
-    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_full_while_a_checkpoint_is_written_is_named(seed, tmp_path, monkeypatch):
     """Catches the RuntimeError by which torch hides the disk's error, and an earlier checkpoint that is lost."""
     path = tmp_path / "checkpoint.pt"
     checkpoint.save(path, Checkpoint("a", "b", STATE))
@@ -56,9 +54,7 @@ def test_a_disk_that_is_full_while_a_checkpoint_is_written_is_named(
 
 @pytest.mark.parametrize("write", [atomic.write_atomically, atomic.create_atomically])
 @pytest.mark.parametrize("methods", [("open", "unlink"), ("write_bytes", "open")])
-def test_a_read_only_disk_is_named_by_the_user_s_file(
-    write: Callable[[Path, bytes], object], methods: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_read_only_disk_is_named_by_the_user_s_file(write, methods, tmp_path, monkeypatch):
     """Catches the removal of the temporary file, which fails there too, and whose error named that file."""
 
     def refused(self: Path, *_: object, **__: object) -> None:
@@ -73,7 +69,7 @@ def test_a_read_only_disk_is_named_by_the_user_s_file(
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-def test_a_file_is_created_once(has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_created_once(has_links, tmp_path, monkeypatch):
     """Catches two runs that claim one folder, on a disk with hard links or without, and a temporary file that stays."""
 
     def refused(*_: object) -> None:
@@ -86,7 +82,7 @@ def test_a_file_is_created_once(has_links: bool, tmp_path: Path, monkeypatch: py
     assert os.listdir(tmp_path) == ["a"]
 
 
-def test_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+def test_a_device_is_not_replaced_by_a_file(tmp_path):
     """Catches --json /dev/full, which put a file in the place of the machine's device."""
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: expected the name of a file, got that of a device"):
@@ -117,7 +113,7 @@ class Limited:
         return self._file.write(data)
 
 
-def test_a_checkpoint_that_asks_for_gradients_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_that_asks_for_gradients_is_refused(tmp_path):
     """Catches a step count of the optimizer with requires_grad, on which Adam fails at its first step."""
     moments = {"means.0": {"step": torch.ones((), requires_grad=True)}}
     checkpoint.save(tmp_path / "c.pt", Checkpoint("a", "b", {"optimizer": moments}))
@@ -137,7 +133,7 @@ ENDLESS: dict[str, Callable[[dict[str, Any], int], object]] = {
 
 
 @pytest.mark.parametrize("part", ENDLESS)
-def test_a_record_with_endless_entries_is_refused(part: str, tmp_path: Path) -> None:
+def test_a_record_with_endless_entries_is_refused(part, tmp_path):
     """Catches a record whose lists hold a report for a minute and take a gigabyte."""
     path = tmp_path / "record.json"
     record.write(study.read(Path(__file__).parents[2] / "results" / "published" / "effects")[0][0], path)
@@ -149,7 +145,7 @@ def test_a_record_with_endless_entries_is_refused(part: str, tmp_path: Path) -> 
         record.read(path)
 
 
-def test_a_limit_of_the_address_space_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_of_the_address_space_counts(monkeypatch):
     """Catches an export of 16384 x 16384 pixels under `ulimit -v` that ends in a stack trace."""
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1280 << 20, 1))
     assert memory.too_little_address_space() is None
@@ -178,12 +174,12 @@ def test_a_limit_of_the_address_space_counts(monkeypatch: pytest.MonkeyPatch) ->
         (InputError("model: expected a name"), False),
     ],
 )
-def test_what_says_that_there_is_no_memory(error: Exception, expected: bool) -> None:
+def test_what_says_that_there_is_no_memory(error, expected):
     """Catches a library that says it in words of its own, which was a stack trace."""
     assert is_out_of_memory(error) == expected
 
 
-def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch):
     """Catches `copy or render it again` for a file that is right."""
 
     def full(*_: object) -> None:
@@ -199,7 +195,7 @@ def test_an_image_without_memory_is_not_a_damaged_one(monkeypatch: pytest.Monkey
 
 @pytest.mark.slow
 @pytest.mark.parametrize("megabytes", [300, 400, 700, 1000, 1279, 1280, 1300, 1400, 1600, 2000])
-def test_too_little_memory_is_one_line(megabytes: int, square: Path, tmp_path: Path) -> None:
+def test_too_little_memory_is_one_line(megabytes, square, tmp_path):
     """Catches a stack trace or a signal, wherever the memory ends: as torch is loaded, the scene, in a step."""
     words = overrides(square, tmp_path / "r", "model=7dgs")
 

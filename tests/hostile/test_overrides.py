@@ -98,7 +98,7 @@ def end(words: list[str], square: Path, results: Path) -> str:
 
 
 @pytest.mark.parametrize("seeds", [range(SAMPLE), pytest.param(range(SAMPLE, ALL), marks=pytest.mark.slow)])
-def test_hostile_overrides_are_refused_or_run(seeds: range, square: Path, tmp_path: Path) -> None:
+def test_hostile_overrides_are_refused_or_run(seeds, square, tmp_path):
     """Catches a stack trace, a hang, and a training that ends well and is then lost."""
     known, ends = keys(), dict.fromkeys(("refused", "ok", "failed", "diverged"), 0)
 
@@ -123,7 +123,7 @@ def test_hostile_overrides_are_refused_or_run(seeds: range, square: Path, tmp_pa
     assert ends["ok"] > 0
 
 
-def test_a_full_disk_is_one_runs_end(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_one_runs_end(square, tmp_path, monkeypatch):
     """Catches a disk without room for a record that ends the whole sweep in a stack trace, or loses the training."""
     composed, fsync = hydra.compose("config", overrides(square, tmp_path, "model=3dgs", "train.iterations=3")), os.fsync
 

@@ -36,14 +36,14 @@ MEMORY = 8 << 30  # bytes of address space beyond those that torch takes
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(400, marks=pytest.mark.slow)])
-def test_any_call_works_or_is_an_input_error(count: int) -> None:
+def test_any_call_works_or_is_an_input_error(count):
     """Catches a crash in a kernel, a stack trace from torch, and a result or gradient that depends on strides."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
     done = python(__file__, str(count), env=environment)
     assert done.returncode == 0, f"{done.stdout[-600:]}\nexit status {done.returncode}: {done.stderr[-3000:]}"
 
 
-def test_a_time_beyond_64_bits_is_a_number() -> None:
+def test_a_time_beyond_64_bits_is_a_number():
     """Catches torch's OverflowError for an integer that a float holds."""
     assert float(CameraTime.at(torch.zeros(3), 10**30).time) == pytest.approx(1e30)
 

@@ -1,11 +1,9 @@
 """The kernels of Adam and of the finite check against the same in torch, and what they refuse."""
 
 import math
-from typing import Any
 
 import pytest
 import torch
-from conftest import Place
 from torch import Tensor
 
 from gsbench.errors import InputError
@@ -17,7 +15,7 @@ from gsbench.train.optim import BETAS, EPS, adam_reference
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("shape", [(0, 3), (1,), (700, 0, 3), (700, 1, 3), (1000, 28), (70_000, 1)])
 @pytest.mark.parametrize("step", [1.0, 30_000.0])
-def test_adam_updates_what_was_drawn(shape: tuple[int, ...], step: float, place: Place) -> None:
+def test_adam_updates_what_was_drawn(shape, step, place):
     """Catches a run of rows that ends wrong, a row updated twice, a wrong row of a wide parameter, rows that should
     rest, a bias correction lost to cancellation, and bits that depend on the number of threads."""
     random = torch.Generator().manual_seed(0)
@@ -39,7 +37,7 @@ def test_adam_updates_what_was_drawn(shape: tuple[int, ...], step: float, place:
 
 
 @pytest.mark.usefixtures("threads")
-def test_all_parameters_in_one_call_are_updated_as_torch_does(place: Place) -> None:
+def test_all_parameters_in_one_call_are_updated_as_torch_does(place):
     """Catches a parameter that is left out or updated twice, another's rate or count of updates, a 33rd that is
     forgotten, numbers after the last whole block of a GPU, and what `skip` should have stopped."""
     random = torch.Generator().manual_seed(0)
@@ -78,7 +76,7 @@ LENGTHS = [300_000 if i == 17 else 5 for i in range(40)]
 @pytest.mark.parametrize(
     ("array", "at", "bad"), [(0, 0, math.nan), (39, 4, math.inf), (17, 299_999, -math.inf), (17, 1023, math.nan)]
 )
-def test_one_bad_number_among_many_arrays_is_found(array: int, at: int, bad: float, place: Place) -> None:
+def test_one_bad_number_among_many_arrays_is_found(array, at, bad, place):
     """Catches a kernel call that leaves out the last arrays, the last numbers or what another thread found, a flag at
     another array, and large finite numbers whose sum is taken for infinity."""
     torch.set_num_threads(2)
@@ -99,7 +97,7 @@ def test_one_bad_number_among_many_arrays_is_found(array: int, at: int, bad: flo
     assert skip == 1  # it stays, whatever comes later
 
 
-def test_every_array_is_flagged(place: Place) -> None:
+def test_every_array_is_flagged(place):
     """Catches a flag that hides the next one, and an array whose gradient is a view with gaps."""
     arrays = [torch.full((n,), math.nan, device=place.device) for n in (1, 2, 255, 256, 257, 1025)]
     arrays.append(torch.full((4, 3), math.inf, device=place.device).T[1:])
@@ -127,7 +125,7 @@ X, ONE = torch.zeros(4, 2), torch.ones(())
         ({7: torch.zeros(1)}, r"skip: .* of shape \[\] on cpu, got torch.float32 of shape \[1\]"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(changed: dict[int, Any], message: str) -> None:
+def test_arrays_that_do_not_fit_are_refused(changed, message):
     """Catches a mask or an array of another size or type, and a parameter with gaps, whose address a kernel gets."""
     listed = {i: X.clone() for i in range(4)} | {4: ONE.clone(), 5: ONE.clone(), 6: None, 7: None} | changed
     *arrays, drawn, skip = listed.values()
@@ -144,7 +142,7 @@ def test_arrays_that_do_not_fit_are_refused(changed: dict[int, Any], message: st
         ([X], torch.zeros(1).bool(), "flags: expected contiguous torch.float32 .* got torch.bool"),
     ],
 )
-def test_flags_that_do_not_fit_are_refused(arrays: list[Tensor], flags: Tensor, message: str) -> None:
+def test_flags_that_do_not_fit_are_refused(arrays, flags, message):
     """Catches numbers of another type read as float32, and a flag written after the last."""
     with pytest.raises(InputError, match=message):
         flag_arrays(arrays, flags, ONE.clone())

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from conftest import Place
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sliced_models import assert_same, gradients
@@ -56,7 +55,7 @@ def is_kept(orders: Tensor, waves: int) -> Tensor:
 
 @pytest.mark.parametrize("waves", [1, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colors(degree: int, waves: int, place: Place) -> None:
+def test_colors(degree, waves, place):
     """Catches a wrong harmonic, wave or derivative, and coefficients of degrees not yet in use that get a gradient."""
     inputs, opacities = color_inputs(waves, torch.float64), torch.ones(21)
     opacities[4] = 0.9 / 255  # not drawn: no colour, no gradient
@@ -69,7 +68,7 @@ def test_colors(degree: int, waves: int, place: Place) -> None:
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("degree", [1, 3])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_gradients_of_views_add_up(share: float, degree: int) -> None:
+def test_gradients_of_views_add_up(share, degree):
     """Catches a view whose gradient, of the rows that have one, lands in other rows of what views before it left."""
     N, inputs, random = 1100, color_inputs(3, torch.float32, 1100), torch.Generator().manual_seed(1)
     views = [shown(inputs, (torch.rand(N, generator=random) < share).float(), degree, 3) for _ in range(3)]
@@ -85,7 +84,7 @@ def test_gradients_of_views_add_up(share: float, degree: int) -> None:
 @pytest.mark.parametrize("waves", [1, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize(("N", "share"), [(1, 1.0), (37, 0.8), (1100, 0.0), (1100, 0.3), (1100, 1.0)])
-def test_orders_and_opacities_leave_colors_out(N: int, share: float, degree: int, waves: int, place: Place) -> None:
+def test_orders_and_opacities_leave_colors_out(N, share, degree, waves, place):
     """Catches a row that is sorted to another's place, a vector of two orders, a gradient above a row's order; culling
     that is not exact at 1/255, and gradients in the wrong row, or not written, as the drawn are packed."""
     g = torch.Generator().manual_seed(N)
@@ -102,7 +101,7 @@ def test_orders_and_opacities_leave_colors_out(N: int, share: float, degree: int
 
 @pytest.mark.parametrize("waves", [1, 3])
 @pytest.mark.parametrize(("gaussian_per_view", "time_per_view"), [(False, False), (True, False), (True, True)])
-def test_several_views_in_one_call(gaussian_per_view: bool, time_per_view: bool, waves: int, cuda_device: str) -> None:
+def test_several_views_in_one_call(gaussian_per_view, time_per_view, waves, cuda_device):
     """Catches a view that reads the camera, time or Gaussians of another, and gradients that are not their sum."""
     random, names = torch.Generator().manual_seed(2), ("sh0", "shN", "means", "times")
     inputs = dict(zip(names, color_inputs(waves, torch.float32), strict=False))
@@ -130,7 +129,7 @@ def test_several_views_in_one_call(gaussian_per_view: bool, time_per_view: bool,
         assert torch.equal(gradient, want), key
 
 
-def test_views_that_do_not_fit_are_refused(place: Place) -> None:
+def test_views_that_do_not_fit_are_refused(place):
     """Catches centres and times that are read past their end, and views that the CPU's kernel would leave out."""
     sh0, shN, means, times = [place.move(x) for x in color_inputs(2, torch.float32)]
     centers, time, opacities = place.move(torch.rand(4, 3)), place.move(torch.tensor(0.5)), place.move(torch.ones(21))
@@ -151,7 +150,7 @@ def test_views_that_do_not_fit_are_refused(place: Place) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 600), st.integers(0, 3), st.integers(1, 4), st.integers(0, 2**31))
-def test_orders_that_leave_nothing_out_change_no_bit(N: int, degree: int, waves: int, seed: int) -> None:
+def test_orders_that_leave_nothing_out_change_no_bit(N, degree, waves, seed):
     """Catches rows that are worked on in another order, or by other arithmetic, where they have orders."""
     g = torch.Generator().manual_seed(seed)
     highest = torch.randint(degree, 4, (N,), generator=g)
@@ -164,13 +163,13 @@ def test_orders_that_leave_nothing_out_change_no_bit(N: int, degree: int, waves:
     assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
 
 
-def test_any_number_is_an_order() -> None:
+def test_any_number_is_an_order():
     """Catches an order that is read as a place in memory: nonsense may have any colour, and ends no process."""
     orders = torch.tensor([-1, -(2**31), 2**31 - 1], dtype=torch.int32).repeat(7)
     shown(color_inputs(1, torch.float32), torch.ones(21), 3, 1, orders).sum().backward()
 
 
-def test_coefficients_and_orders_that_do_not_fit_are_refused() -> None:
+def test_coefficients_and_orders_that_do_not_fit_are_refused():
     """Catches coefficients that are no whole degrees of every wave, and orders of another kind or number."""
     sh0, shN, means = color_inputs(1, torch.float32)
     with pytest.raises(InputError, match="coefficients"):

@@ -36,7 +36,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["three_cameras", "no_gaussian", "beta"])
-def test_a_forward_pass_is_one_call(name: str, cuda_device: str, called: list[str]) -> None:
+def test_a_forward_pass_is_one_call(name, cuda_device, called):
     """Catches kernels that Python calls one by one, each with memory of its own, or again for the backward pass."""
     arguments = case(name, torch.float32, cuda_device)
     differentiate(arguments, cuda_device, EVERY_PIXEL)  # which learns how many intersections there are
@@ -52,7 +52,7 @@ def test_a_forward_pass_is_one_call(name: str, cuda_device: str, called: list[st
         assert image.requires_grad == (way is Tape)
 
 
-def test_too_little_memory_is_enlarged(cuda_device: str, called: list[str]) -> None:
+def test_too_little_memory_is_enlarged(cuda_device, called):
     """Catches intersections that are left out of an image, a call that is made twice each time, memory that stays as
     large as an image needed long ago, and a repetition that makes calls with too little memory again."""
     arguments = case("random", torch.float32, cuda_device)
@@ -78,7 +78,7 @@ def test_too_little_memory_is_enlarged(cuda_device: str, called: list[str]) -> N
     assert torch.equal(image, expected.image)
 
 
-def test_what_looks_at_operators_sees_them(cuda_device: str) -> None:
+def test_what_looks_at_operators_sees_them(cuda_device):
     """Catches images that torch.compile and dispatch modes cannot differentiate, as another call has drawn them."""
     arguments = case("three_cameras", torch.float32, cuda_device)
     expected, gradients = differentiate(arguments, cuda_device, EVERY_PIXEL)
@@ -90,7 +90,7 @@ def test_what_looks_at_operators_sees_them(cuda_device: str) -> None:
 
 
 @pytest.mark.slow
-def test_more_tiles_than_16_bits_can_number(cuda_device: str) -> None:
+def test_more_tiles_than_16_bits_can_number(cuda_device):
     """Catches tiles whose numbers are cut off, or taken for the number that stands for none."""
     C = 2**16 + 1  # images of one tile
     means = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [0.0, 0.0, -1.0]])  # the last one is behind the camera
@@ -108,9 +108,7 @@ def test_more_tiles_than_16_bits_can_number(cuda_device: str) -> None:
 
 @pytest.mark.parametrize("kernel", [nullcontext, backward_by_splat])
 @pytest.mark.parametrize("name", ["random", "opaque_stack", "three_cameras", "five_channels", "beta"])
-def test_order_of_threads_does_not_matter(
-    name: str, kernel: Any, cuda_device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_order_of_threads_does_not_matter(name, kernel, cuda_device, monkeypatch):
     """Catches a missing barrier: by the shim, a thread would read what another has not written yet, or has over."""
     if cuda_device != "cpu":
         pytest.skip("the order of threads can be chosen on the shim only; on a GPU, racecheck looks for races")
@@ -127,9 +125,7 @@ def test_order_of_threads_does_not_matter(
         torch.testing.assert_close(x, y, rtol=1e-4, atol=1e-5)
 
 
-def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
-    cuda_device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_out_of_memory_names_the_buffer_and_the_process_lives_on(cuda_device, monkeypatch):
     """Catches torch's own words, which say neither what the memory was for nor what to lower, and a broken state."""
     arguments, new_empty = case("random", torch.float32, cuda_device), Tensor.new_empty
     asked = 0
@@ -170,7 +166,7 @@ def test_out_of_memory_names_the_buffer_and_the_process_lives_on(
 
 
 @pytest.mark.parametrize(("C", "N"), [(1, 0), (1, 257), (3, 1000)])
-def test_what_density_control_adds_up(C: int, N: int, cuda_device: str) -> None:
+def test_what_density_control_adds_up(C, N, cuda_device):
     """Catches a scale at the other axis, a camera left out, a count that starts anew, Gaussians after the last whole
     block, and sums of a step that is to be skipped; torch adds up the same on the CPU (`GradientRule.accumulate`)."""
     random = torch.Generator().manual_seed(0)

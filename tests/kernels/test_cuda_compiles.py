@@ -15,7 +15,7 @@ LOCAL_MEMORY = {"colors.cu": 152, "triangular.cu": 120, "blend_backward_by_splat
 
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="needs nvcc")
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
-def test_compiles_without_a_warning(source: Path, tmp_path: Path) -> None:
+def test_compiles_without_a_warning(source, tmp_path):
     """Catches host code called on the device, a missing __device__, what a shim would let pass; arrays that are indexed
     at run time and so leave the registers, and registers that run out: both slow a kernel down and change no result."""
     command = ["nvcc", "-std=c++20", "-arch=sm_90", "--ftz=true", "--cubin", "-Xptxas", "-v", "-Werror", "all-warnings"]

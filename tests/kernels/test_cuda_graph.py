@@ -63,7 +63,7 @@ def both(
 
 
 @pytest.mark.parametrize(("name", "agr"), [("3dgs", False), ("4dgs", False), ("6dgs", True), ("7dgs", True)])
-def test_replays_are_what_is_launched(name: str, agr: bool, device: str) -> None:
+def test_replays_are_what_is_launched(name, agr, device):
     """Catches a camera, a time or a parameter that is read when a picture is recorded, and not when it is replayed."""
     fitted, replayed, launched = both(device, name, agr)
     for distance, time in ((4.0, 0.4), (4.5, 0.1), (3.9, 0.9)):
@@ -75,7 +75,7 @@ def test_replays_are_what_is_launched(name: str, agr: bool, device: str) -> None
     torch.testing.assert_close(replayed(at, 0.9), launched(at, 0.9), rtol=0, atol=1e-4)
 
 
-def test_replays_of_beta_profiles(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replays_of_beta_profiles(device, monkeypatch):
     """Catches a replay that draws Gaussians where the slice has exponents, or ones of the wrong camera."""
     fitted, replayed, launched = both(device, "3dgs")
     gaussians, at = launched(camera(device), 0.4), fitted.slice
@@ -87,7 +87,7 @@ def test_replays_of_beta_profiles(device: str, monkeypatch: pytest.MonkeyPatch) 
     assert (launched(camera(device), 0.4) - gaussians).abs().max() > 0.1
 
 
-def test_more_pairs_than_there_is_room_for(device: str) -> None:
+def test_more_pairs_than_there_is_room_for(device):
     """Catches Gaussians that are left out because a picture recorded from afar had few pairs of tiles and Gaussians."""
     _, replayed, launched = both(device, "7dgs")
     for distance in (30.0, 2.5, 1.5):
@@ -98,7 +98,7 @@ def test_more_pairs_than_there_is_room_for(device: str) -> None:
     torch.testing.assert_close(replayed(small, 0.4), launched(small, 0.4), rtol=0, atol=1e-4)
 
 
-def test_a_bad_value_is_named(device: str) -> None:
+def test_a_bad_value_is_named(device):
     """Catches a picture of NaN: replays do not go through the rasterizer's door."""
     fitted, replayed, _ = both(device, "4dgs")
     replayed(camera(device), 0.4)
@@ -110,7 +110,7 @@ def test_a_bad_value_is_named(device: str) -> None:
 
 @pytest.mark.parametrize("room", [0, 1, 40])
 @pytest.mark.parametrize("N", [0, 300])
-def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
+def test_too_little_room_is_counted(N, room, device):
     """Catches a pair written past the end of the lists, and an image with too few of them that looks good."""
     at, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
@@ -135,7 +135,7 @@ def test_too_little_room_is_counted(N: int, room: int, device: str) -> None:
     assert (pairs > 40) == (N > 0)
 
 
-def test_only_the_cuda_backend_is_replayed() -> None:
+def test_only_the_cuda_backend_is_replayed():
     """Catches a graph asked for where nothing records one."""
     with pytest.raises(InputError, match=r"expected raster\.backend=cuda, got 'reference'"):
         GraphedFrames(model("3dgs", 5, backend=REFERENCE), torch.zeros(3))

@@ -139,7 +139,7 @@ def run(operation: Operation, at: Call) -> tuple[list[Tensor], dict[str, Tensor 
 
 
 @OPERATIONS
-def test_shapes_and_gradients(operation: Operation) -> None:
+def test_shapes_and_gradients(operation):
     """Catches outputs of other shapes than declared, and an input whose gradient is lost on the way to autograd."""
     at = call(operation)
     outputs, gradients = run(operation, at)
@@ -155,7 +155,7 @@ def test_shapes_and_gradients(operation: Operation) -> None:
 
 @OPERATIONS
 @pytest.mark.usefixtures("threads")
-def test_threads_and_wider_vectors_change_no_bit(operation: Operation) -> None:
+def test_threads_and_wider_vectors_change_no_bit(operation):
     """Catches rows that two threads share or none computes, another order of a sum; a product that only one of v3 and
     v4 fuses with a sum, an approximate instruction."""
     at = call(operation, N if "ids" in operation.inputs else 1100 + 5)  # some whole vectors, and a rest; `ids` are of N
@@ -175,7 +175,7 @@ def test_threads_and_wider_vectors_change_no_bit(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_memory_of_any_layout(operation: Operation) -> None:
+def test_memory_of_any_layout(operation):
     """Catches memory read as it does not lie, a gradient that is added up in the memory that the rows of a leaf share,
     or one that is written in another order: weights whose columns were taken for rows gave wrong results in silence."""
     at = call(operation)
@@ -188,7 +188,7 @@ def test_memory_of_any_layout(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_no_gaussians(operation: Operation) -> None:
+def test_no_gaussians(operation):
     """Catches a loop that runs once over nothing, there and back."""
     at = call(operation, 0)
     outputs, gradients = run(operation, at)
@@ -197,7 +197,7 @@ def test_no_gaussians(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_what_is_left_out_together(operation: Operation) -> None:
+def test_what_is_left_out_together(operation):
     """Catches a null address in a kernel, which ended the process by a signal: a part of a group is refused."""
     groups: dict[str, list[str]] = {}
     for name, x in operation.inputs.items():
@@ -214,7 +214,7 @@ def test_what_is_left_out_together(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_wrong_arguments_are_refused(operation: Operation) -> None:
+def test_wrong_arguments_are_refused(operation):
     """Catches arrays that a kernel would read past their end or as other numbers, and a message without a name."""
     at = call(operation)
     for name, x in at.tensors.items():
@@ -243,7 +243,7 @@ def has_any_length(operation: Operation, name: str) -> bool:
 
 
 @pytest.mark.parametrize("operation", [x for x in declared() if x.adds], ids=lambda operation: operation.name)
-def test_what_is_added_is_added(operation: Operation) -> None:
+def test_what_is_added_is_added(operation):
     """Catches a backward kernel that overwrites the gradients of a batch's other views."""
     at = call(operation)
     tensors, numbers = list(at.tensors.values()), list(at.numbers.values())
@@ -259,7 +259,7 @@ def test_what_is_added_is_added(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_torch_compile_is_told_the_shapes(operation: Operation) -> None:
+def test_torch_compile_is_told_the_shapes(operation):
     """Catches a fake whose shapes are not those of the outputs and gradients, for which torch.compile would allocate
     others; and an operation that aliases, mutates or misdeclares its outputs."""
     at = call(operation)
@@ -279,7 +279,7 @@ def test_torch_compile_is_told_the_shapes(operation: Operation) -> None:
 
 
 @OPERATIONS
-def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
+def test_declaration_and_kernel_name_the_same(operation):
     """Catches a field that a declaration has and the kernel's structure has not: it would be dropped in silence."""
     library = library_of("cpu")
     names = {*operation.inputs, *operation.numbers} - {"with_gradient"}  # which is said by a null
@@ -294,7 +294,7 @@ def test_declaration_and_kernel_name_the_same(operation: Operation) -> None:
         assert library.takes(f"{operation.name}_backward", f"grad.{name}") == expected, name
 
 
-def test_every_kernel_is_declared() -> None:
+def test_every_kernel_is_declared():
     """Catches a kernel that no operation calls any more."""
     called = {operation.name for operation in declared()}
     without_gradient = {"adam_all", "flag_values", "flag_arrays", "exact_splats", "exact_image"}
@@ -302,14 +302,14 @@ def test_every_kernel_is_declared() -> None:
     assert {name.removesuffix("_backward") for name in kernels.native().SIGNATURES} == called | without_gradient
 
 
-def test_kernels_of_another_source_are_refused() -> None:
+def test_kernels_of_another_source_are_refused():
     """Catches a build older than its source: its kernels would ignore arguments that they do not know."""
     older = dict(kernels.native().SIGNATURES) | {"slice_free_time": (("INPUTS", "N, threads"),)}
     with pytest.raises(InputError, match="slice_free_time is not of this source"):
         Library(SimpleNamespace(SIGNATURES=older))
 
 
-def test_a_message_says_what_was_expected_and_what_came() -> None:
+def test_a_message_says_what_was_expected_and_what_came():
     """Catches a refusal that names no shape."""
     with pytest.raises(InputError, match=r"expected quats of shape \[4, 4\], got \[5, 4\]"):
         slice_static(torch.zeros(4, 3), torch.zeros(5, 4), torch.zeros(4))
@@ -317,7 +317,7 @@ def test_a_message_says_what_was_expected_and_what_came() -> None:
         slice_static(torch.zeros(4, 3).long(), torch.zeros(4, 4), torch.zeros(4))
 
 
-def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_known_calls_are_not_matched_again(monkeypatch):
     """Catches models that are rendered in turns and pay for each other's checks (0.1 ms a frame), and sizes of
     Gaussians that are kept for ever."""
     matched: list[int] = []
@@ -336,7 +336,7 @@ def test_known_calls_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(slice_static._known) <= MOST_KNOWN
 
 
-def test_the_extension_counts_and_types_its_values() -> None:
+def test_the_extension_counts_and_types_its_values():
     """Catches a call that shifts every field by one: the last door looks at number and kind."""
     native = kernels.native()
     with pytest.raises(TypeError, match="expected 8 values"):
@@ -347,7 +347,7 @@ def test_the_extension_counts_and_types_its_values() -> None:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("sizes", [(0, 1, 7), (5, (1 << 20) + 3)])
-def test_zeroed_arrays_are_zero_and_their_neighbours_are_not(sizes: tuple[int, ...]) -> None:
+def test_zeroed_arrays_are_zero_and_their_neighbours_are_not(sizes):
     """Catches the ends of arrays, which begin anywhere; zeros of large ones are written past the cache."""
     around = [torch.ones(1 + n + 2) for n in sizes]
     library_of("cpu").zero([x[1:-2] for x in around])

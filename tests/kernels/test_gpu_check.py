@@ -17,7 +17,7 @@ sys.meta_path.insert(0, Missing())
 """
 
 
-def test_nothing_it_runs_needs_the_rest_of_gsbench() -> None:
+def test_nothing_it_runs_needs_the_rest_of_gsbench():
     """Catches an import by which a GPU machine's tests and benchmarks all fail, where none can be had to see it."""
     collect = ["-p", "no:hydra_pytest", "-p", "no:cacheprovider", "-q", "--collect-only"]
     collect += ["tests/kernels", "tests/raster"]

@@ -53,7 +53,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_higher_instruction_set_is_not_slower() -> None:
+def test_a_higher_instruction_set_is_not_slower():
     """Catches a kernel for which wider vectors lose, as gathers of AVX-512 did: v4 took twice as long as v3."""
     torch.set_num_threads(1)
     levels, best = kernels.native().instruction_sets(), kernels.native().active()

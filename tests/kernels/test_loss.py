@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from conftest import Place
 
 from gsbench.errors import InputError
 from gsbench.kernels.loss import l1_ssim
@@ -35,7 +34,7 @@ def value_and_gradient(image: torch.Tensor, target: torch.Tensor, weight: float 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_value_and_gradient(height: int, width: int, ssim_weight: float, place: Place) -> None:
+def test_value_and_gradient(height, width, ssim_weight, place):
     """Catches a wrong window, padding, edge or derivative, in pictures smaller than the window too."""
     a, b = pictures(height, width)
     exact = a.double().requires_grad_()
@@ -49,7 +48,7 @@ def test_value_and_gradient(height: int, width: int, ssim_weight: float, place: 
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (12, 21), (17, 33)])
-def test_several_images_have_the_bits_of_each(height: int, width: int, place: Place) -> None:
+def test_several_images_have_the_bits_of_each(height, width, place):
     """Catches an image that is compared with another's target, a gradient of another's loss, and sums over all."""
     images, targets = (torch.stack(x) for x in zip(*(pictures(height, width, seed) for seed in range(4)), strict=True))
     in_bytes = (255 * targets).round().to(torch.uint8)
@@ -66,7 +65,7 @@ def test_several_images_have_the_bits_of_each(height: int, width: int, place: Pl
 
 @pytest.mark.usefixtures("threads", "instruction_set")
 @pytest.mark.parametrize("height", [1, 2, 5, 11, 13, 14, 15, 23, 90])
-def test_same_bits_for_any_number_of_threads(height: int) -> None:
+def test_same_bits_for_any_number_of_threads(height):
     """Catches strips of the picture that see other neighbours, or sums in another order.
 
     Strips begin and end anywhere in a group of rows: a row that is gone when the next group wants it differs here too.
@@ -79,7 +78,7 @@ def test_same_bits_for_any_number_of_threads(height: int) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (12, 21), (16, 17), (37, 50), (17, 449)])
-def test_bytes_have_the_bits_of_floats(height: int, width: int, place: Place) -> None:
+def test_bytes_have_the_bits_of_floats(height, width, place):
     """Catches a byte divided with another rounding, read as signed, or read past the end of a row."""
     a, b = pictures(height, width)
     in_bytes = (255 * b).round().to(torch.uint8)
@@ -89,7 +88,7 @@ def test_bytes_have_the_bits_of_floats(height: int, width: int, place: Place) ->
     assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
 
 
-def test_errors() -> None:
+def test_errors():
     """Catches pictures of different size or type that would be read past their end."""
     a, b = pictures(8, 8)
     for first, second, message in (

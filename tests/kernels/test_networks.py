@@ -22,7 +22,7 @@ def layer(rows: int, inputs: int, outputs: int) -> list[Tensor]:
 
 
 @LAYERS
-def test_a_layer_and_its_gradients_are_torch_s(rows: int, inputs: int, outputs: int, relu: bool) -> None:
+def test_a_layer_and_its_gradients_are_torch_s(rows, inputs, outputs, relu):
     """Catches a row, column or product that a tile leaves out or takes twice, and a ReLU that stops no gradient."""
     tensors = layer(rows, inputs, outputs)
     upstream = torch.randn(rows, outputs, generator=torch.Generator().manual_seed(1))
@@ -34,7 +34,7 @@ def test_a_layer_and_its_gradients_are_torch_s(rows: int, inputs: int, outputs: 
     torch.testing.assert_close(torch.autograd.grad(y, tensors, upstream), by_torch, rtol=1e-4, atol=1e-4)
 
 
-def test_rows_without_a_gradient_change_nothing() -> None:
+def test_rows_without_a_gradient_change_nothing():
     """Catches rows that the backward pass leaves out though they have a gradient, or whose gradients another row gets:
     the bits are those of a layer that has no such rows."""
     x, weight, bias = layer(700, 40, 50)
@@ -74,9 +74,7 @@ def gradients(model: HexPlaneModel, positions: Tensor, time: float, upstream: Te
     ("rows", "channels", "levels", "width", "outputs"),
     [(700, 32, 2, 64, [3, 3, 4]), (150, 7, 3, 13, [3, 1, 40, 4]), (1, 20, 1, 33, [2])],
 )
-def test_a_field_and_its_gradients_are_torch_s(
-    rows: int, channels: int, levels: int, width: int, outputs: list[int], time: float
-) -> None:
+def test_a_field_and_its_gradients_are_torch_s(rows, channels, levels, width, outputs, time):
     """Catches a wrong line, share or level, channels beyond the last, outputs or a hidden layer of another head, a lost
     layer, bias or ReLU, a chunk or column that is left out, and rows whose gradients other rows get: some have none."""
     g = torch.Generator().manual_seed(0)
@@ -91,7 +89,7 @@ def test_a_field_and_its_gradients_are_torch_s(
     assert not computed[1][(upstream == 0).all(1)].any()
 
 
-def test_every_output_has_a_head() -> None:
+def test_every_output_has_a_head():
     """Catches an output that no head writes, and memory beyond the outputs that a head reads or writes."""
     of_planes = torch.rand(9, 4), torch.rand(9, 3), *torch.rand(2, 3), torch.rand(()), torch.rand(12, 4)
     layers = torch.rand(5, 4), torch.rand(5), torch.rand(3, 5, 5), torch.rand(3, 5), torch.rand(6, 5), torch.rand(6)
@@ -104,7 +102,7 @@ def test_every_output_has_a_head() -> None:
         assert y.isfinite().all()
 
 
-def test_nan_stays() -> None:
+def test_nan_stays():
     """Catches a ReLU that makes NaN 0, so that a training goes on which should end."""
     x, weight, bias = layer(20, 8, 4)
     x.data[3, 5] = math.nan

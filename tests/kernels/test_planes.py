@@ -32,7 +32,7 @@ def gradients(field: Planes, positions: Tensor, upstream: Tensor) -> list[Tensor
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize(("channels", "levels"), [(32, 2), (3, 3), (40, 1)])
-def test_samples_and_gradients_are_torch_s(channels: int, levels: int) -> None:
+def test_samples_and_gradients_are_torch_s(channels, levels):
     """Catches a wrong corner, share, axis, level or channel, a product without one of the planes, channels beyond the
     last, and a gradient that leaves the grid: points are inside, on nodes, on the border and far outside."""
     g = torch.Generator().manual_seed(1)
@@ -53,7 +53,7 @@ def test_samples_and_gradients_are_torch_s(channels: int, levels: int) -> None:
         torch.testing.assert_close(x[rows].double(), y[rows], rtol=2e-5, atol=2e-5, msg=name)
 
 
-def test_positions_at_the_border_have_the_gradient_of_inside_or_none() -> None:
+def test_positions_at_the_border_have_the_gradient_of_inside_or_none():
     """Catches a derivative beyond the border, where features are constant, and a division by zero in a cell's width."""
     positions = torch.tensor([[1.0001, 0.2, 0.3], [-7.0, 0.2, 0.3], [math.nan, 0.2, 0.3]])
     _, by_position, *_ = gradients(planes(16, 1), positions, torch.ones(3, 16))
@@ -61,7 +61,7 @@ def test_positions_at_the_border_have_the_gradient_of_inside_or_none() -> None:
     assert by_position[:, 1:].abs().min() > 0
 
 
-def test_nodes_that_do_not_fit_are_refused() -> None:
+def test_nodes_that_do_not_fit_are_refused():
     """Catches nodes that the kernel would read past their end, and numbers of them that overflow."""
     tensors = torch.zeros(1, 3), torch.zeros(3), torch.ones(3), torch.zeros(46, 2)
     with pytest.raises(InputError, match=r"expected of_space of shape \[47, 2\], got \[46, 2\]"):
@@ -73,7 +73,7 @@ def test_nodes_that_do_not_fit_are_refused() -> None:
 
 @pytest.mark.usefixtures("instruction_set")
 @pytest.mark.parametrize("channels", [32, 3])
-def test_the_penalty_and_its_gradients_are_torch_s(channels: int) -> None:
+def test_the_penalty_and_its_gradients_are_torch_s(channels):
     """Catches a plane, row or number that is left out or has another's weight, a difference at the border of a plane,
     and a distance from 1 whose gradient has the wrong sign, or is not zero at 1, where nodes start."""
     field, results = planes(channels, 2), []

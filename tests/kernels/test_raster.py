@@ -85,7 +85,7 @@ def backward_kernels(place: Place) -> Iterator[AbstractContextManager[None]]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_picture(name: str, place: Place) -> None:
+def test_picture(name, place):
     """Catches any rule of the picture that differs, a bound or tile that loses a Gaussian, and radii, means or depths
     that density control would take for others."""
     output = rasterize(**with_background(name, device=place.device), backend=place.device)
@@ -105,7 +105,7 @@ def test_picture(name: str, place: Place) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_gradients(name: str, place: Place) -> None:
+def test_gradients(name, place):
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
     for kernel in backward_kernels(place):
         with kernel:
@@ -113,7 +113,7 @@ def test_gradients(name: str, place: Place) -> None:
         assert_gradients_close(actual, by_reference(name)[1])
 
 
-def test_many_tiles_and_rounds(place: Place) -> None:
+def test_many_tiles_and_rounds(place):
     """Catches what shows only with more than 32 splats a tile and several tiles: staging rounds, offsets, sort keys."""
     g = torch.Generator().manual_seed(3)
     N, width, height = (3_000, 230, 170) if place.device == "cuda" else (300, 50, 40)
@@ -133,9 +133,7 @@ def test_many_tiles_and_rounds(place: Place) -> None:
 
 @pytest.mark.parametrize("is_reversed", [False, True])
 @pytest.mark.parametrize("name", [name for name in CASES if "their_own" in name])
-def test_cameras_of_their_own_gaussians_have_the_bits_of_single_calls(
-    name: str, is_reversed: bool, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_of_their_own_gaussians_have_the_bits_of_single_calls(name, is_reversed, place, monkeypatch):
     """Catches a camera that reads another's Gaussians or adds to their gradients, and a barrier that is missing."""
     if is_reversed:
         monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")  # the kernels of a CPU do not read it
@@ -158,7 +156,7 @@ def test_cameras_of_their_own_gaussians_have_the_bits_of_single_calls(
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["random", "three_cameras", "five_channels", "opaque_stack", "beta_of_three_cameras"])
-def test_same_bits_for_any_number_of_threads(name: str) -> None:
+def test_same_bits_for_any_number_of_threads(name):
     """Catches sums whose order depends on who comes first."""
     arguments = with_background(name)
     if name == "random":  # several tiles and several tasks of every loop
@@ -176,7 +174,7 @@ def test_same_bits_for_any_number_of_threads(name: str) -> None:
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("position", [0, 15, (1 << 17) - 1, 1 << 17, -1])
-def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
+def test_one_bad_value_of_many_is_flagged(bad, position):
     """Catches vectors or parts of a large array that are not looked at: its first, where parts meet, its last."""
     N = 100_003
     arrays = [torch.full((N, 3), 0.5), torch.full((N, 3, 3), 0.5), torch.full((N,), 0.5), torch.full((N, 3), 0.5)]
@@ -202,7 +200,7 @@ def test_one_bad_value_of_many_is_flagged(bad: float, position: int) -> None:
         ("beta_exponents", torch.nan, "beta_exponents: expected finite"),
     ],
 )
-def test_bad_values_are_named(name: str, value: float, message: str, place: Place) -> None:
+def test_bad_values_are_named(name, value, message, place):
     """Catches a value that shows late, as a picture of NaN, on a GPU, or one of the last camera's Gaussians."""
     arguments = with_background("beta_of_three_cameras_of_their_own_gaussians", device=place.device)
     arguments[name].view(-1)[0 if name == "Ks" else -1] = value
@@ -210,13 +208,13 @@ def test_bad_values_are_named(name: str, value: float, message: str, place: Plac
         rasterize(**arguments, backend=place.device)
 
 
-def test_beta_vector(place: Place) -> None:
+def test_beta_vector(place):
     """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
     assert_beta_vector(place.device, torch.float32, 2e-4)
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_gradients_of_many_gaussians_are_zero_where_none_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gradients_of_many_gaussians_are_zero_where_none_is_given(monkeypatch):
     """Catches rows that stay as they were in memory, where zeros are written past the cache."""
     monkeypatch.setattr(operation, "allocate", lambda _, like, shape: like.new_full(shape, math.nan))
     N, last = 90_001, 20
@@ -233,7 +231,7 @@ def test_gradients_of_many_gaussians_are_zero_where_none_is_given(monkeypatch: p
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_a_large_exponent_is_a_gaussian() -> None:
+def test_a_large_exponent_is_a_gaussian():
     """Catches digits of 1 - r^2 that are lost near 1, which an exponent of 10^5 multiplies: alphas were off by 1e-3."""
     arguments = with_background("random") | {"eps2d": 0.0}
     large = arguments | {"factors": arguments["factors"] * (2e5**0.5), "beta_exponents": torch.full((60,), 1e5)}
@@ -244,7 +242,7 @@ def test_a_large_exponent_is_a_gaussian() -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
+def test_gradients_at_the_rim_are_those_of_the_held_profile():
     """Catches a gradient of an exponent below 1 that is infinite or missing at the rim: pixels are put on it."""
     distances = torch.tensor([0.9, 1 - 1e-4, 1 - 6e-7, 1 + 1e-5]).sqrt()  # r at which each image has its one pixel
     Ks = torch.tensor([[1.0, 0, 0], [0, 1, 0.5], [0, 0, 1]]).repeat(4, 1, 1)
@@ -275,7 +273,7 @@ def test_gradients_at_the_rim_are_those_of_the_held_profile() -> None:
             assert (x - y).norm() <= 5e-3 * y.norm()
 
 
-def test_what_it_cannot_do_is_refused() -> None:
+def test_what_it_cannot_do_is_refused():
     """Catches a crash or a silent wrong result where the kernels have limits the reference has not: types, a gradient
     by intrinsics, and 100,000 Gaussians that each cover a 4k picture, or 2,000 cameras of it."""
     arguments = with_background("random")

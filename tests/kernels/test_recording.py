@@ -25,7 +25,7 @@ def repeated(recording: Recording) -> None:
         recording.repeat()
 
 
-def test_a_repetition_has_the_results_of_the_present_values() -> None:
+def test_a_repetition_has_the_results_of_the_present_values():
     """Catches an operation that is left out: in place, of several results, a copy, into zeros, or through a view."""
 
     def work(x: Tensor) -> list[Tensor]:
@@ -46,7 +46,7 @@ def test_a_repetition_has_the_results_of_the_present_values() -> None:
         assert all(torch.equal(x, y) for x, y in zip(results, work(inputs), strict=True))
 
 
-def test_kernels_and_gradients_are_repeated() -> None:
+def test_kernels_and_gradients_are_repeated():
     """Catches a kernel that is not recorded, a backward pass of the tape, and autograd's where torch is in between."""
     scales, quats, opacities = numbers(50, 3), numbers(50, 4), numbers(50)
     inputs = [scales, quats, opacities]
@@ -70,7 +70,7 @@ def test_kernels_and_gradients_are_repeated() -> None:
     assert all(x.any() for x in results)
 
 
-def test_a_recording_that_is_too_large_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_that_is_too_large_is_given_up(monkeypatch):
     """Catches hidden layers that are kept for all Gaussians of a batch, 40 GB for four views of 100,000 of them."""
     monkeypatch.setattr("gsbench.kernels.recording.MOST_BYTES", 1_000)
     inputs = torch.zeros(125)
@@ -86,7 +86,7 @@ def test_a_recording_that_is_too_large_is_given_up(monkeypatch: pytest.MonkeyPat
     assert third.item() == 4
 
 
-def test_a_number_that_was_read_is_read_again() -> None:
+def test_a_number_that_was_read_is_read_again():
     """Catches a repetition with a number that no longer holds, and a reading outside of a recording."""
     count = torch.tensor([3, 1])
     assert read(count, lambda _: False) == [3, 1]
@@ -100,7 +100,7 @@ def test_a_number_that_was_read_is_read_again() -> None:
         repeated(recording)
 
 
-def test_what_is_captured_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_captured_is_repeated(monkeypatch):
     """Catches calls that run while they are captured or are left out of a graph."""
     captured = []
 
@@ -120,7 +120,7 @@ def test_what_is_captured_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     assert total.item() == 6 + 2 * (10 + 2)
 
 
-def test_what_a_pause_calls_is_not_repeated() -> None:
+def test_what_a_pause_calls_is_not_repeated():
     """Catches operations or reads of a pause in a repetition, and a recording that does not go on after its error."""
     x, total = torch.ones(1, dtype=torch.int64), torch.zeros(1, dtype=torch.int64)
 
@@ -142,7 +142,7 @@ def test_what_a_pause_calls_is_not_repeated() -> None:
 
 
 @pytest.mark.parametrize("work", [Tensor.item, Tensor.nonzero, torch.rand_like, lambda x: x[x > 0]])
-def test_what_cannot_be_repeated_says_so(work: object) -> None:
+def test_what_cannot_be_repeated_says_so(work):
     """Catches a number that Python code read, a shape that depends on values, and a draw without its generator."""
     x = torch.ones(())
     with Recording() as recording:
@@ -150,7 +150,7 @@ def test_what_cannot_be_repeated_says_so(work: object) -> None:
     assert not recording.is_repeatable
 
 
-def test_threads_record_one_after_the_other() -> None:
+def test_threads_record_one_after_the_other():
     """Catches a recording with another thread's calls, and torch's note of a recording that stays after its end."""
     recorded: list[list[tuple[Recording, Tensor]]] = [[], []]
     inputs = [torch.ones(3), torch.ones(3)]
@@ -174,7 +174,7 @@ def test_threads_record_one_after_the_other() -> None:
     assert all((result == 2).all() for _, result in recorded[1])
 
 
-def test_recording_does_not_import_torch_s_compiler() -> None:
+def test_recording_does_not_import_torch_s_compiler():
     """Catches a second that every training would lose, because torch imports its compiler for a dispatch mode."""
     code = (
         "import sys, torch; from gsbench.kernels.recording import Recording\n"

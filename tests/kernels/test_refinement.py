@@ -5,7 +5,6 @@ from copy import deepcopy
 
 import pytest
 import torch
-from conftest import Place
 from sliced_models import assert_same, gradients, weights_of
 from torch import Tensor
 
@@ -36,7 +35,7 @@ def nan_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("N", [1, 127, 300, 16_421])  # on a GPU, the last are more than 512 batches
 @pytest.mark.parametrize("widths", [[3, 1, 3, 28], [3, 7], [3, 3, 21]])
-def test_refinement(N: int, widths: list[int], place: Place) -> None:
+def test_refinement(N, widths, place):
     """Catches a block's edge that is lost, a network that reads another's weights, and any wrong gradient."""
     if N > 300 and widths != [3, 7]:
         pytest.skip("many rows are tested of one network")
@@ -66,7 +65,7 @@ def intervals_around(time: Tensor, count: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("N", [1, 127, 5000])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.98, 1.0])
 @pytest.mark.parametrize("rests", [False, True])
-def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, place: Place) -> None:
+def test_rows_that_agr_does_not_move(N, share, rests, place):
     """Catches a row past the prefix, or outside its interval, that is moved, counted in a weight's gradient or lost."""
     N = N if place.name != "cuda" else min(N, 300)
     parts, count = [3, 1, 2, 7], round(share * N)
@@ -96,7 +95,7 @@ def test_rows_that_agr_does_not_move(N: int, share: float, rests: bool, place: P
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
-def test_several_views_in_one_call(share: float, cuda_device: str) -> None:
+def test_several_views_in_one_call(share, cuda_device):
     """Catches a view that sees the time of another, and gradients that are not the sum over views."""
     exact, values = exact_network(300, [3, 1, 9], [3, 1, 2, 7])
     network, times = exact.to(cuda_device, torch.float32), torch.tensor([0.375, 0.5, 0.1], device=cuda_device)
@@ -128,7 +127,7 @@ def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: l
 @pytest.mark.usefixtures("instruction_set", "threads", "nan_memory")
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 @pytest.mark.parametrize("N", [0, 1, 127, 128, 129, 5000])
-def test_refinement_of_what_has_no_gradient(N: int, share: float) -> None:
+def test_refinement_of_what_has_no_gradient(N, share):
     """Catches gradients in the wrong row, or not written, as those that have one are packed, or a row that counts as
     one without though one of its numbers is not zero; and sums that depend on the number of threads."""
     g = torch.Generator().manual_seed(N)
@@ -154,7 +153,7 @@ def test_refinement_of_what_has_no_gradient(N: int, share: float) -> None:
     assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
 
 
-def test_arrays_that_do_not_fit_are_refused(place: Place) -> None:
+def test_arrays_that_do_not_fit_are_refused(place):
     """Catches arrays that a kernel would read past their end, and a network that would not fit its own."""
     single = place.move(torch.ones(1))
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Place
 from sliced_models import CASES, CENTER, TIME, assert_same, gradients, slice_of, sliced_model, weights_of
 
 from gsbench.errors import InputError
@@ -36,7 +35,7 @@ CONDITIONED = [(name, options) for name, options in CASES if name not in ("3dgs"
 
 
 @pytest.mark.parametrize(("name", "options"), CASES)
-def test_slice(name: str, options: dict[str, Any], place: Place) -> None:
+def test_slice(name, options, place):
     """Catches a wrong row order, reflection, opacity factor, size that does not stop, or derivative by a parameter."""
     exact, raw = sliced_model(name, options, torch.float64)
     expected = slice_of(exact, raw)
@@ -56,7 +55,7 @@ def test_slice(name: str, options: dict[str, Any], place: Place) -> None:
 
 @pytest.mark.parametrize(("name", "options"), CONDITIONED)
 @pytest.mark.parametrize("share", SHARES)
-def test_static_rows(name: str, options: dict[str, Any], share: float, place: Place) -> None:
+def test_static_rows(name, options, share, place):
     """Catches a static row that reads a column of time or direction, fades, or has a gradient by what it lacks."""
     if place.name == "cuda" and options.get("scheme") == "cholesky":
         pytest.skip("refused on a GPU")
@@ -79,7 +78,7 @@ def test_static_rows(name: str, options: dict[str, Any], share: float, place: Pl
 
 
 @pytest.mark.parametrize(("name", "options", "per_view"), SEVERAL_VIEWS)
-def test_several_views_in_one_call(name: str, options: dict[str, Any], per_view: bool, cuda_device: str) -> None:
+def test_several_views_in_one_call(name, options, per_view, cuda_device):
     """Catches a view that reads the camera, time or parameters of another, and gradients that are not their sum."""
     model, raw = sliced_model(name, options, torch.float32)
     assert model.takes_views
@@ -109,7 +108,7 @@ def test_several_views_in_one_call(name: str, options: dict[str, Any], per_view:
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_opacities_of_the_largest_logits() -> None:
+def test_opacities_of_the_largest_logits():
     """Catches exp2 beyond the exponents of float32: without AVX-512, the opacity of a logit of -100 was 1."""
     logits = torch.tensor([-1e30, -200.0, -150.0, -128.0, -100.0, -90.0, -88.0, -80.0, 0.0, 80.0, 100.0, 200.0, 1e30])
     quats = torch.eye(4)[:1].expand(len(logits), 4).contiguous()
@@ -118,7 +117,7 @@ def test_opacities_of_the_largest_logits() -> None:
 
 
 @pytest.mark.usefixtures("instruction_set")
-def test_sizes_of_beta_profiles_keep_their_digits() -> None:
+def test_sizes_of_beta_profiles_keep_their_digits():
     """Catches a softplus that loses the digits of small sizes, or that does not stop, with its derivative."""
     sizes = torch.tensor([-30.0, -15.0, -9.0, -4.0, -0.1, 0.0, 0.1, 4.0, 30.0, 1e7])
     results = []
@@ -136,7 +135,7 @@ def test_sizes_of_beta_profiles_keep_their_digits() -> None:
 
 
 @pytest.mark.parametrize(("name", "options"), WITHOUT_KERNEL)
-def test_an_option_without_a_kernel_is_sliced_in_torch(name: str, options: dict[str, Any]) -> None:
+def test_an_option_without_a_kernel_is_sliced_in_torch(name, options):
     """Catches a kernel that slices by another formula than the option says."""
     model, raw = sliced_model(name, options, torch.float64)
     slices = []
@@ -146,7 +145,7 @@ def test_an_option_without_a_kernel_is_sliced_in_torch(name: str, options: dict[
     assert all(torch.equal(x, y) for x, y in zip(*slices, strict=True))
 
 
-def test_arguments_are_taken_by_name() -> None:
+def test_arguments_are_taken_by_name():
     """Catches a default that is not all rows, an input in the place of another, and a name that is dropped."""
     _, raw = sliced_model("freetime", {}, torch.float32)
     by_name = {key: x for key, x in raw.items() if key in slice_free_time.inputs} | {"time": TIME}
@@ -158,7 +157,7 @@ def test_arguments_are_taken_by_name() -> None:
         slice_free_time(**by_name | {"quats": None})
 
 
-def test_arguments_that_do_not_fit_are_refused() -> None:
+def test_arguments_that_do_not_fit_are_refused():
     """Catches a slice of nothing, and a prefix longer than the arrays, which a kernel would read past their end."""
     rows, none, by_default = torch.ones(2, 3), torch.ones(2, 0), (None, None, None)
     shape = (rows, rows, none, none, torch.ones(2), torch.zeros(3))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import Place
 from torch import Tensor
 
 from benchmarks.scene import camera, model
@@ -59,7 +58,7 @@ def gradients(of: GaussianModel) -> dict[str, Tensor]:
     return taken
 
 
-def test_a_tape_records_its_thread_alone() -> None:
+def test_a_tape_records_its_thread_alone():
     """Catches calls of another thread on a tape, where autograd does not see them: a viewer beside a probe."""
     fitting, (view,) = fitted("4dgs", 20), views(1)
     with Tape(), ThreadPoolExecutor(1) as pool:
@@ -68,7 +67,7 @@ def test_a_tape_records_its_thread_alone() -> None:
     assert float(gradients(fitting)["splats.opacities"].abs().sum()) > 0
 
 
-def test_a_tape_runs_backwards_for_several_vectors() -> None:
+def test_a_tape_runs_backwards_for_several_vectors():
     """Catches a second vector whose product has the first one's in it, or is empty: the probe asks for two."""
     view = views(1)[0]
     gaussians = fitted("7dgs").slice(CameraTime.of(view.camera, view.time))
@@ -99,7 +98,7 @@ def test_a_tape_runs_backwards_for_several_vectors() -> None:
         ("3dgs", True, True),
     ],
 )
-def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) -> None:
+def test_a_step_s_gradients_are_autograd_s(name, agr, classed):
     """Catches an operation left out of the chain, a gradient given twice, or to another tensor."""
     fitting, batch = fitted(name, agr=agr, classed=classed), views(3)
     expected: dict[str, Tensor] = {}
@@ -125,9 +124,7 @@ def test_a_step_s_gradients_are_autograd_s(name: str, agr: bool, classed: bool) 
     ("name", "agr", "classed"),
     [("7dgs", True, False), ("4dgs", False, False), ("7dgs", True, True), ("4dgs", True, True)],
 )
-def test_a_training_step_s_gradients_are_the_reference_s(
-    name: str, agr: bool, classed: bool, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_step_s_gradients_are_the_reference_s(name, agr, classed, place, monkeypatch):
     """Catches what no kernel shows alone: a gradient that is lost, or taken twice, on its way from the loss through
     blending, projection, colours and slices to the parameters, or in the sum over views."""
     torch.set_num_threads(1)  # the shim runs in one
@@ -159,9 +156,7 @@ def test_a_training_step_s_gradients_are_the_reference_s(
         ("ubs", False, [], []),
     ],
 )
-def test_views_together_have_the_bits_of_views_one_by_one(
-    name: str, agr: bool, read_twice: list[str], shared: list[str], place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_views_together_have_the_bits_of_views_one_by_one(name, agr, read_twice, shared, place, monkeypatch):
     """Catches a view that reads another's slice, camera or target, and gradients that are lost or added twice.
 
     On a CPU, gradients are added from the last view to the first. On a GPU, a thread adds those of its Gaussian from
@@ -194,7 +189,7 @@ def test_views_together_have_the_bits_of_views_one_by_one(
         assert torch.equal(got, want) or place.device == "cuda" or rounded, key
 
 
-def test_views_that_cannot_be_rendered_together_are_parts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_that_cannot_be_rendered_together_are_parts_of_their_own(monkeypatch):
     """Catches images of two sizes in one launch, results in another order than their views', and a map or a term of the
     loss that sees one view of several."""
     monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", ("cpu",))
@@ -219,7 +214,7 @@ def test_views_that_cannot_be_rendered_together_are_parts_of_their_own(monkeypat
 
 @pytest.mark.usefixtures("threads", "instruction_set")
 @pytest.mark.parametrize(("name", "N", "classed"), [("4dgs", 300, False), ("7dgs", 300, False), ("7dgs", 2500, True)])
-def test_the_same_bits_for_any_number_of_threads(name: str, N: int, classed: bool) -> None:
+def test_the_same_bits_for_any_number_of_threads(name, N, classed):
     """Catches views whose gradients are added in the order that threads come by."""
     fitting, batch = fitted(name, N, agr=True, classed=classed), views(5)
     results = []
@@ -232,7 +227,7 @@ def test_the_same_bits_for_any_number_of_threads(name: str, N: int, classed: boo
 
 
 @pytest.mark.usefixtures("threads")
-def test_small_scenes_are_trained_on_one_thread() -> None:
+def test_small_scenes_are_trained_on_one_thread():
     """Catches a number of threads that is not put back, also where a step fails, and large scenes held to one."""
     torch.set_num_threads(3)
     with fitting_threads(10_000, 80 * 80):
@@ -252,7 +247,7 @@ def test_small_scenes_are_trained_on_one_thread() -> None:
     assert torch.get_num_threads() == 3
 
 
-def test_what_torch_does_in_between_is_differentiated_too() -> None:
+def test_what_torch_does_in_between_is_differentiated_too():
     """Catches a gradient lost where a tensor of autograd's graph enters an operation, or an operation's enters one."""
     g = torch.Generator().manual_seed(3)
     scales, quats = torch.randn(20, 3, generator=g).requires_grad_(), torch.randn(20, 4, generator=g).requires_grad_()
@@ -278,7 +273,7 @@ def test_what_torch_does_in_between_is_differentiated_too() -> None:
         torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
 
 
-def test_a_network_is_differentiated_once() -> None:
+def test_a_network_is_differentiated_once():
     """Catches a pass through a network for each input of a kernel or each of its outputs, a gradient that such a pass
     would have and one pass lacks, and a tensor that is cut off from its network where no tape runs."""
     g = torch.Generator().manual_seed(6)
@@ -304,7 +299,7 @@ def test_a_network_is_differentiated_once() -> None:
     assert len(passes) == 1
 
 
-def test_two_views_may_share_a_gradient() -> None:
+def test_two_views_may_share_a_gradient():
     """Catches two sums that are one tensor, as torch gives both terms of a sum: another view's would be added twice."""
     g = torch.Generator().manual_seed(5)
     a, b = torch.randn(20, 3, generator=g).requires_grad_(), torch.randn(20, 3, generator=g).requires_grad_()
@@ -323,7 +318,7 @@ def test_two_views_may_share_a_gradient() -> None:
         torch.testing.assert_close(sums[id(x)], gradient, rtol=1e-5, atol=1e-5)
 
 
-def test_what_is_added_does_not_depend_on_what_is_there() -> None:
+def test_what_is_added_does_not_depend_on_what_is_there():
     """Catches coefficients that two operations read, each of which adds its own part to other views' gradient.
 
     Which views share a sum depends on the number of threads, and its rounding would too.
@@ -346,7 +341,7 @@ def test_what_is_added_does_not_depend_on_what_is_there() -> None:
     assert torch.equal(gradient({id(sh0): other.clone()}), other + alone)
 
 
-def test_nothing_is_noted_where_nothing_is_wanted() -> None:
+def test_nothing_is_noted_where_nothing_is_wanted():
     """Catches a tape that keeps every tensor of a rendering."""
     with Tape() as tape, torch.no_grad():
         slice_static(torch.zeros(2, 3, requires_grad=True), torch.ones(2, 4), torch.zeros(2))

@@ -90,14 +90,14 @@ def launched(fitted: Training) -> Training:
     ],
 )
 def test_calls_of_a_step(
-    model: str,
-    options: tuple[str, ...],
-    kernels: int,
-    operations: int,
-    repeated: int,
-    start: Start,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    model,
+    options,
+    kernels,
+    operations,
+    repeated,
+    start,
+    monkeypatch,
+):
     """Catches a change after which a step of four views launches more, or a repeated one more outside of its graphs:
     each call takes a GPU at least two microseconds, and Python five; and a value that the CPU waits for."""
     called, call = Counter[str](), CudaLibrary.call
@@ -134,9 +134,7 @@ EVENTS = ("train.densify.every=12", "train.lambda_from=4500", "train.curve_point
         *[pytest.param(model, 60, marks=pytest.mark.slow) for model in ("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")],
     ],
 )
-def test_repeated_steps_train_as_launched_ones(
-    model: str, steps: int, start: Start, repeats: Counter[str], cuda_device: str
-) -> None:
+def test_repeated_steps_train_as_launched_ones(model, steps, start, repeats, cuda_device):
     """Catches work of a step that a repetition does not do again, or with an address, a count of Gaussians or a part
     of the model from before an event. The shim adds in a fixed order, so all bits are equal."""
     from interrupted import assert_same_bits
@@ -158,9 +156,7 @@ def test_repeated_steps_train_as_launched_ones(
     assert trainings[0].loss == pytest.approx(trainings[1].loss, rel=1e-2)
 
 
-def test_more_intersections_than_there_is_room_for(
-    start: Start, repeats: Counter[str], cuda_device: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_intersections_than_there_is_room_for(start, repeats, cuda_device, monkeypatch):
     """Catches lists of tiles that write beyond their memory, which was allocated for the view that was recorded, a step
     that learns from images without some of their intersections, or is not done again, and what earlier changed then."""
     from interrupted import assert_same_bits
@@ -181,7 +177,7 @@ def test_more_intersections_than_there_is_room_for(
     assert trainings[0].loss == pytest.approx(trainings[1].loss, rel=1e-2)
 
 
-def test_a_bad_step_changes_nothing_until_it_is_looked_at(start: Start, repeats: Counter[str]) -> None:
+def test_a_bad_step_changes_nothing_until_it_is_looked_at(start, repeats):
     """Catches repeated steps after a bad gradient that move a parameter, a moment, a count of updates or the
     statistics of density control, and another step or parameter that is blamed when the CPU looks."""
     fitted = start("4dgs")
@@ -209,7 +205,7 @@ def test_a_bad_step_changes_nothing_until_it_is_looked_at(start: Start, repeats:
         fitted.state_dict()
 
 
-def test_a_value_that_is_not_finite_is_found_in_a_repetition(start: Start, repeats: Counter[str]) -> None:
+def test_a_value_that_is_not_finite_is_found_in_a_repetition(start, repeats):
     """Catches a training that goes on with NaN, because the rasterizer's check was not repeated, and an error that does
     not name the first bad step and its values."""
     fitted = start("7dgs")

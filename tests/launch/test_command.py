@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -62,7 +61,7 @@ def hydra() -> Iterator[None]:
         ),
     ],
 )
-def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
+def test_the_runs_of_a_command(words, runs):
     """Catches scenes that one job does one after the other, axes in another order, a run for Slurm that trains on the
     login node, axes of an experiment that a command line cannot replace, and a plan for a run that is of no sweep."""
     assert runs_of(parse(words.split())) == ([run.split() for run in runs or [words]], runs is not None)
@@ -101,7 +100,7 @@ def test_the_runs_of_a_command(words: str, runs: list[str] | None) -> None:
         ),
     ],
 )
-def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
+def test_a_command_without_runs_is_refused(words, message):
     """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
     silence, a key without the one that it needs, a scene that is no scene, one folder that several runs share, and a
     job that is submitted and fails, or is never requeued, for a number out of its range."""
@@ -109,7 +108,7 @@ def test_a_command_without_runs_is_refused(words: str, message: str) -> None:
         check_runs([compose_run(run) for run in runs_of(parse(words.split()))[0]])
 
 
-def test_a_sweep_of_different_runs_is_allowed() -> None:
+def test_a_sweep_of_different_runs_is_allowed():
     """Catches a sweep over protocols, folders of results or initial PLYs that is refused as one run, and a key that one
     of its runs does not read."""
     several = ("protocol=gsbench,published", "results=a,b", "+init.ply=a,b", "effects.budget_db=1 effects.gate=end,off")
@@ -118,17 +117,17 @@ def test_a_sweep_of_different_runs_is_allowed() -> None:
         check_runs([compose_run(run) for run in runs])
 
 
-def test_a_question_is_left_to_hydra() -> None:
+def test_a_question_is_left_to_hydra():
     """Catches a question that is refused as an option, such as for the config of a run, and a run taken for one."""
     assert [parse(["+exp=mini", *words]).asks for words in ([], ["--cfg", "job"], ["-c", "job"])] == [False, True, True]
 
 
-def test_scenes_of_the_user_are_choices() -> None:
+def test_scenes_of_the_user_are_choices():
     """Catches a retry or a job that cannot compose a scene without a file."""
     assert compose_run(["+exp=mini", "data.scenes=[new]", "scene=new"]).config.scene.name == "new"
 
 
-def test_configs_of_the_user_are_found_in_their_folder(tmp_path: Path) -> None:
+def test_configs_of_the_user_are_found_in_their_folder(tmp_path):
     """Catches --config-dir that is read for the help alone, that stays for the next command, or that is mistyped."""
     from hydra.core.global_hydra import GlobalHydra
 
@@ -151,7 +150,7 @@ def settings(ablation: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_an_ablation_changes_what_it_names_and_nothing_else(name: str) -> None:
+def test_an_ablation_changes_what_it_names_and_nothing_else(name):
     """Catches an ablation that is the whole model, or one that changes a second thing."""
     whole, changed, named = settings("none"), settings(name), ABLATIONS[name]
     differs = {key: value for key, value in changed.items() if whole.get(key) != value}
@@ -159,7 +158,7 @@ def test_an_ablation_changes_what_it_names_and_nothing_else(name: str) -> None:
     assert "model.name" not in named or changed["agr"] is True  # AGR stays, so that only the effects differ
 
 
-def test_the_ablation_sweeps_over_all_ablations_by_itself() -> None:
+def test_the_ablation_sweeps_over_all_ablations_by_itself():
     """Catches an ablation that is shipped and not in the sweep, and a plan that forgets the experiment's own axes."""
     runs, is_sweep = runs_of(parse(["+exp=ablation", "scene=suzanne"]))
     assert is_sweep
@@ -167,7 +166,7 @@ def test_the_ablation_sweeps_over_all_ablations_by_itself() -> None:
     assert {path.stem for path in (CONF / "ablation").glob("*.yaml")} == set(ABLATIONS)
 
 
-def test_launch_settings_change_no_number() -> None:
+def test_launch_settings_change_no_number():
     """Catches a partition, or a results folder, that makes another run of the same run."""
     words = ["model=7dgs", "+launch=slurm", "launch.partition=gpu", "+launch.sbatch.qos=x", "results=r", "resume=false"]
     assert identity([*words, "+exp=mini"]) == ("+exp=mini", "model=7dgs")

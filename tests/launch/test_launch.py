@@ -40,15 +40,13 @@ def states(experiment: Path) -> list[str]:
         ("launch.nosuch=1", r"config key 'launch\.nosuch' is not known"),
     ],
 )
-def test_retry_takes_only_settings_of_the_launch(word: str, message: str, tmp_path: Path) -> None:
+def test_retry_takes_only_settings_of_the_launch(word, message, tmp_path):
     """Catches a retry that may change what its runs are."""
     with pytest.raises(InputError, match=message):
         retry(status.read(tmp_path), [word])
 
 
-def test_retry_passes_over_what_cannot_be_launched(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_retry_passes_over_what_cannot_be_launched(tmp_path, capsys, monkeypatch):
     """Catches a stack trace, or a whole retry that ends, for a folder that is gone and words that are not known."""
     monkeypatch.chdir(tmp_path)
     experiment, gone = tmp_path / "mini", str(tmp_path / "gone")
@@ -70,9 +68,7 @@ def test_retry_passes_over_what_cannot_be_launched(
         assert reason in line
 
 
-def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(tmp_path, capsys):
     """Catches a retry that says that no run failed, beside a status that lists one, and a command for a damaged record,
     whose words are not known."""
     run, folder = ("7dgs", "lego", 0), tmp_path / "mini" / "seed0"
@@ -87,7 +83,7 @@ def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(
     assert "no run was stopped" not in errors
 
 
-def test_a_retry_launches_with_the_settings_that_it_gets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_launches_with_the_settings_that_it_gets(tmp_path, monkeypatch):
     """Catches more memory that is asked for and never used, and a run that loses what decides its numbers."""
     monkeypatch.chdir(tmp_path)  # a retry goes to where the command was typed
     experiment = tmp_path / "mini"
@@ -101,7 +97,7 @@ def test_a_retry_launches_with_the_settings_that_it_gets(tmp_path: Path, monkeyp
     assert config.results == str(tmp_path)
 
 
-def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_ends_with_its_own_runs(tmp_path, monkeypatch):
     """Catches a sweep that ends badly because of a run of another sweep in the same folder of results, and a plan that
     is left of a sweep whose runs were all refused as they began."""
     words = ["+exp=mini", "scene=suzanne", "model=3dgs", f"results={tmp_path}"]
@@ -122,7 +118,7 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(plan.find(tmp_path / "mini")) == 2
 
 
-def test_plans_are_read_oldest_first(tmp_path: Path) -> None:
+def test_plans_are_read_oldest_first(tmp_path):
     """Catches plans in the order of the file system: the status of a run is that of its last sweep."""
     names = [f"2026-01-{day:02}" for day in (3, 11, 9, 2, 8, 4, 27)]
     for name in names:
@@ -141,14 +137,14 @@ def test_plans_are_read_oldest_first(tmp_path: Path) -> None:
     ],
 )
 def test_a_run_that_raises_ends_with_a_reason(
-    error: Exception,
-    reason: str,
-    is_refused: bool,
-    traces: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    error,
+    reason,
+    is_refused,
+    traces,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     """Catches an error that ends the sweep, one told as another, and a stack trace for what users can mend."""
     monkeypatch.setattr(execution, "execute", lambda _: (_ for _ in ()).throw(error))
     with hydra_with(None):
@@ -159,7 +155,7 @@ def test_a_run_that_raises_ends_with_a_reason(
     assert ("Traceback" in errors) == traces
 
 
-def test_a_path_that_only_a_node_knows_is_left_to_its_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_only_a_node_knows_is_left_to_its_job(tmp_path, monkeypatch):
     """Catches TMPDIR of a node that is refused before its job, one not refused here, and a stack trace there."""
     monkeypatch.delenv("DISK_OF_NODE", raising=False)
     words = ["+exp=dnerf", "scene=trex", "data.root=${oc.env:DISK_OF_NODE}", f"results={tmp_path}"]
@@ -171,7 +167,7 @@ def test_a_path_that_only_a_node_knows_is_left_to_its_job(tmp_path: Path, monkey
     assert "DISK_OF_NODE" in str(ended.reason)
 
 
-def test_a_run_looks_for_its_parent_without_haste(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_looks_for_its_parent_without_haste(monkeypatch):
     """Catches a thread that takes a CPU from the training, and a run that goes on when its parent is gone."""
     parents, done = iter([7, 7, 1]), list[Any]()
     monkeypatch.setattr(os, "getppid", lambda: next(parents))
@@ -181,9 +177,7 @@ def test_a_run_looks_for_its_parent_without_haste(monkeypatch: pytest.MonkeyPatc
     assert done == [processes.POLL, processes.POLL, (os.getpid(), signal.SIGTERM)]
 
 
-def test_without_slurm_the_error_says_where_to_go(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_slurm_the_error_says_where_to_go(monkeypatch, tmp_path, capsys):
     """Catches an error of submitit that only asks whether this is a cluster."""
     monkeypatch.setenv("PATH", str(tmp_path))
     words = ["-m", "+exp=mini", "scene=suzanne", "model=3dgs", "+launch=slurm", f"results={tmp_path / 'results'}"]
@@ -193,7 +187,7 @@ def test_without_slurm_the_error_says_where_to_go(
     assert message.endswith("(docs/runs.md#slurm-from-a-login-node-to-the-table)")
 
 
-def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -> None:
+def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path):
     """Catches runs that were kept and count as trained in no time, runs that failed and are waited for, runs at once
     that are added up, and a line that divides by nothing."""
     plan.write(Plan("local", [[f"seed={i}"] for i in range(10)]), tmp_path)
@@ -211,7 +205,7 @@ def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path: Path) -
     assert plan.time_left(tmp_path, 2) == ""
 
 
-def test_a_sweep_has_the_bits_of_one_process_and_a_retry_does_what_is_missing(square: Path, tmp_path: Path) -> None:
+def test_a_sweep_has_the_bits_of_one_process_and_a_retry_does_what_is_missing(square, tmp_path):
     """Catches runs that depend on the process they share, a sweep that says nothing until its end, one that is repeated
     and expects its kept runs to train, an outcome that a run of a process of its own writes without its record, and a
     retry that loses a run's overrides, trains a finished run again, or hides that nothing is left.

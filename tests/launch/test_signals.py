@@ -52,9 +52,7 @@ SAVED = ["not started", "stopped", "stopped"]
         ("worker", signal.SIGKILL, 1, 3_000, ["done", "done", "lost"]),
     ],
 )
-def test_a_signal_lets_each_run_save_and_no_other_begins(
-    at: str, number: signal.Signals, code: int, iterations: int, ended: list[str], square: Path, tmp_path: Path
-) -> None:
+def test_a_signal_lets_each_run_save_and_no_other_begins(at, number, code, iterations, ended, square, tmp_path):
     """Catches runs that are killed with their checkpoints, siblings that are lost, orphans that train for days after
     their sweep was killed, and a sweep that ends as the kernel kills one of its runs for memory."""
     sweep, deadline = Forked(tmp_path, "gsbench", *words(square, tmp_path, iterations)), time.monotonic() + 120
@@ -88,7 +86,7 @@ def test_a_signal_lets_each_run_save_and_no_other_begins(
 
 
 @pytest.mark.parametrize("launch", ["local", "parallel"])
-def test_a_sweep_that_is_refused_leaves_no_plan(launch: str, tmp_path: Path) -> None:
+def test_a_sweep_that_is_refused_leaves_no_plan(launch, tmp_path):
     """Catches eight runs that never started, for ever, after a command without data.root."""
     assert main_here("+exp=dnerf", f"results={tmp_path}", f"+launch={launch}") == 2
     assert not list(tmp_path.rglob(plan.FILE_NAME))
@@ -97,7 +95,7 @@ def test_a_sweep_that_is_refused_leaves_no_plan(launch: str, tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
-def test_a_signal_at_any_time_loses_nothing(seed: int, square: Path, tmp_path: Path) -> None:
+def test_a_signal_at_any_time_loses_nothing(seed, square, tmp_path):
     """Catches a moment in which a signal loses a run, a record or a bit: imports, loading, training and measuring."""
     draw = random.Random(seed)
     whole, results = tmp_path / "whole", tmp_path / "results"

@@ -64,7 +64,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_each_run_is_a_job_in_the_image(log: Path, square: Path, tmp_path: Path) -> None:
+def test_each_run_is_a_job_in_the_image(log, square, tmp_path):
     """Catches jobs outside of the image, results or data that it does not see, and settings that Slurm does not get."""
     image, results = tmp_path / "gsbench.sif", tmp_path / "results"
     image.touch()
@@ -88,7 +88,7 @@ def test_each_run_is_a_job_in_the_image(log: Path, square: Path, tmp_path: Path)
     assert [*in_image[:3], *in_image[4:-1]] == ["exec", "--nv", "--bind", "--pwd", str(ROOT), str(image), *program]
 
 
-def test_a_stopped_run_is_requeued_as_often_as_it_may(log: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_is_requeued_as_often_as_it_may(log, tmp_path):
     """Catches a run that ends with its first job, as Slurm's signal ends the script, and one that never ends."""
     ready, script = tmp_path / "ready", tmp_path / "job.sh"
     run = f"bash -c 'trap \"exit {STOPPED}\" USR2; touch {ready}; while :; do sleep 0.05; done' --"
@@ -104,7 +104,7 @@ def test_a_stopped_run_is_requeued_as_often_as_it_may(log: Path, tmp_path: Path)
     assert (log / "scontrol").read_text() == "requeue 70\n" * 2
 
 
-def test_a_job_listens_before_it_reads_its_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_listens_before_it_reads_its_plan(tmp_path, monkeypatch):
     """Catches a job that Slurm's signal kills without a word while it loads."""
     heard: list[bool] = []
     monkeypatch.setattr(stop, "listen", lambda: heard.append(True))
@@ -113,7 +113,7 @@ def test_a_job_listens_before_it_reads_its_plan(tmp_path: Path, monkeypatch: pyt
     assert heard
 
 
-def test_a_job_ends_with_the_status_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_ends_with_the_status_of_its_run(tmp_path, monkeypatch):
     """Catches a run that failed in a job that Slurm shows as completed, another run of the plan, and a user's model in
     the folder of the command that cannot be imported."""
     monkeypatch.setattr(stop, "listen", lambda: None)
@@ -132,7 +132,7 @@ def test_a_job_ends_with_the_status_of_its_run(tmp_path: Path, monkeypatch: pyte
     assert os.getcwd() in sys.path
 
 
-def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path, tmp_path: Path) -> None:
+def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log, square, tmp_path):
     """Catches USR2 that kills a run with its last minutes, and a job that begins from the first step again."""
     (tmp_path / "fakes" / "srun").write_text(
         "#!/bin/bash\nshift\n"
@@ -149,9 +149,7 @@ def test_a_run_that_slurm_stops_goes_on_in_its_next_job(log: Path, square: Path,
     assert sweep.returncode == 0, sweep.stderr
 
 
-def test_a_missing_image_is_named_before_anything_is_submitted(
-    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_image_is_named_before_anything_is_submitted(log, tmp_path, monkeypatch, capsys):
     """Catches an array of jobs that all fail because of a name mistyped once, and a retry that leaves the image out."""
     monkeypatch.chdir(tmp_path)
     words = ["+exp=mini", "scene=suzanne", "+launch=slurm", "launch.container=gone.sif"]
@@ -165,7 +163,7 @@ def test_a_missing_image_is_named_before_anything_is_submitted(
 
 
 @pytest.mark.parametrize("name", ["a,b", "a:b"])
-def test_a_folder_that_cannot_be_bound_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_bound_is_refused(name, tmp_path, monkeypatch):
     """Catches a folder that Apptainer would read as two."""
     folder = tmp_path / name
     folder.mkdir()
@@ -178,7 +176,7 @@ def test_a_folder_that_cannot_be_bound_is_refused(name: str, tmp_path: Path, mon
         in_container([config], folder)
 
 
-def test_jobs_that_slurm_refuses_leave_no_plan(log: Path, tmp_path: Path) -> None:
+def test_jobs_that_slurm_refuses_leave_no_plan(log, tmp_path):
     """Catches runs that wait for ever for jobs that were never accepted."""
     (log.parent / "fakes" / "sbatch").write_text("#!/bin/bash\necho 'sbatch: error: invalid partition' >&2; exit 1\n")
     ended = gsbench("+exp=mini", "scene=suzanne", "+launch=slurm", f"results={tmp_path / 'results'}")

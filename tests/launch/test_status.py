@@ -135,9 +135,7 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
         ),
     ],
 )
-def test_the_state_of_a_run_follows_from_its_traces(
-    queue: Queue | None, traces: dict[str, Any], state: str, reason: str | None, tmp_path: Path
-) -> None:
+def test_the_state_of_a_run_follows_from_its_traces(queue, traces, state, reason, tmp_path):
     """Catches a trace that is not matched to its run, a hard death that is taken for running for ever, a living,
     requeued or refused run that is taken for lost, a damaged record that stops the status of all others, and a reason
     that is named nowhere."""
@@ -159,7 +157,7 @@ def test_the_state_of_a_run_follows_from_its_traces(
         assert "squeue is not on this machine" in text
 
 
-def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
+def test_a_process_that_was_killed_is_gone(tmp_path):
     """Catches a check that asks only whether the process number is in use, zombies included."""
     sleeper = subprocess.Popen(["sleep", "60"])
     folder = traced(tmp_path, progress_of={"pid": sleeper.pid, "born": born(sleeper.pid)})
@@ -196,9 +194,7 @@ def test_a_process_that_was_killed_is_gone(tmp_path: Path) -> None:
     ],
     ids=["memory", "error", "time"],
 )
-def test_a_lost_job_says_how_it_ended(
-    job: str, step: str, log: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lost_job_says_how_it_ended(job, step, log, reason, tmp_path, monkeypatch):
     """Catches memory that ran out told as a kill, as only the step of a job knows of it, and a log's last line."""
     sacct = tmp_path / "sacct"
     sacct.write_text(f"#!/bin/sh\nprintf '7_0|{job}\\n7_0.batch|{step}\\n7_1|COMPLETED|0:0\\n'\n")
@@ -221,7 +217,7 @@ def test_a_lost_job_says_how_it_ended(
         ("", "(empty)"),
     ],
 )
-def test_a_log_is_quoted_where_it_names_the_cause(log: str, cause: str, tmp_path: Path) -> None:
+def test_a_log_is_quoted_where_it_names_the_cause(log, cause, tmp_path):
     """Catches `exit code 13` alone for a job whose log says in its first line that Python may not be run."""
     path = tmp_path / "7_0_log.err"
     path.write_text(log)
@@ -231,7 +227,7 @@ def test_a_log_is_quoted_where_it_names_the_cause(log: str, cause: str, tmp_path
     assert status.cause_in(path) == "(no log)"
 
 
-def test_a_failure_is_planned_once_it_is_tried_again(tmp_path: Path) -> None:
+def test_a_failure_is_planned_once_it_is_tried_again(tmp_path):
     """Catches a retried run that still looks failed."""
     folder = traced(tmp_path, plan_of={"started": time.time() - 100}, record_of=DIVERGED)
     os.utime(folder / "record.json", (time.time() - 1, time.time() - 1))
@@ -241,7 +237,7 @@ def test_a_failure_is_planned_once_it_is_tried_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("newer", ["a", "b"])
-def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> None:
+def test_of_two_traces_of_a_run_the_newer_counts(tmp_path, newer):
     """Catches the first one found, or the older one: folders of a run done again under another name remain."""
     now = time.time()
     for name in ("a", "b"):
@@ -258,9 +254,7 @@ def test_of_two_traces_of_a_run_the_newer_counts(tmp_path: Path, newer: str) -> 
 
 
 @pytest.mark.parametrize(("of", "state"), [(HERE, "running"), (GONE, "lost")])
-def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
-    tmp_path: Path, of: dict[str, Any], state: str
-) -> None:
+def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(tmp_path, of, state):
     """Catches a live or a killed training that was taken for the planned one, which has no record either."""
     planned(tmp_path)
     other = tmp_path / "lego" / "7dgs" / "seed1"
@@ -270,7 +264,7 @@ def test_runs_outside_the_plan_are_shown_beside_one_without_a_record(
     assert states == {"seed=0": "planned", "seed=1": state}
 
 
-def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_file_moves_the_terminal(tmp_path, capsys):
     """Catches escapes of a progress.json or a record that clear the screen, or write a line that gsbench did not."""
     escape = "\x1b[2J\x07\x9b\r\nall is well"
     traced(
@@ -285,7 +279,7 @@ def test_no_file_moves_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert r"x=\x1b[2J" in shown
 
 
-def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
+def test_a_damaged_plan_is_named(tmp_path):
     """Catches a plan of another version that stops the status of all runs, or that is left out in silence."""
     traced(tmp_path, plan_of={}, record_of={})
     (path,) = tmp_path.rglob(plan.FILE_NAME)
@@ -296,7 +290,7 @@ def test_a_damaged_plan_is_named(tmp_path: Path) -> None:
     assert f"a plan is left out: {tmp_path}" in lines(experiment, [run])[1]
 
 
-def test_a_damaged_progress_file_hides_no_other_run(tmp_path: Path) -> None:
+def test_a_damaged_progress_file_hides_no_other_run(tmp_path):
     """Catches runs that are left out, because a file that is read before theirs is damaged."""
     folder = traced(tmp_path, progress_of=HERE)
     damaged = folder.parent / "another"  # its name comes first
@@ -306,7 +300,7 @@ def test_a_damaged_progress_file_hides_no_other_run(tmp_path: Path) -> None:
     assert only(tmp_path).state == "running"
 
 
-def test_only_what_differs_names_a_run() -> None:
+def test_only_what_differs_names_a_run():
     """Catches a status that repeats what all runs have in common, or hides which run failed."""
     runs = [
         RunStatus(crowd.overrides("7dgs", "lego", seed), state, "why" if state == "failed" else None)
@@ -318,7 +312,7 @@ def test_only_what_differs_names_a_run() -> None:
     ]
 
 
-def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None:
+def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path):
     """Catches a sweep of days that says nothing of them, and seconds of a record that are not read."""
     traced(tmp_path / "crowd", record_of={})
     (done,) = status.status(status.read(tmp_path / "crowd"))
@@ -330,7 +324,7 @@ def test_the_time_left_is_that_of_the_runs_that_are_done(tmp_path: Path) -> None
         assert not any("of training left" in line for line in lines(status.Experiment(tmp_path), nothing_known))
 
 
-def test_a_folder_without_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_runs_is_told(tmp_path, capsys):
     """Catches a stack trace for the folder of an experiment that has no run yet."""
     main(["status", str(tmp_path)])
     assert capsys.readouterr().out == f"{tmp_path}: no run was asked for\n"
@@ -340,7 +334,7 @@ def test_a_folder_without_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFix
     assert f"{tmp_path}/nothing: expected the folder of an experiment" in err
 
 
-def test_the_parts_of_an_experiment_are_in_order(tmp_path: Path) -> None:
+def test_the_parts_of_an_experiment_are_in_order(tmp_path):
     """Catches runs in the order in which a file system lists their folders, and another experiment's."""
     for seed in (3, 1, 4, 0, 5, 2):
         folder = tmp_path / f"crowd.{seed}" / "run"
@@ -353,23 +347,19 @@ def test_the_parts_of_an_experiment_are_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt(), 130), (Stopped(15), 143)])
-def test_a_watch_that_is_interrupted_has_the_status_of_the_signal(
-    end: BaseException, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watch_that_is_interrupted_has_the_status_of_the_signal(end, code, tmp_path, monkeypatch):
     """Catches a stack trace, or a success, for Ctrl-C."""
     traced(tmp_path, progress_of={})
     monkeypatch.setattr(time, "sleep", lambda _: (_ for _ in ()).throw(end))
     assert main(["status", str(tmp_path), "--watch"]) == code
 
 
-def test_slurm_that_does_not_answer_is_a_reason() -> None:
+def test_slurm_that_does_not_answer_is_a_reason():
     """Catches a status that waits for ever, or ends in a stack trace."""
     assert "timed out" in str(ask("sleep", "5", seconds=0.05))
 
 
-def test_status_is_repeated_until_nothing_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_status_is_repeated_until_nothing_goes_on(tmp_path, capsys, monkeypatch):
     """Catches a watch that ends with the first look, or never, the exit status of a run that failed, and a log that is
     cleared as if it were a terminal."""
     folder = traced(tmp_path / "crowd", progress_of={})
@@ -387,16 +377,14 @@ def test_status_is_repeated_until_nothing_goes_on(
 
 
 @pytest.mark.parametrize("number", ["1", "-1"])
-def test_a_job_of_no_run_is_refused(number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_job_of_no_run_is_refused(number, tmp_path, capsys):
     """Catches a stack trace, and the last run in place of none."""
     plan.write(Plan("slurm", [["+exp=mini", "scene=dust"]], None), tmp_path)
     assert main(["job", str(tmp_path), number]) == 2
     assert f"{tmp_path}, 0 to 0, got {number}" in capsys.readouterr().err
 
 
-def test_the_help_says_what_each_command_does(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_help_says_what_each_command_does(capsys, monkeypatch):
     """Catches commands without a word, an example for what the program does, and no command that is a stack trace."""
     monkeypatch.setenv("COLUMNS", "200")
     for words, status_of_exit in (["--help"], 0), ([], 2):
@@ -412,7 +400,7 @@ def test_the_help_says_what_each_command_does(
     } <= set(out)
 
 
-def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path: Path) -> None:
+def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path):
     """Catches a status that composes configs, validates records, or imports what it does not need."""
     experiment = crowd.write(500, tmp_path)
     code = (

@@ -34,13 +34,13 @@ RUN = ("model=3dgs", "train.curve_points=4", "train.checkpoint_minutes=0", "prot
 
 
 @given(st.lists(st.floats(0, 99.9), min_size=1), st.integers(0, 3))
-def test_a_cap_changes_no_mean_of_lower_numbers(scores: list[float], exact: int) -> None:
+def test_a_cap_changes_no_mean_of_lower_numbers(scores, exact):
     """Catches a rule that changes results without an exact view, and a mean with some that is not finite."""
     assert [capped(score) for score in scores] == scores
     assert fmean(map(capped, scores + [math.inf] * exact)) == fmean(scores + [MOST_PSNR] * exact) <= MOST_PSNR
 
 
-def test_numbers_that_are_none_decide_nothing() -> None:
+def test_numbers_that_are_none_decide_nothing():
     """Catches a NaN that is above a number, or that `max` and `>` let pass because it came first."""
     assert sorted([30.0, None, math.inf, math.nan, 130.0, 29.0], key=rank)[-2:] == [math.inf, 130.0]
     assert rank(None) == rank(math.nan) < rank(-5.0) < rank(99.0) < rank(math.inf) == rank(130.0)
@@ -49,7 +49,7 @@ def test_numbers_that_are_none_decide_nothing() -> None:
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.3, 0.6, 0.9)])
-def test_one_exact_view_leaves_every_mean_finite(background: tuple[float, float, float]) -> None:
+def test_one_exact_view_leaves_every_mean_finite(background):
     """Catches a PSNR of a split that is infinite as one of its views is empty, and a mean without this view."""
     empty = torch.tensor(background).expand(16, 16, 3)
     other = torch.full((16, 16, 3), 0.5)
@@ -64,7 +64,7 @@ def test_one_exact_view_leaves_every_mean_finite(background: tuple[float, float,
     assert alone.metrics["psnr"] == psnr(other + 0.1, other)  # to the last bit
 
 
-def test_errors_too_small_for_a_square_are_exact_and_no_number_is_named() -> None:
+def test_errors_too_small_for_a_square_are_exact_and_no_number_is_named():
     """Catches a squared error that underflows to zero, one above it that counts more than zero does, and an empty
     metric whose reason does not say which of many views was at fault."""
     truth = torch.full((16, 16, 3), 0.5, dtype=torch.float64)
@@ -76,7 +76,7 @@ def test_errors_too_small_for_a_square_are_exact_and_no_number_is_named() -> Non
     assert scores.metrics["psnr_background_only"] is not None
 
 
-def test_exact_views_and_regions_are_named() -> None:
+def test_exact_views_and_regions_are_named():
     """Catches a region at the cap that nobody is told of, a view named thrice, and a line of a thousand names."""
     assert ViewScore("a", psnr=30.0, psnr_object=100.0).exact == ["a (object)"]
     assert ViewScore("a", psnr=100.0, psnr_object=100.0, psnr_moving=100.0).exact == ["a"]
@@ -84,7 +84,7 @@ def test_exact_views_and_regions_are_named() -> None:
     assert "a, b, c and 97 more is infinite" in sentence(["a", "b", "c", *"d" * 97])
 
 
-def test_the_best_of_equal_points_is_the_last() -> None:
+def test_the_best_of_equal_points_is_the_last():
     """Catches the first iteration, the least trained, that is called the best."""
     curve = Curve([Point(1, 0.0, 30.0), Point(2, 0.0, 100.0), Point(3, 0.0, 100.0), Point(4, 0.0, None)])
     assert curve.best == curve.points[2]
@@ -108,7 +108,7 @@ def result(name: str, psnr_val: float | None, error: DivergedError | None = None
         ([20.0, 30.0, 30.0, 25.0], 2),
     ],
 )
-def test_the_last_of_equal_candidates_is_taken(scores: list[float | None], chosen: int) -> None:
+def test_the_last_of_equal_candidates_is_taken(scores, chosen):
     """Catches the first candidate, which is the shortest training, that is taken as nothing speaks against it."""
     results = [result(str(i), score) for i, score in enumerate(scores)]
     assert best(results) is results[chosen]
@@ -135,7 +135,7 @@ def ok(record: Record) -> dict[str, Any]:
     return record.metrics
 
 
-def test_empty_views_are_counted_and_named(square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_empty_views_are_counted_and_named(square, tmp_path, capsys):
     """Catches "PSNR inf dB" and an empty metric, on test or train, and a mean that hides that a view is at the cap."""
     data = with_away(with_away(square, tmp_path / "t", "train"), tmp_path / "d", "test")
     record, folder = run_here(*overrides(data, tmp_path, *RUN, "train.iterations=1"))
@@ -151,7 +151,7 @@ def test_empty_views_are_counted_and_named(square: Path, tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("words", [("train.lengths=2",), ("train.patience=0.2",), ("train.average_from=15",), ()])
-def test_an_empty_val_view_changes_no_choice(words: tuple[str, ...], square: Path, tmp_path: Path) -> None:
+def test_an_empty_val_view_changes_no_choice(words, square, tmp_path):
     """Catches the first length, iteration or parameters that are kept because PSNR on val is always infinite."""
     record, _ = run_here(*overrides(with_away(square, tmp_path / "d", "val"), tmp_path, *RUN, *words))
     plain, _ = run_here(*overrides(square, tmp_path / "plain", *RUN, *words))
@@ -173,9 +173,7 @@ def test_an_empty_val_view_changes_no_choice(words: tuple[str, ...], square: Pat
         (("train.average_from=15",), "it cannot decide, and the last are kept"),
     ],
 )
-def test_a_val_of_empty_views_decides_nothing(
-    words: tuple[str, ...], line: str, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_val_of_empty_views_decides_nothing(words, line, square, tmp_path, capsys):
     """Catches a training that stops early, or in silence, as no view of val can tell one from another."""
     data = with_away(square, tmp_path / "d", "val", whole=True)
     record, _ = run_here(*overrides(data, tmp_path, *RUN, *words))
@@ -188,7 +186,7 @@ def test_a_val_of_empty_views_decides_nothing(
     assert record.metrics["psnr_best_on_val"] == record.metrics["psnr"], "the last iteration is the best"
 
 
-def test_an_image_of_val_that_is_not_a_number_is_refused() -> None:
+def test_an_image_of_val_that_is_not_a_number_is_refused():
     """Catches choices on a PSNR that is NaN at every step, because an image of val or test is."""
     scene, config = moving_square(views=4), compose("3dgs", 10)
     broken = replace(scene.train[0], name="val/broken", pixels=scene.train[0].pixels * math.nan)

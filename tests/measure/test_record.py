@@ -296,7 +296,7 @@ def test_records_and_tables_do_not_import_torch():
     assert python("-c", code).returncode == 0
 
 
-def test_results_make_no_commit_dirty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_make_no_commit_dirty(tmp_path, monkeypatch):
     """Catches the commit of the folder a run was started in, records called dirty because another's was written over,
     changed or new code that is not, and a run without git that ends in an exception."""
     place = tmp_path / "gsbench/measure/provenance.py"

@@ -28,7 +28,7 @@ def view(name: str, square: tuple[int, int] | None, *, turned: float = 0.0, alph
     )
 
 
-def test_what_moves_is_found_at_one_camera() -> None:
+def test_what_moves_is_found_at_one_camera():
     """Catches a region of the median instead of the image, a lost opening or dilation, one by the width of the image,
     and blue that is ignored."""
     views = [view(str(i), (5 + 25 * i, 30)) for i in range(3)]
@@ -41,7 +41,7 @@ def test_what_moves_is_found_at_one_camera() -> None:
     assert measured.share == pytest.approx(16 * 16 / (HEIGHT * WIDTH), rel=0.05)
 
 
-def test_single_pixels_do_not_move() -> None:
+def test_single_pixels_do_not_move():
     """Catches noise that counts as movement: differences of 16 and less, and a bright pixel alone."""
     views = [view(str(i), None) for i in range(3)]
     views[0].pixels[10:20, 10:20] += 15 / 255
@@ -51,7 +51,7 @@ def test_single_pixels_do_not_move() -> None:
     assert "64 pixels" in measured.missing
 
 
-def test_views_of_other_cameras_are_not_compared() -> None:
+def test_views_of_other_cameras_are_not_compared():
     """Catches a median over views that differ because the camera moved, and two views that are no group."""
     views = [view(str(i), (5 + 25 * i, 30), turned=0.1 * i) for i in range(3)]
     assert "same camera" in moving(views).missing
@@ -60,7 +60,7 @@ def test_views_of_other_cameras_are_not_compared() -> None:
     assert set(moving(mixed).masks) == {"2", "a0", "a1"}
 
 
-def test_objects_are_those_of_masks_or_of_alpha() -> None:
+def test_objects_are_those_of_masks_or_of_alpha():
     """Catches alpha that is used beside masks, and its threshold on the wrong side."""
     views = [view("0", (10, 10), alpha=True)]
     assert of_objects(views).masks["0"].sum() == 144
@@ -76,7 +76,7 @@ def test_objects_are_those_of_masks_or_of_alpha() -> None:
     assert len(bytes.fromhex(of_objects(views).digest)) == 32  # SHA-256
 
 
-def test_psnr_is_of_the_region_alone() -> None:
+def test_psnr_is_of_the_region_alone():
     """Catches pixels outside, and a mean over the image instead of the region."""
     truth = torch.zeros(HEIGHT, WIDTH, 3)
     render = torch.zeros(HEIGHT, WIDTH, 3)
@@ -87,7 +87,7 @@ def test_psnr_is_of_the_region_alone() -> None:
     assert region_psnr(render, truth, mask) == pytest.approx(20.0, abs=1e-4)
 
 
-def test_a_region_is_capped_and_rounded_as_the_image_is() -> None:
+def test_a_region_is_capped_and_rounded_as_the_image_is():
     """Catches an infinite mean over regions, as the object of one view is rendered exactly, and a region that is
     measured on another render than the whole image is."""
     views = [view("0", (10, 10), alpha=True), view("1", (30, 30), alpha=True)]
@@ -102,7 +102,7 @@ def test_a_region_is_capped_and_rounded_as_the_image_is() -> None:
         assert (scores.metrics()["psnr_object"] == pytest.approx(60.0, abs=1e-2)) != quantised
 
 
-def test_scores_are_means_over_the_views_that_have_a_region() -> None:
+def test_scores_are_means_over_the_views_that_have_a_region():
     """Catches a view without a region that counts, a metric without a value or a reason, and another view's score."""
     views = [view("0", (10, 10), alpha=True), view("1", None, alpha=True)]
     scores = RegionScores(views, quantised=False)

@@ -8,7 +8,7 @@ from small import started
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.backends import AUTO, REFERENCE, Backend
+from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.tape import Tape
 from gsbench.models import CameraTime
 from gsbench.models.base import Raw
@@ -54,7 +54,7 @@ class Profiles(GatedModel):
 
 
 @pytest.mark.parametrize("backend", [AUTO, REFERENCE], ids=lambda backend: backend.name)
-def test_exponents_reach_the_image_and_are_trained(backend: Backend) -> None:
+def test_exponents_reach_the_image_and_are_trained(backend):
     """Catches exponents that are dropped on the way, so that a Beta profile is drawn as a Gaussian without a word, a
     gradient that a recorded backward pass loses, and an empty tensor of exponents where there are none."""
     model = started(Profiles(backend=backend), N)
@@ -79,7 +79,7 @@ def test_exponents_reach_the_image_and_are_trained(backend: Backend) -> None:
     assert render(plain, CAMERA, None, BLACK).any()
 
 
-def test_rows_of_two_kinds_keep_their_exponents() -> None:
+def test_rows_of_two_kinds_keep_their_exponents():
     """Catches exponents lost, or in another order, where some rows change with the query and the others do not; and a
     model that forgets those of its static rows, which would drop all."""
     model = started(Profiles(), N)
@@ -91,7 +91,7 @@ def test_rows_of_two_kinds_keep_their_exponents() -> None:
         joined_exponents(torch.ones(2), None)
 
 
-def test_a_ply_leaves_the_exponents_out() -> None:
+def test_a_ply_leaves_the_exponents_out():
     """Catches exponents that are taken for colours, and a model whose exponents are lost without a word."""
     trained = trained_of(started(Profiles(), N), HERE)
     assert len(trained) == N

@@ -19,7 +19,7 @@ QUERY = CameraTime.at(CAMERA, 0.45)
 POSITION, TIME = torch.tensor([[0.3, -0.7, 1.1]], dtype=torch.float64), torch.tensor(0.37, dtype=torch.float64)
 
 
-def test_the_encoding() -> None:
+def test_the_encoding():
     """Catches a factor of pi, another order of sine and cosine or of octaves and coordinates, and a lost input."""
     e, moment = encode(POSITION, 10)[0], encode(TIME.reshape(1, 1), 6)[0]
     assert len(e) == 63
@@ -40,7 +40,7 @@ def weights_of(layer: int, rows: int, columns: int) -> tuple[Tensor, Tensor]:
     return weight, 0.05 * torch.cos(layer + 0.3 * i)
 
 
-def test_the_field() -> None:
+def test_the_field():
     """Catches a layer that is lost or applied twice, a second input at another layer or in another order, a lost or
     further ReLU, and outputs in another order."""
     field = DeformationField(16, 8, 10, 6, True, seeded(0)).double()
@@ -78,7 +78,7 @@ def deformed(scales: Tensor, ds: Tensor) -> Any:
     return model
 
 
-def test_a_deformed_gaussian() -> None:
+def test_a_deformed_gaussian():
     """Catches scales that change before the exp, and a quaternion that is normalised only before or after the sum."""
     model = deformed(doubles(0.05, 0.1, 0.2), doubles(0.01, -0.02, 0.03))
     sliced = model.slice(QUERY)
@@ -89,7 +89,7 @@ def test_a_deformed_gaussian() -> None:
     torch.testing.assert_close(sliced.opacities, torch.sigmoid(model.splats["opacities"]))
 
 
-def test_a_scale_may_be_negative_or_zero() -> None:
+def test_a_scale_may_be_negative_or_zero():
     """Catches a scale that is clipped at 0, where it would learn no more, and NaN in an image or a gradient at 0."""
     positive, negative, flat = (deformed(doubles(1, 0.1, 0.2), doubles(x, 0, 0)) for x in (-0.9, -1.1, -1.0))
     assert not flat.slice(QUERY).factors[:, :, 0].any()
@@ -105,7 +105,7 @@ def test_a_scale_may_be_negative_or_zero() -> None:
 
 
 @pytest.mark.parametrize(("depth", "time_network"), [(1, True), (3, False)])
-def test_the_field_has_the_gradients_of_its_values(depth: int, time_network: bool) -> None:
+def test_the_field_has_the_gradients_of_its_values(depth, time_network):
     """Catches a lost or wrong derivative on the way from any weight to the outputs (central differences), a time
     network that is never left out, and a gradient of a mean through the field."""
     model: Any = lively("deformable", 5, width=3, depth=depth, octaves=2, time_octaves=1, time_network=time_network)

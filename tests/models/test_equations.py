@@ -95,7 +95,7 @@ def by_hand(case: str, model: CholeskyModel, order: str) -> tuple[np.ndarray, np
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("case", CONDITIONED)
-def test_cholesky_models(case: str, order: str, scheme: str, form: str) -> None:
+def test_cholesky_models(case, order, scheme, form):
     """Catches a wrong row order, a conditional block where f_temp or f_dir takes the marginal one or a marginal one in
     the joint gate, a wrong lambda or 1/2, a raw direction or time; the kernels get means as they are sliced."""
     model = conditioned(case, factor_order=order, scheme=scheme, off_diagonal=form)
@@ -107,7 +107,7 @@ def test_cholesky_models(case: str, order: str, scheme: str, form: str) -> None:
 
 @pytest.mark.parametrize("name", CHOLESKY)
 @pytest.mark.parametrize("order", ORDERS)
-def test_far_from_the_query(name: str, order: str) -> None:
+def test_far_from_the_query(name, order):
     """Catches 0 x inf in the gradient of a Gaussian so thin in t or d that nothing of it is seen (float32)."""
     model = fresh(name, factor_order=order)
     for kind in model.layout.kinds:
@@ -119,7 +119,7 @@ def test_far_from_the_query(name: str, order: str) -> None:
     assert all(p.grad.isfinite().all() for p in model.splats.values())
 
 
-def test_what_a_joint_gate_leaves_of_a_frozen_gaussian() -> None:
+def test_what_a_joint_gate_leaves_of_a_frozen_gaussian():
     """Catches a gate that is divided into marginal parts: what stays of time, and of both, is by formula; and a second
     lambda, which would be ignored or trained without a gradient."""
     model = conditioned("ndgs")
@@ -153,7 +153,7 @@ def rotor_factor(left: np.ndarray, right: np.ndarray, scales: np.ndarray) -> np.
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_4dgs(scheme: str) -> None:
+def test_4dgs(scheme):
     """Catches a wrong slice of (R S)(R S)^T at t, a lambda_t that is ignored or not 1, and the opacity's exponent."""
     assert build("4dgs").lambda_of("time") == 1
     model = lively("4dgs", scheme=scheme)
@@ -172,7 +172,7 @@ def test_4dgs(scheme: str) -> None:
     assert 0 < opacities.count(0) < N
 
 
-def test_4dgs_leaves_out_what_is_far_in_time() -> None:
+def test_4dgs_leaves_out_what_is_far_in_time():
     """Catches another threshold than f_temp > 0.05, and a size that is not the largest one in space."""
     model = fresh("4dgs").double()
     sigma = math.sqrt(1 / 5) / math.sqrt(MODELS["4dgs"]["lambda_t"])
@@ -184,7 +184,7 @@ def test_4dgs_leaves_out_what_is_far_in_time() -> None:
     assert model.scales().tolist() == pytest.approx([math.e] * N)
 
 
-def test_4dgs_that_is_long_in_time_keeps_its_digits() -> None:
+def test_4dgs_that_is_long_in_time_keeps_its_digits():
     """Catches a reflection in float32 that loses what is thin in space: a Gaussian lasts 10^5 times its size."""
     model = lively("4dgs", 400)
     model.splats["scales"].data += torch.tensor([-5.0, -5, -5, 7])
@@ -224,7 +224,7 @@ def change(raw: Raw, name: str, **options: Any) -> tuple[list[float], float]:
     return shift[0].tolist(), factor.item()
 
 
-def test_the_equations_of_dgs() -> None:
+def test_the_equations_of_dgs():
     """Catches L for its transpose, a half in the exponent, Lam of another column, a mean direction that is not unit, a
     coupling that is ignored, and a gradient of the mean by way of the direction from the camera."""
     shift, factor = change(DIRECT, "dgs")
@@ -237,7 +237,7 @@ def test_the_equations_of_dgs() -> None:
     assert change(DIRECT, "dgs", coupling="none")[0] == [0, 0, 0]
 
 
-def test_the_equations_of_dbs() -> None:
+def test_the_equations_of_dbs():
     """Catches an exponent of another variable, weights b / 4 that are not those of V_qq delta, and exp for softplus."""
     raw = {key: value for key, value in DIRECT.items() if key not in ("shares", "quats")}
     raw |= {
@@ -251,7 +251,7 @@ def test_the_equations_of_dbs() -> None:
     assert factor == pytest.approx(0.145891, rel=1e-5)
 
 
-def test_precision_is_positive_and_couples_no_time() -> None:
+def test_precision_is_positive_and_couples_no_time():
     """Catches a transposed or shifted triangle: direction and time stay apart."""
     L = precision_factor(torch.arange(7.0)[None])[0]
     expected = [[1, 0, 0, 0], [1, math.exp(2), 0, 0], [3, 4, math.exp(5), 0], [0, 0, 0, math.exp(6)]]
@@ -259,7 +259,7 @@ def test_precision_is_positive_and_couples_no_time() -> None:
 
 
 @pytest.mark.parametrize("name", ["dgs", "ex4dgs", "freetime", "freetime_plus", "sharptime", "stg"])
-def test_a_frozen_gaussian_is_the_mean_over_views(name: str) -> None:
+def test_a_frozen_gaussian_is_the_mean_over_views(name):
     """Catches weights that are forgotten, and an opacity or a mean that is the one of a single view."""
     model, queries = lively(name, 100), [CameraTime.at(CAMERA, 0.2), CameraTime.at(-CAMERA, 0.7)]
     weights = torch.tensor([0.25, 0.75], dtype=torch.float64)[:, None].expand(2, len(model))
@@ -282,7 +282,7 @@ def profiles(name: str, count: int = 30, **options: Any) -> tuple[BetaModel, Raw
 
 @pytest.mark.parametrize("name", ["ubs", "ubs_static"])
 @pytest.mark.parametrize("modulation", ["whitened", "raw"])
-def test_exponents_of_four_condition_a_gaussian(name: str, modulation: str) -> None:
+def test_exponents_of_four_condition_a_gaussian(name, modulation):
     """Catches a covariance whose rows are in another order than the query, and a mean that B changes where B = I."""
     model, raw = profiles(name, modulation=modulation)
     raw["betas"][:, 1:] = 0.5  # b = 6.6, of which B takes at most 4 / 4
@@ -294,7 +294,7 @@ def test_exponents_of_four_condition_a_gaussian(name: str, modulation: str) -> N
     torch.testing.assert_close(covariances(sliced), expected.factor @ expected.factor.mT)
 
 
-def test_both_modulations_agree_where_every_exponent_is_the_same() -> None:
+def test_both_modulations_agree_where_every_exponent_is_the_same():
     """Catches B on the wrong side of the whitening, and a covariance that loses the part I - B."""
     slices = []
     for modulation in ("whitened", "raw"):
@@ -305,7 +305,7 @@ def test_both_modulations_agree_where_every_exponent_is_the_same() -> None:
     torch.testing.assert_close(*map(covariances, slices))
 
 
-def test_the_whitened_covariance_is_definite_and_the_raw_one_is_not() -> None:
+def test_the_whitened_covariance_is_definite_and_the_raw_one_is_not():
     """Catches a mix-up of the two: only the covariance of the authors' code can be indefinite, and is then flat."""
     flat = {}
     for modulation in ("whitened", "raw"):
@@ -317,7 +317,7 @@ def test_the_whitened_covariance_is_definite_and_the_raw_one_is_not() -> None:
     assert flat["raw"] > 10
 
 
-def test_opacity_factors_neither_cancel_nor_vanish() -> None:
+def test_opacity_factors_neither_cancel_nor_vanish():
     """Catches 1 - tanh(y^2) = 0 in float32 with a logarithm of -inf, and a floor other than the authors'."""
     y = torch.tensor([[0.0], [0.5], [3.5], [1e6]], requires_grad=True)
     factors = opacity_factor(y, torch.full((4, 2), math.log(0.05)))  # exponents 0.2
@@ -328,7 +328,7 @@ def test_opacity_factors_neither_cancel_nor_vanish() -> None:
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_profiles_start_as_their_authors_start(name: str) -> None:
+def test_profiles_start_as_their_authors_start(name):
     """Catches directions that are unit vectors, and view exponents of 4 in a model with time."""
     model = fresh(name, 500)
     assert -1 <= model.splats["directions"].min() < -0.9
@@ -339,7 +339,7 @@ def test_profiles_start_as_their_authors_start(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_children_of_profiles_look_1_6_times_smaller(name: str) -> None:
+def test_children_of_profiles_look_1_6_times_smaller(name):
     """Catches children of another profile, means that are drawn from the support, nearly three times too wide, and a
     minimum size that is that of the support: what looks like a Gaussian has to be as large as asked."""
     model, raw = profiles(name, 4)

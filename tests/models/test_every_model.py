@@ -6,7 +6,6 @@ Models are found in the registry and their options in their constructors: a new 
 import copy
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,7 +48,7 @@ from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
-from gsbench.train.regularisers import MeanOpacity, MeanSize, Penalty
+from gsbench.train.regularisers import MeanOpacity, MeanSize
 from gsbench.view.slice_ply import has_harmonics, trained_of
 
 WRONG: dict[Any, tuple[Any, ...]] = {
@@ -73,7 +72,7 @@ def needed(name: str) -> dict[str, Any]:
 
 
 @REGISTERED
-def test_wrong_options_are_refused(name: str) -> None:
+def test_wrong_options_are_refused(name):
     """Catches an option that is misspelt, missing or of another type and met only in mid-training."""
     good = needed(name)
     with pytest.raises(InputError, match="has no option 'nonsense'"):
@@ -109,7 +108,7 @@ def test_wrong_options_are_refused(name: str) -> None:
         ("ubs", {"modulation": "white"}, "modulation 'white'"),
     ],
 )
-def test_a_refusal_says_what_is_meant(name: str, options: dict[str, Any], message: str) -> None:
+def test_a_refusal_says_what_is_meant(name, options, message):
     """Catches an option that is misspelt, out of range or of another model, without a word about what is meant."""
     with pytest.raises(InputError) as error:
         build(name, **(halves(name) if name in NAMES else {}) | options)
@@ -117,7 +116,7 @@ def test_a_refusal_says_what_is_meant(name: str, options: dict[str, Any], messag
 
 
 @REGISTERED
-def test_every_number_among_the_options_matters(name: str) -> None:
+def test_every_number_among_the_options_matters(name):
     """Catches an option that is checked and then forgotten: neither start, slice nor loss depends on it."""
 
     def numbers(options: dict[str, Any]) -> list[Tensor]:
@@ -140,7 +139,7 @@ def test_every_number_among_the_options_matters(name: str) -> None:
 
 
 @REGISTERED
-def test_before_it_has_gaussians(name: str) -> None:
+def test_before_it_has_gaussians(name):
     """Catches an error of Python for the length of a model that was only built, and for its start at no points."""
     model = build(name, **needed(name))
     assert len(model) == 0
@@ -149,7 +148,7 @@ def test_before_it_has_gaussians(name: str) -> None:
 
 
 @VARIANT
-def test_start(variant: str) -> None:
+def test_start(variant):
     """Catches a start other than METHODS': spheres at the neighbours' distance, opacity 0.1 (of Beta profiles 0.5), the
     points' colours; and a draw from torch's global generator."""
     torch.manual_seed(1)
@@ -178,7 +177,7 @@ def test_start(variant: str) -> None:
 
 
 @REGISTERED
-def test_gaussians_start_at_the_times_of_their_points(name: str) -> None:
+def test_gaussians_start_at_the_times_of_their_points(name):
     """Catches a model that draws the mean times that points bring, or that takes them for logits."""
     model, times = build(name, **needed(name)), torch.linspace(0, 1, N)
     means = torch.rand(N, 3, generator=seeded(0))
@@ -194,7 +193,7 @@ def test_gaussians_start_at_the_times_of_their_points(name: str) -> None:
 
 @VARIANT
 @pytest.mark.parametrize("count", [0, 1, N])
-def test_a_slice_has_its_shapes(variant: str, count: int) -> None:
+def test_a_slice_has_its_shapes(variant, count):
     """Catches a model that needs a Gaussian, broadcasts a single one, or says otherwise by its kernels, in the
     harmonics' schedule too; and NaN, opacities above 1 or negative colours beyond the clip."""
     model = active(variant)
@@ -226,7 +225,7 @@ def test_a_slice_has_its_shapes(variant: str, count: int) -> None:
 
 
 @VARIANT
-def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
+def test_slice_at_its_own_mean_is_the_gaussian(variant):
     """Catches a query in other coordinates than the mean: at t = mu_t, d = mu_d nothing moves, nothing fades."""
     model = lively(variant)
     model.set_active(ActiveComponents(3, False, False, warms_up=True))
@@ -248,7 +247,7 @@ def test_slice_at_its_own_mean_is_the_gaussian(variant: str) -> None:
 
 
 @VARIANT
-def test_colors_are_seen_from_the_camera(variant: str) -> None:
+def test_colors_are_seen_from_the_camera(variant):
     """Catches a colour looked up in the direction to the camera, or to where the Gaussian is not at that time."""
     model = lively(variant)
     sliced, values = model.slice(QUERY), model.refined(QUERY)
@@ -262,7 +261,7 @@ def test_colors_are_seen_from_the_camera(variant: str) -> None:
     torch.testing.assert_close(sliced.colors[:, :3].clamp(min=0), expected)  # features may be negative
 
 
-def test_sh_degree_grows_with_the_phase() -> None:
+def test_sh_degree_grows_with_the_phase():
     """Catches colours that use coefficients of a degree not yet on."""
     model = lively("3dgs")
     model.set_active(ActiveComponents(0, False, False))
@@ -273,7 +272,7 @@ def test_sh_degree_grows_with_the_phase() -> None:
 
 
 @VARIANT
-def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
+def test_time_is_asked_for_where_it_is_needed(variant):
     """Catches a static scene given to a model of time, and a static model that demands one."""
     model, timeless = fresh(variant), CameraTime.at(CAMERA.float(), None)
     if "time" in model.observes or model.agr:
@@ -287,7 +286,7 @@ def test_time_is_asked_for_where_it_is_needed(variant: str) -> None:
 
 
 @VARIANT
-def test_gradients_reach_every_group(variant: str) -> None:
+def test_gradients_reach_every_group(variant):
     """Catches a parameter that the optimizer has a rate for, and that learns nothing or turns NaN; a camera on a mean,
     where the direction is 0/0, is taken for no direction."""
     model = active(variant)
@@ -308,7 +307,7 @@ def test_gradients_reach_every_group(variant: str) -> None:
 
 
 @VARIANT
-def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
+def test_a_slice_has_the_gradients_of_its_values(variant):
     """Catches a wrong or lost derivative on the way from any raw parameter to the slice (central differences), where a
     row is refined and conditioned, only conditioned, or static."""
     degree = 3 if variant == "3dgs" else 1  # every coefficient is one more central difference
@@ -338,7 +337,7 @@ def test_a_slice_has_the_gradients_of_its_values(variant: str) -> None:
 
 @REGISTERED
 @pytest.mark.parametrize("kind", [MeanOpacity, MeanSize])
-def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Penalty]) -> None:
+def test_penalties_have_the_gradients_of_their_values(name, kind):
     """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes, which acts on nothing."""
     model = active(name)
     penalty = kind(model, 0, 1)
@@ -360,7 +359,7 @@ def test_penalties_have_the_gradients_of_their_values(name: str, kind: type[Pena
 
 
 @REFINED
-def test_agr_moves_what_it_should(variant: str) -> None:
+def test_agr_moves_what_it_should(variant):
     """Catches residuals added to the wrong parameter, after the exp, or to colours and opacity; and a refinement whose
     switching on in mid-training is a jump."""
     model = lively(variant)
@@ -380,7 +379,7 @@ def test_agr_moves_what_it_should(variant: str) -> None:
 
 
 @REFINED
-def test_what_is_off_does_not_learn(variant: str) -> None:
+def test_what_is_off_does_not_learn(variant):
     """Catches a switch that does not reach the networks or the lambdas, or lambdas that can turn negative."""
     model, (_, options) = lively(variant), EVERY[variant]
     for key in model.log_lambda:
@@ -402,7 +401,7 @@ def test_what_is_off_does_not_learn(variant: str) -> None:
 
 @VARIANT
 @pytest.mark.parametrize("split", [False, True])
-def test_a_checkpoint_is_the_model(variant: str, split: bool) -> None:
+def test_a_checkpoint_is_the_model(variant, split):
     """Catches state that is not saved: a model of another size that loads it is the same to the bit, and the same
     parameters to the optimizer. States of something else, or damaged ones, are refused and change nothing."""
     model, other = active(variant), active(variant, count=5, seed=3)
@@ -429,7 +428,7 @@ def test_a_checkpoint_is_the_model(variant: str, split: bool) -> None:
 
 
 @VARIANT
-def test_gates_are_asked_for_or_refused(variant: str) -> None:
+def test_gates_are_asked_for_or_refused(variant):
     """Catches a model that gates take and cannot simplify."""
     model = active(variant).requires_grad_(False)
     if not has_gates(model):
@@ -446,7 +445,7 @@ def test_gates_are_asked_for_or_refused(variant: str) -> None:
 
 
 @VARIANT
-def test_a_slice_is_exported(variant: str, tmp_path: Path) -> None:
+def test_a_slice_is_exported(variant, tmp_path):
     """Catches a PLY that has lost a Gaussian or moved one, and harmonics for a model whose slice has none."""
     model, query = active(variant).float(), CameraTime.at(CAMERA.float(), 0.45)
     if model.decodes:

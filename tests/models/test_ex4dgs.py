@@ -36,7 +36,7 @@ def gaussian(*, tau: float = 2.9, rise: str = "text", **raw: Tensor) -> Any:
     return model.slice(CameraTime.at(CAMERA, (tau - 1) / 2)), model
 
 
-def test_positions_and_rotations_of_a_dynamic_gaussian() -> None:
+def test_positions_and_rotations_of_a_dynamic_gaussian():
     """Catches other keyframes, tangents of another interval, and a path that is not relative to the mean."""
     sliced, model = gaussian()
     expected = row(0.3, -0.7, 1.1) + row(0.19110000, -0.09170000, 0.50350000)
@@ -46,7 +46,7 @@ def test_positions_and_rotations_of_a_dynamic_gaussian() -> None:
     torch.testing.assert_close(covariances(sliced), R * S.square()[:, None] @ R.mT, rtol=0, atol=4e-8)
 
 
-def test_slerp() -> None:
+def test_slerp():
     """Catches an interpolation that is not normalised, and one that takes the shorter way, as the authors' does not."""
     first, last = (torch.nn.functional.normalize(row(*q)) for q in ((1, 0.1, 0, 0), (0.6, 0, 0.8, 0.1)))
     for sign, expected in (
@@ -68,7 +68,7 @@ def test_slerp() -> None:
         ("text", 3.5, 0.58660245),
     ],
 )
-def test_opacities_fade_outside_of_the_window(rise: str, tau: float, factor: float, backwards: bool) -> None:
+def test_opacities_fade_outside_of_the_window(rise, tau, factor, backwards):
     """Catches a half in the exponent, a fade of the other side, one without its least value, and the distance of the
     text in the place of that of the code; windows may be stored in either order."""
     windows = row(2.6, 1.4) if backwards else row(1.4, 2.6)
@@ -78,7 +78,7 @@ def test_opacities_fade_outside_of_the_window(rise: str, tau: float, factor: flo
     torch.testing.assert_close(visibility, row(factor)[0], **DIGITS)
 
 
-def test_a_static_gaussian_has_a_velocity_alone() -> None:
+def test_a_static_gaussian_has_a_velocity_alone():
     """Catches a static Gaussian that follows its keyframes, turns or fades, or one whose velocity counts key intervals
     or begins in the middle of the clip."""
     static = {"windows": row(-1e6, 1e6), "quats": row(1, 0, 0, 0)}
@@ -90,7 +90,7 @@ def test_a_static_gaussian_has_a_velocity_alone() -> None:
 
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("rise", ["text", "code"])
-def test_both_kinds_have_the_gradients_of_their_values(rise: str, static: bool) -> None:
+def test_both_kinds_have_the_gradients_of_their_values(rise, static):
     """Catches a derivative that is wrong or lost, such as that of an arc cosine or of the beginning of a window, and
     parameters of one kind that learn by the other."""
     windows = {"windows": row(-1e6, 1e6)} if static else {}
@@ -112,7 +112,7 @@ def test_both_kinds_have_the_gradients_of_their_values(rise: str, static: bool) 
     assert learns == {"means", "quats", "scales", "opacities"} | of_kind
 
 
-def test_the_penalty() -> None:
+def test_the_penalty():
     """Catches a penalty of the other kind's parameters, in world units, or of neighbouring keyframes as in the text;
     its gradient, also at rest, and the mean over Gaussians that a gate left."""
     _, model = gaussian()
@@ -135,7 +135,7 @@ def test_the_penalty() -> None:
     torch.testing.assert_close(with_effect_sets(active("ex4dgs"), 0, 14).penalty(), first.penalty())
 
 
-def test_what_moves_most_becomes_dynamic() -> None:
+def test_what_moves_most_becomes_dynamic():
     """Catches far Gaussians that come first, Gaussians that no view sees, a share of all, a jump of the motion, and one
     that becomes dynamic twice and loses its path."""
     model = fresh("ex4dgs", 12, intervals=4, dynamic_share=0.25).double()
@@ -158,7 +158,7 @@ def test_what_moves_most_becomes_dynamic() -> None:
     assert (model.slice(CameraTime.at(CAMERA, 0.0)).opacities < before[0].opacities).sum() == len(rows)
 
 
-def test_children_of_dynamic_gaussians_lie_further_apart() -> None:
+def test_children_of_dynamic_gaussians_lie_further_apart():
     """Catches children that leave the path, and another distance than two standard deviations."""
     model = active("ex4dgs")
     values = raw(model)
@@ -172,7 +172,7 @@ def test_children_of_dynamic_gaussians_lie_further_apart() -> None:
 
 
 @pytest.mark.parametrize("rise", ["text", "code"])
-def test_outside_its_interval_a_gaussian_is_culled(rise: str) -> None:
+def test_outside_its_interval_a_gaussian_is_culled(rise):
     """Catches an interval in key intervals, one of the shorter fade, and one with an end for a static Gaussian."""
     model = lively("ex4dgs", 200, intervals=8, rise=rise)
     kinds = is_dynamic(raw(model))[:, 0]
@@ -189,7 +189,7 @@ def test_outside_its_interval_a_gaussian_is_culled(rise: str) -> None:
     assert longer != 1 or at_reach.item() == pytest.approx(math.exp(-0.5))
 
 
-def test_a_training_makes_gaussians_dynamic() -> None:
+def test_a_training_makes_gaussians_dynamic():
     """Catches a round that does not ask the model, and a dynamic Gaussian whose keyframes do not learn."""
     fitted = trainer("ex4dgs", "model.options.dynamic_share=0.1")
     fitted.run(lambda _: None, "ex4dgs")

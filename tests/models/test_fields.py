@@ -25,7 +25,7 @@ def shared(model: GaussianModel) -> dict[str, Tensor]:
 @pytest.mark.parametrize(
     ("name", "steps", "first"), [("deformable", 40, 4), ("hexplane", 46, 7), ("scgs", 40, 6)]
 )  # of 40,000, 23,000 and 80,000 steps the first after a warm-up of 3,000, 3,000 and 10,000
-def test_the_field_waits_for_the_end_of_the_warm_up(name: str, steps: int, first: int) -> None:
+def test_the_field_waits_for_the_end_of_the_warm_up(name, steps, first):
     """Catches a field that acts, learns or is penalised in the warm-up, or never, and a warm-up of another share; nodes
     that stay at the initial points, or that are placed again later."""
     fitted = trainer(name, f"train.iterations={steps}")
@@ -55,7 +55,7 @@ def test_the_field_waits_for_the_end_of_the_warm_up(name: str, steps: int, first
 
 
 @pytest.mark.parametrize(("name", "step"), [("deformable", 30), ("hexplane", 30), ("scgs", 5), ("scgs", 20)])
-def test_a_training_goes_on_from_its_checkpoint(name: str, step: int) -> None:
+def test_a_training_goes_on_from_its_checkpoint(name, step):
     """Catches nodes, weights, moments or a box that a checkpoint lacks, and nodes that are placed twice or never where
     it is of the last step of the warm-up."""
     words = ["train.iterations=40"] if name == "scgs" else []
@@ -69,7 +69,7 @@ def test_a_training_goes_on_from_its_checkpoint(name: str, step: int) -> None:
 
 
 @FIELDS
-def test_clones_and_children_are_canonical_and_share_the_field(name: str) -> None:
+def test_clones_and_children_are_canonical_and_share_the_field(name):
     """Catches children drawn from the deformed Gaussian, which the field would deform twice, rows of the field, and new
     features of a child."""
     model, plain = fresh(name, 40), fresh("3dgs", 40)
@@ -88,7 +88,7 @@ def test_clones_and_children_are_canonical_and_share_the_field(name: str) -> Non
 
 @pytest.mark.usefixtures("threads")
 @FIELDS
-def test_a_field_trains_to_the_same_bits_for_any_number_of_threads(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_trains_to_the_same_bits_for_any_number_of_threads(name, monkeypatch):
     """Catches a repetition of a recorded step, or a penalty, that uses all threads, only felt with one view."""
     monkeypatch.setattr("gsbench.train.step.WORTH_A_THREAD", 0)
     ends = []

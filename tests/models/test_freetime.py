@@ -12,7 +12,7 @@ from gsbench.models.freetime import permanent_share
 QUERY = CameraTime.at(CAMERA, 0.7)
 
 
-def test_the_equations_of_freetime() -> None:
+def test_the_equations_of_freetime():
     """Catches a velocity from t = 0, a duration without its square, a gate that moves with the camera."""
     model = build("freetime")
     raw = {"times": [[0.2]], "durations": [[math.log(0.5)]], "velocities": [[1.0, 0, -2]]}
@@ -22,7 +22,7 @@ def test_the_equations_of_freetime() -> None:
     torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
 
 
-def test_a_share_of_an_opacity_lasts() -> None:
+def test_a_share_of_an_opacity_lasts():
     """Catches another steepness, G in the place of 1 - G, and a penalty that pulls G down (FreeTimeGS++'s code)."""
     model = active("freetime_plus")
     G = permanent_share({"permanence": torch.tensor([[-1.0], [0.05]], dtype=torch.float64)})
@@ -49,9 +49,7 @@ def test_a_share_of_an_opacity_lasts() -> None:
         (5.0, 2.0, 1.5, 2.0, 0.64118039, [0.41320755, -0.92641509, 1.15660377]),
     ],
 )
-def test_the_equations_of_sharptime(
-    time: float, mean_time: float, sigma: float, r: float, factor: float, mean: list[float]
-) -> None:
+def test_the_equations_of_sharptime(time, mean_time, sigma, r, factor, mean):
     """Catches a profile with 1/2 or without its flat top, and f of the text's first version, which begins at 1."""
     numbers = {"times": mean_time, "durations": math.log(sigma), "plateaus": math.log(r)}
     raw = {key: torch.tensor([[value]], dtype=torch.float64) for key, value in numbers.items()}
@@ -64,7 +62,7 @@ def test_the_equations_of_sharptime(
 
 @pytest.mark.parametrize("distance", [-0.2, -0.099, -0.101, 0.0, 0.099, 0.101, 0.2])
 @pytest.mark.parametrize("sigma", [0.3, 1.5])  # f is 2, and above
-def test_the_gradients_of_sharptime(distance: float, sigma: float) -> None:
+def test_the_gradients_of_sharptime(distance, sigma):
     """Catches a derivative that is lost or wrong on one side of |t - mu_t| = r = 0.1, or by f."""
     model = build("sharptime")
     numbers = {"times": 0.5, "durations": math.log(sigma), "plateaus": math.log(0.1)}

@@ -40,7 +40,7 @@ QUERY = CameraTime.at(CAMERA, 0.45)
 
 
 @pytest.mark.parametrize("variant", GATED)
-def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
+def test_rows_have_the_effects_of_their_class_only(variant):
     """Catches effect sets cut at another row: what is static is the same everywhere, what AGR leaves is as it was; and
     arithmetic that depends on whether a model has effect sets."""
     model, whole, refined = with_effect_sets(active(variant), 8, 15), active(variant), 8 if "agr" in variant else 0
@@ -64,7 +64,7 @@ def test_rows_have_the_effects_of_their_class_only(variant: str) -> None:
         assert torch.equal(x, y)
 
 
-def test_agr_that_moves_nothing_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agr_that_moves_nothing_is_not_called(monkeypatch):
     """Catches networks that are evaluated on no row, which on a GPU costs as much as on a few."""
     model = with_effect_sets(active("7dgs_agr"), 0, 10)
     monkeypatch.setattr(model.refinement, "forward", None)
@@ -72,7 +72,7 @@ def test_agr_that_moves_nothing_is_not_called(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_agr_moves_a_row_within_its_span_alone(dtype: torch.dtype) -> None:
+def test_agr_moves_a_row_within_its_span_alone(dtype):
     """Catches a Gaussian that AGR moves before its first time, or after its last one, by torch and by the kernel."""
     model = with_effect_sets(active("7dgs_agr"), 4, 10).to(dtype)
     query = CameraTime.at(CAMERA.to(dtype), 0.45)
@@ -99,7 +99,7 @@ def freeze(model: GaussianModel) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("variant", OBSERVING)
-def test_a_static_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
+def test_a_static_row_is_a_frozen_one(variant, dtype):
     """Catches a static row that would look otherwise to whoever does not know of effect sets, by kernels or by torch.
 
     An exponent of f_dir or f_temp is (q - mu)^2 / (2 e^32) = 1e-14 (q - mu)^2 there.
@@ -116,7 +116,7 @@ def test_a_static_row_is_a_frozen_one(variant: str, dtype: torch.dtype) -> None:
     torch.testing.assert_close(static.opacities, frozen.opacities, **tolerance)
 
 
-def test_turn_of_space() -> None:
+def test_turn_of_space():
     """Catches a sign or a place in the rotation of space that a left quaternion makes with its partner."""
     left = torch.randn(20, 4, generator=seeded(0), dtype=torch.float64)
     both = rotation4d(left, left * torch.tensor([1, -1, -1, 1]))
@@ -127,7 +127,7 @@ def test_turn_of_space() -> None:
 
 @pytest.mark.parametrize("variant", ["3dgs", "4dgs"])
 @torch.no_grad()
-def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
+def test_fewer_harmonics_have_the_same_colour_on_average(variant):
     """Catches a constant colour that is not given what the cut harmonics were on average, weighted by opacities."""
     model, g = fresh(variant).double(), seeded(3)
     model.splats["shN"] += 0.02 * torch.randn(model.splats["shN"].shape, generator=g, dtype=torch.float64)
@@ -150,7 +150,7 @@ def test_fewer_harmonics_have_the_same_colour_on_average(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", ["7dgs", "7dgs_paper"])
-def test_time_goes_on_as_it_did_where_direction_is_frozen(variant: str) -> None:
+def test_time_goes_on_as_it_did_where_direction_is_frozen(variant):
     """Catches f_temp by the deviation that t has at a known direction: frozen, direction is known no more."""
     model = lively(variant)
     early, late = (CameraTime.at(CAMERA, time) for time in (0.35, 0.6))
@@ -191,7 +191,7 @@ class Checked(Breathing, gates=True):
         return Gaussians3DModel.condition(self, raw, None)
 
 
-def test_gates_are_not_inherited() -> None:
+def test_gates_are_not_inherited():
     """Catches a model of ours whose gates are refused, one without the methods whose gates are not, and a model that is
     gated by its base's methods, which drop what it adds without a word."""
     for name in GATED:
@@ -211,7 +211,7 @@ def test_gates_are_not_inherited() -> None:
         as_gated(started(type("More", (Checked,), {})()))
 
 
-def test_a_model_that_lacks_a_method(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_lacks_a_method(monkeypatch):
     """Catches a TypeError of Python for a class that is not finished."""
     monkeypatch.setattr(registry, "_REGISTRY", registry._REGISTRY | {"half": Half})
     with pytest.raises(InputError, match="model 'half': expected all methods that a model needs, Half lacks frozen"):
@@ -230,7 +230,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_effect_sets_of_a_checkpoint_are_checked(fault: str) -> None:
+def test_effect_sets_of_a_checkpoint_are_checked(fault):
     """Catches a damaged checkpoint that reaches the kernels with rows that there are not."""
     model = with_effect_sets(active("7dgs_agr"), 3, 10)
     model.fill(model.effect_sets)
@@ -240,7 +240,7 @@ def test_effect_sets_of_a_checkpoint_are_checked(fault: str) -> None:
         active("7dgs_agr").load_state(state)
 
 
-def test_a_checkpoint_with_gates_of_a_model_without_them() -> None:
+def test_a_checkpoint_with_gates_of_a_model_without_them():
     """Catches a checkpoint that loads and then fails at its first image."""
     model = started(Gaussians3DModel())
     model.effect_sets = EffectSets(0, 0, torch.full((N,), 3, dtype=torch.int32))

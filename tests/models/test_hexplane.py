@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import pytest
 import torch
 from small import CAMERA, DIGITS, doubles, lively, seeded
 from tiny_training import trainer
@@ -51,14 +50,14 @@ def network_of_the_vectors(*further: int) -> Network:
     return network
 
 
-def test_the_features_of_planes() -> None:
+def test_the_features_of_planes():
     """Catches rows in place of columns, another order of axes, levels or corners of the box, a time mapped to [-1, 1],
     and a sum in place of the product."""
     planes = planes_of_the_vectors()
     torch.testing.assert_close(planes(POSITION, TIME).detach()[0], FEATURES, **DIGITS)
 
 
-def test_the_network() -> None:
+def test_the_network():
     """Catches a lost or further layer or ReLU, heads in another order, and a hidden layer of another head."""
     network = network_of_the_vectors()
     torch.testing.assert_close(network(FEATURES[None]).detach()[0], CHANGES, rtol=0, atol=1e-8)
@@ -73,7 +72,7 @@ def test_the_network() -> None:
     torch.testing.assert_close(network(features), expected)
 
 
-def test_a_changed_gaussian() -> None:
+def test_a_changed_gaussian():
     """Catches scales changed after the exp, a quaternion normalised before the sum, and colours that do not change."""
     model: Any = lively("hexplane", 4, appearance=True)
     model.set_active(FULL)
@@ -102,7 +101,7 @@ def test_a_changed_gaussian() -> None:
     assert torch.equal(harmonics_at(model, QUERY), harmonics)
 
 
-def test_the_penalty() -> None:
+def test_the_penalty():
     """Catches differences of the first order or along columns, a plane of space taken for one of time, and a mean over
     the planes or levels."""
     planes = planes_of_the_vectors(levels=1)
@@ -117,7 +116,7 @@ def test_the_penalty() -> None:
     )
 
 
-def test_the_field_has_the_gradients_of_its_values() -> None:
+def test_the_field_has_the_gradients_of_its_values():
     """Catches a lost or wrong derivative on the way from any number of the field, or a position, to the changes."""
     model: Any = lively("hexplane", 5, channels=2, resolution=3, width=3, appearance=True, sh_degree=1)
     fields = model.planes, model.network
@@ -136,7 +135,7 @@ def test_the_field_has_the_gradients_of_its_values() -> None:
     assert torch.autograd.gradcheck(changes, values, fast_mode=True)
 
 
-def test_points_in_a_plane_make_no_nan() -> None:
+def test_points_in_a_plane_make_no_nan():
     """Catches a division by the box's width of zero, a gradient that is infinite there, and a crash at NaN."""
     points = torch.rand(20, 3, generator=seeded(0)) * torch.tensor([1.0, 1.0, 0.0])
     planes = Planes(points, (4, 4, 4, 4), 1, 2, seeded(1))
@@ -146,7 +145,7 @@ def test_points_in_a_plane_make_no_nan() -> None:
     assert positions.grad.isfinite().all()
 
 
-def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:
+def test_a_step_adds_the_gradient_of_the_penalty_once():
     """Catches a penalty of each view, whose sum grows with the batch, and a repeated step that adds it twice."""
     gradients = []
     for weights in ([0.0] * 3, [3.0, 5.0, 7.0]):
@@ -162,7 +161,7 @@ def test_a_step_adds_the_gradient_of_the_penalty_once() -> None:
         torch.testing.assert_close(added, without + expected)
 
 
-def test_views_of_a_step_share_what_time_does_not_change(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_of_a_step_share_what_time_does_not_change(monkeypatch):
     """Catches samples in space that each view takes anew, and gradients of them that are lost or counted twice."""
     gradients = []
     for share, expected in ((True, 1), (False, 3)):

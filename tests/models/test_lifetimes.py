@@ -31,7 +31,7 @@ LEAST = 0.04
 
 
 @pytest.mark.parametrize("variant", [*TIMED, "7dgs_paper", "7dgs_raw", "7dgs_nodir, bounded"])
-def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
+def test_outside_its_interval_a_gaussian_is_culled(variant):
     """Catches a duration in other units, a lambda, an exponent or an opacity that is left out, raw times, the 1/2 of
     f_temp in a joint gate, and an interval that is too long: rows would be sorted into an order that saves nothing."""
     model = conditioned(variant, 200) if "," in variant else lively(variant, 200)
@@ -62,13 +62,13 @@ def test_outside_its_interval_a_gaussian_is_culled(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", ["ubs", *(name for name in NAMES if "time" not in registry.find(name).observes)])
-def test_models_without_intervals(variant: str) -> None:
+def test_models_without_intervals(variant):
     """Catches a model that is sorted by times that it does not have; rows of UBS are not sorted either."""
     assert fresh(variant).visible_intervals() is None
 
 
 @pytest.mark.parametrize("name", [*TIMED, "ubs"])
-def test_lifetimes_are_held(name: str) -> None:
+def test_lifetimes_are_held(name):
     """Catches a model that forgets lambda, its unit of time or the exponents, or that lengthens what is long enough."""
     model = fresh(name)
     raw = {key: value.data for key, value in model.splats.items()}
@@ -107,7 +107,7 @@ class Moments:
         raise AssertionError(parameter)
 
 
-def test_rows_are_sorted_by_when_they_can_be_visible() -> None:
+def test_rows_are_sorted_by_when_they_can_be_visible():
     """Catches rows in another order, moments that stay where they were, rows of equal intervals that swap, and a sort
     that mixes static Gaussians among those that change with time."""
     model, moments = fresh("7dgs", count=300), Moments()

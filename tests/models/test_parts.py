@@ -38,7 +38,7 @@ def directions(seed: int, N: int) -> Tensor:
     return nn.functional.normalize(normal(seed, N, 3), dim=-1)
 
 
-def test_triangular_row_scaled() -> None:
+def test_triangular_row_scaled():
     """Catches another scaling than (2 sigmoid(x) - 1) times the diagonal of the entry's own row."""
     layout = CholeskyLayout("ddd", "row_scaled")
     L = layout.factor(torch.tensor([[0.0, 1.0, 2.0]]), layout.split(torch.tensor([[5.0, -6.0, 0.0]])))
@@ -48,7 +48,7 @@ def test_triangular_row_scaled() -> None:
 
 @PROPERTY
 @given(seeds, st.sampled_from(["ppp", "dddppp", "dddtppp", "ptd", "pppddd", "ppptddd"]), st.sampled_from(OFF_DIAGONALS))
-def test_parameters_undo_a_factor(seed: int, letters: str, form: str) -> None:
+def test_parameters_undo_a_factor(seed, letters, form):
     """Catches a factor that changes when a split writes it back: parameters -> L -> L Q -> parameters."""
     layout, n = CholeskyLayout(letters, form), len(letters)
     parameters = {"log_diagonal": normal(seed, 4, n), **layout.split(normal(seed + 1, 4, n * (n - 1) // 2))}
@@ -70,14 +70,14 @@ def test_parameters_undo_a_factor(seed: int, letters: str, form: str) -> None:
         ),
     ],
 )
-def test_kinds_of_entries(letters: str, expected: dict[str, str]) -> None:
+def test_kinds_of_entries(letters, expected):
     """Catches an entry of L_pp among the motions, or of L_td among the shapes: each has its unit and its rate."""
     layout, n = CholeskyLayout(letters, "raw"), len(letters)
     names = torch.tensor([10 * i + j for i in range(n) for j in range(i)])[None]
     assert {kind: " ".join(map(str, x[0].tolist())) for kind, x in layout.split(names).items()} == expected
 
 
-def test_row_scaled_cuts_what_it_cannot_reach() -> None:
+def test_row_scaled_cuts_what_it_cannot_reach():
     """Catches atanh of 1 or more, which is not finite: such entries become 99.9 % of their diagonal."""
     factor = torch.tensor([[[1.0, 0, 0], [4.0, 2.0, 0], [-9.0, 0, 3.0]]])
     layout = CholeskyLayout("ddd", "row_scaled")
@@ -88,7 +88,7 @@ def test_row_scaled_cuts_what_it_cannot_reach() -> None:
 
 @PROPERTY
 @given(seeds)
-def test_rotation(seed: int) -> None:
+def test_rotation(seed):
     """Catches a transpose or another order of components than wxyz, and lengths that matter."""
     q = normal(seed, 5, 4)
     expected = Rotation.from_quat(q.numpy(), scalar_first=True).as_matrix()
@@ -103,7 +103,7 @@ def hamilton(a: Tensor, b: Tensor) -> Tensor:
 
 @PROPERTY
 @given(seeds)
-def test_rotation4d(seed: int) -> None:
+def test_rotation4d(seed):
     """Catches a sign in M_left or M_right: their product is a rotation, v -> l v conj(r) as quaternions."""
     left, right, v = normal(seed, 5, 4), normal(seed + 1, 5, 4), normal(seed + 2, 5, 4)
     R = rotation4d(left, right)
@@ -114,7 +114,7 @@ def test_rotation4d(seed: int) -> None:
     torch.testing.assert_close((R @ v[..., None])[..., 0], hamilton(hamilton(left, v), conjugate))
 
 
-def test_spherical_harmonics_are_scipy_s() -> None:
+def test_spherical_harmonics_are_scipy_s():
     """Catches a wrong constant, order or sign. 3DGS' real basis is sqrt(2) Re / Im of Y_lm, phase (-1)^m included."""
     d = directions(0, 50)
     polar, azimuth = np.arccos(d[:, 2].numpy()), np.arctan2(d[:, 1].numpy(), d[:, 0].numpy())
@@ -126,7 +126,7 @@ def test_spherical_harmonics_are_scipy_s() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colors(degree: int) -> None:
+def test_colors(degree):
     """Catches coefficients above the degree in use that still show, a lost +0.5 and a clamp at another value."""
     coefficients, d = normal(1, 20, 16, 3), directions(2, 20)
     n = (degree + 1) ** 2
@@ -135,7 +135,7 @@ def test_colors(degree: int) -> None:
     assert (expected == 0).any()
 
 
-def test_time_colors() -> None:
+def test_time_colors():
     """Catches 4DSH with another frequency, phase or period: sum over n of cos(2 pi n (t - mu_t)) beta_n Y."""
     coefficients, d, offset = normal(3, 20, 3, 16, 3), directions(4, 20), normal(5, 20)
     waves = np.stack([np.cos(2 * np.pi * n * offset.numpy()) for n in range(3)], -1)
@@ -147,7 +147,7 @@ def test_time_colors() -> None:
     torch.testing.assert_close(sh_time_colors(coefficients[:, :1], d, 2, offset), sh_colors(coefficients[:, 0], d, 2))
 
 
-def test_orders_leave_out_what_is_above_them() -> None:
+def test_orders_leave_out_what_is_above_them():
     """Catches a row that loses the highest degree or wave of its own order, or keeps one above: degree + 4 waves."""
     coefficients, d, offset = normal(6, 12, 3, 16, 3), directions(7, 12), normal(8, 12)
     orders = torch.tensor([degree + 4 * waves for degree in range(4) for waves in range(3)], dtype=torch.int32)
@@ -163,7 +163,7 @@ PACKED = st.integers(0, MOST_PACKED)
 
 @PROPERTY
 @given(PACKED, st.lists(PACKED, min_size=1))
-def test_an_order_is_one_number(packed: int, others: list[int]) -> None:
+def test_an_order_is_one_number(packed, others):
     """Catches a packing that loses an order, for ints and for tensors; a limit that compares the numbers themselves,
     for degree 0 with 2 waves (4) is not above degree 3 (3); and a frequency or degree counted from the wrong end."""
     order = order_of(packed)
@@ -179,7 +179,7 @@ def test_an_order_is_one_number(packed: int, others: list[int]) -> None:
     assert mask.tolist() == expected
 
 
-def test_time_encoding() -> None:
+def test_time_encoding():
     """Catches another octave, order or factor than (sin 2^k pi t, cos 2^k pi t), k = 0..K-1; the paper's K is 10."""
     t = 0.37
     expected = [f(2**k * math.pi * t) for k in range(10) for f in (math.sin, math.cos)]
@@ -188,7 +188,7 @@ def test_time_encoding() -> None:
         np.testing.assert_allclose(encoded.numpy(), expected[: 2 * K], atol=1e-10)
 
 
-def test_refinement_measures_in_units() -> None:
+def test_refinement_measures_in_units():
     """Catches a scene of another size that is refined otherwise: lengths 100 times longer move 100 times further."""
     units = torch.tensor([100.0] * 3 + [1.0] * 4 + [1.0, 100.0])
     small, large = (Refinement([3, 1, 3, 2], torch.Generator().manual_seed(0), 4, u) for u in (None, units))
@@ -200,7 +200,7 @@ def test_refinement_measures_in_units() -> None:
     torch.testing.assert_close(again, moved * units, rtol=1e-4, atol=1e-4)
 
 
-def test_refinement_starts_at_zero_but_learns() -> None:
+def test_refinement_starts_at_zero_but_learns():
     """Catches residuals before any training, an output layer of zeros that gets no gradient, and another start than
     that of torch.nn.Linear: uniform within 1 / sqrt(width)."""
     refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0))
@@ -216,7 +216,7 @@ def test_refinement_starts_at_zero_but_learns() -> None:
     assert refinement.weight_out.grad.any(1).all()
 
 
-def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
+def test_refinement_is_four_perceptrons_on_27_numbers():
     """Catches a shortcut of the shared first layer that is not 27 x 64 x c on the concatenated features."""
     refinement = Refinement([3, 1, 3, 28], torch.Generator().manual_seed(0)).double()
     for i, p in enumerate([refinement.weight_out, refinement.bias_out]):
@@ -233,7 +233,7 @@ def test_refinement_is_four_perceptrons_on_27_numbers() -> None:
         torch.testing.assert_close(moved, value + perceptron(f))
 
 
-def test_unit() -> None:
+def test_unit():
     """Catches a direction of another length than 1, and NaN where a camera sits on a mean: zero, with no gradient."""
     vectors = torch.tensor([[3.0, 0, 4], [0, 0, 0], [1e-15, 0, 0], [0, -1e-5, 0]], requires_grad=True)
     directions = unit(vectors)

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -47,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
-def test_a_module_that_the_user_names(folder: Path) -> None:
+def test_a_module_that_the_user_names(folder):
     """Catches a name of a module that is not imported, or imported after the model was looked for."""
     (folder / "models_of_mine.py").write_text(MODEL.replace("NAME", "mine"))
     with pytest.raises(InputError, match="model 'mine' is not known"):
@@ -56,7 +55,7 @@ def test_a_module_that_the_user_names(folder: Path) -> None:
     assert find("mine").__module__ == "models_of_mine"
 
 
-def test_an_installed_package_lists_its_models(folder: Path) -> None:
+def test_an_installed_package_lists_its_models(folder):
     """Catches an entry point that no one reads."""
     (folder / "models_of_a_package.py").write_text(MODEL.replace("NAME", "packaged"))
     about = folder / "of_others-1.0.dist-info"
@@ -75,7 +74,7 @@ class Hidden:
 
 
 @pytest.mark.parametrize(("members", "is_visible"), [({}, False), ({"kernel": slice_static}, True)])
-def test_a_condition_of_its_own_is_called(members: dict[str, Any], is_visible: bool) -> None:
+def test_a_condition_of_its_own_is_called(members, is_visible):
     """Catches a derived model whose `condition` is ignored, since its base slices by a kernel."""
     model = type("Derived", (Hidden, Gaussians3DModel), members)()
     model.initialise(random_points(5, 1.0, torch.Generator().manual_seed(0)), 1.0, torch.Generator())
@@ -84,7 +83,7 @@ def test_a_condition_of_its_own_is_called(members: dict[str, Any], is_visible: b
         assert bool(of.slice(CameraTime.at(torch.zeros(3), None)).opacities.any()) == is_visible
 
 
-def test_a_name_that_is_taken(folder: Path) -> None:
+def test_a_name_that_is_taken(folder):
     """Catches a stranger's model that stands in the place of 7DGS in silence; the same class twice is no clash."""
     (folder / "models_of_a_thief.py").write_text(MODEL.replace("NAME", "7dgs"))
     with pytest.raises(InputError, match=r"'7dgs': expected a name of its own, gsbench\.models\.cholesky has"):
@@ -99,7 +98,7 @@ def test_a_name_that_is_taken(folder: Path) -> None:
         ("def broken(:\n", "SyntaxError"),
     ],
 )
-def test_a_module_that_cannot_be_imported(folder: Path, text: str | None, message: str) -> None:
+def test_a_module_that_cannot_be_imported(folder, text, message):
     """Catches a stack trace for a typo in the name, and one line that does not say where the user's own code fails."""
     if text is not None:
         (folder / "models_of_none.py").write_text(text)
@@ -110,16 +109,14 @@ def test_a_module_that_cannot_be_imported(folder: Path, text: str | None, messag
 
 
 @pytest.mark.parametrize("command", [view, export, gates, stability])
-def test_a_command_imports_the_module_of_a_runs_model(
-    command: ModuleType, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_imports_the_module_of_a_runs_model(command, folder, capsys):
     """Catches a command that cannot read the run of a user's model."""
     words = ["--checkpoint"] if command is gates else ["--video", str(folder / "x.webm")] if command is export else []
     assert command.main([*words, str(folder), "--model-module", "models_of_none"]) == 2
     assert "--model-module: expected a Python module that can be imported" in capsys.readouterr().err
 
 
-def test_a_checkpoint_imports_nothing(folder: Path) -> None:
+def test_a_checkpoint_imports_nothing(folder):
     """Catches a config from a file that runs code: its module is named in the message, and not imported."""
     (folder / "models_of_a_stranger.py").write_text("raise SystemExit('imported')")
     register_schema()

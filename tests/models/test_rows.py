@@ -46,7 +46,7 @@ def gain(model: GaussianModel) -> Tensor:
 
 
 @pytest.mark.parametrize("variant", ["4dgs", "7dgs", "7dgs_paper", "7dgs_nodir", "ndgs"])
-def test_start_in_time(variant: str) -> None:
+def test_start_in_time(variant):
     """Catches times outside [-0.1, 1.1], or not uniform, a time scale other than sqrt(T/5) or sqrt(T/10), and times of
     N-DGS that are not clipped as the authors', at infinity, or no logits."""
     model = fresh(variant, 4000)
@@ -63,7 +63,7 @@ def test_start_in_time(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", ["6dgs", "7dgs", "7dgs_paper"])
-def test_start_in_direction(variant: str) -> None:
+def test_start_in_direction(variant):
     """Catches directions that are not uniform on the sphere and a direction scale other than 1."""
     model = fresh(variant, 4000)
     d = model.splats["directions"].data
@@ -75,7 +75,7 @@ def test_start_in_direction(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", EVERY)
-def test_rows_are_selected_split_and_reset(variant: str) -> None:
+def test_rows_are_selected_split_and_reset(variant):
     """Catches a parameter whose rows are not moved with the others, or that is replaced and lost to the optimizer; a
     split that moves other Gaussians, changes what children inherit, gives twins the same place, or draws
     from elsewhere; a reset that raises what was lower already."""
@@ -103,7 +103,7 @@ def test_rows_are_selected_split_and_reset(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", SPLIT)
-def test_children_of_a_split_in_space(variant: str) -> None:
+def test_children_of_a_split_in_space(variant):
     """Catches children of another size or motion: covariance of the slice / 1.6^2, K and the blocks of q unchanged."""
     model = quiet(variant)
     model.extent = math.inf  # nothing is long enough to be split in time
@@ -121,7 +121,7 @@ def test_children_of_a_split_in_space(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", SPLIT)
-def test_children_lie_where_the_parent_is_dense(variant: str) -> None:
+def test_children_lie_where_the_parent_is_dense(variant):
     """Catches offsets of another size or orientation: over many draws, their covariance is that of the parent."""
     model = quiet(variant, count=4)
     model.extent = math.inf
@@ -138,7 +138,7 @@ def test_children_lie_where_the_parent_is_dense(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", [v for v in CHOLESKY if v.startswith("7dgs")])
-def test_children_of_a_split_in_time(variant: str) -> None:
+def test_children_of_a_split_in_time(variant):
     """Catches children off the parent's path or with another slope.
 
     S_t shrinks by 1.6^2, K and the slice's covariance stay, and at any time and from anywhere each child's slice lies
@@ -165,7 +165,7 @@ def test_children_of_a_split_in_time(variant: str) -> None:
 
 
 @pytest.mark.parametrize("case", ["ndgs", "7dgs_nodir, bounded"])
-def test_children_of_bounded_times(case: str) -> None:
+def test_children_of_bounded_times(case):
     """Catches a child of a split in time whose time is added to the logit, and one off its parent's path at an end."""
     model, query = conditioned(case, 40), CameraTime.at(CAMERA, 0.45)
     model.extent = 1e-6  # every Gaussian moves far
@@ -184,7 +184,7 @@ def test_children_of_bounded_times(case: str) -> None:
     torch.testing.assert_close(model.split(parents, seeded(3))["times"], parents["times"], rtol=0, atol=0)
 
 
-def test_long_in_time() -> None:
+def test_long_in_time():
     """Catches thresholds other than |S_pt| > 0.05 extent and sqrt(S_t) > 0.25, and a criterion where there is no t."""
     model = fresh("7dgs")
     assert not model.long_in_time().any()  # nothing moves at first

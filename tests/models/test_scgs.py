@@ -49,7 +49,7 @@ class Motion(nn.Module):
         return [x.repeat(len(positions) // 5, 1) for x in self.outputs]
 
 
-def test_the_nearest_nodes_and_their_weights() -> None:
+def test_the_nearest_nodes_and_their_weights():
     """Catches a distance without features, a radius of the wrong power, a node that counts without its sigmoid, and
     weights whose sum is not 1."""
     near, weights = nodes_of_the_vectors().nearest(POSITION, FEATURES)
@@ -64,7 +64,7 @@ def test_the_nearest_nodes_and_their_weights() -> None:
         (True, doubles(0.45079391, 0.34920235, 0.37797328)),
     ],
 )
-def test_a_gaussian_follows_its_nodes(turns: bool, expected: Tensor) -> None:
+def test_a_gaussian_follows_its_nodes(turns, expected):
     """Catches nodes that only shift, turns around the origin in place of the node, a turn that is not beside the unit
     quaternion; sizes that change before the exp, and a quaternion that changes after it is normalised."""
     model: Any = lively("scgs", 4)
@@ -81,7 +81,7 @@ def test_a_gaussian_follows_its_nodes(turns: bool, expected: Tensor) -> None:
     assert torch.equal(sliced.opacities, torch.sigmoid(model.splats["opacities"]))
 
 
-def test_nodes_are_placed_far_from_each_other() -> None:
+def test_nodes_are_placed_far_from_each_other():
     """Catches the nearest point in place of the farthest, a radius of another range, and a crash with few points."""
     points = torch.rand(200, 3, generator=seeded(0)) * 2.6 - 1.3
     points[7], points[9] = torch.full((3,), 1.3), torch.full((3,), -1.3)
@@ -98,7 +98,7 @@ def test_nodes_are_placed_far_from_each_other() -> None:
     assert len(set(map(tuple, nodes.positions.tolist()))) == 5
 
 
-def test_the_field_starts_next_to_zero() -> None:
+def test_the_field_starts_next_to_zero():
     """Catches a start as that of Deformable-3DGS, whose Gaussians jump, and one at zero, where no layer learns."""
     model: Any = fresh("scgs", width=64, depth=8)
     model.set_active(FULL)
@@ -113,7 +113,7 @@ def test_the_field_starts_next_to_zero() -> None:
     )
 
 
-def test_a_rigid_motion_is_not_penalised() -> None:
+def test_a_rigid_motion_is_not_penalised():
     """Catches a rotation from the later time to the earlier one, and reflections taken for rotations."""
     points = torch.randn(30, 3, generator=seeded(0)).double()
     R = rotation(torch.randn(4, 4, generator=seeded(1)).double())  # at four times
@@ -124,7 +124,7 @@ def test_a_rigid_motion_is_not_penalised() -> None:
     assert stretch(torch.stack([points, -points]), near, weights) > 0.1
 
 
-def test_the_penalty_is_the_least_energy() -> None:
+def test_the_penalty_is_the_least_energy():
     """Catches lost weights, other neighbours or times, and a rotation that is not the best, which SciPy finds."""
     paths = torch.randn(3, 10, 3, generator=seeded(0)).double()
     near = torch.stack([torch.randperm(10, generator=seeded(i))[:5] for i in range(10)])
@@ -137,7 +137,7 @@ def test_the_penalty_is_the_least_energy() -> None:
     torch.testing.assert_close(stretch(paths, near, weights), torch.tensor(energies).double().mean())
 
 
-def test_the_weight_of_the_penalty() -> None:
+def test_the_weight_of_the_penalty():
     """Catches a penalty in the warm-up, of the canonical nodes alone, or of weight zero that costs its time."""
     model: Any = lively("scgs", rigidity=0.5)
     model.set_active(FULL)
@@ -153,7 +153,7 @@ def test_the_weight_of_the_penalty() -> None:
     assert model.penalty() is None
 
 
-def test_field_and_nodes_have_the_gradients_of_their_values() -> None:
+def test_field_and_nodes_have_the_gradients_of_their_values():
     """Catches a lost or wrong derivative on the way from any number of the field or a node to a slice or the penalty,
     and a gradient of a mean through the choice of its nodes."""
     model: Any = lively("scgs", 5, width=3, depth=2, octaves=1, time_octaves=1, nodes=6, rigidity=1.0)
@@ -181,7 +181,7 @@ def test_field_and_nodes_have_the_gradients_of_their_values() -> None:
     assert torch.autograd.gradcheck(outputs, values, fast_mode=True)
 
 
-def test_positions_of_nodes_learn_by_what_follows_them() -> None:
+def test_positions_of_nodes_learn_by_what_follows_them():
     """Catches a derivative by the position of a node that is lost or wrong where the field does not depend on it."""
     model: Any = lively("scgs", 5)
     model.set_active(FULL)

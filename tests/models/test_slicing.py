@@ -56,7 +56,7 @@ def relative(x: Tensor, exact: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("one_query", [False, True])
 @pytest.mark.parametrize("k", [0, 1, 3, 4])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_formula(scheme: str, k: int, one_query: bool) -> None:
+def test_formula(scheme, k, one_query):
     """Catches a wrong block, transpose, order of (p, q) or sign, for no observation, t, d and both; f_temp and f_dir of
     another block than the marginal one, delta^T (R R^T)^-1 delta."""
     mean, factor, query = tame(0, 50, k)
@@ -71,7 +71,7 @@ def test_formula(scheme: str, k: int, one_query: bool) -> None:
     torch.testing.assert_close(mahalanobis(rows, delta), expected)
 
 
-def test_square_root_is_exact_where_the_formula_is_not() -> None:
+def test_square_root_is_exact_where_the_formula_is_not():
     """Catches a reduction that squares the condition number: double precision agrees with 80 digits to 1e-9."""
     factor = hard(1, 8)
     sliced = slice_gaussians(torch.zeros(8, 7).double(), factor, torch.zeros(4).double())
@@ -82,7 +82,7 @@ def test_square_root_is_exact_where_the_formula_is_not() -> None:
 
 @PROPERTY
 @given(seeds, st.integers(0, 4))
-def test_reduction_keeps_the_covariance(seed: int, k: int) -> None:
+def test_reduction_keeps_the_covariance(seed, k):
     """Catches a reflection that is not one: F F^T of the reduced factor, rows (p, q), is that of the factor."""
     F = tame(seed, 5, k)[1]
     T_qq, T_pq, T_pp = reduce(F)
@@ -93,7 +93,7 @@ def test_reduction_keeps_the_covariance(seed: int, k: int) -> None:
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("size", [1.0, 1e-2, 1e-3, 1e-4, 1e-6])
-def test_reduction_of_what_is_nearly_reduced(size: float, sign: int) -> None:
+def test_reduction_of_what_is_nearly_reduced(size, sign):
     """Catches the reflection of the other sign, which cancels where a row has almost its final form (float32)."""
     F = torch.cat([normal(0, 200, 3, 7), size * normal(1, 200, 4, 7)], 1)
     F[:, 3:, :4] += sign * (torch.eye(4) + normal(2, 200, 4, 4).tril(-1))
@@ -105,7 +105,7 @@ def test_reduction_of_what_is_nearly_reduced(size: float, sign: int) -> None:
 
 @pytest.mark.parametrize("k", [0, 1, 3, 4])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_gradients(scheme: str, k: int) -> None:
+def test_gradients(scheme, k):
     """Catches a wrong derivative by factor, mean or query, in each scheme (central differences)."""
     inputs = [x.requires_grad_() for x in tame(3, 2, k)]
 
@@ -117,7 +117,7 @@ def test_gradients(scheme: str, k: int) -> None:
 
 
 @pytest.mark.parametrize("rows", [[0], [1, 2], [0, 1, 2]])
-def test_rows_of_zeros(rows: list[int]) -> None:
+def test_rows_of_zeros(rows):
     """Catches 0/0 in a reflection: a Gaussian that is flat in p, and a row of q that is zero in the reduction."""
     mean, factor, query = tame(7, 3, 4)
     flat = factor.clone()
@@ -149,13 +149,13 @@ def test_rows_of_zeros(rows: list[int]) -> None:
         ((1, 5, 7), (1, 5, 7, 7), (4,)),
     ],
 )
-def test_shapes_are_checked(shapes: tuple[tuple[int, ...], ...]) -> None:
+def test_shapes_are_checked(shapes):
     """Catches shapes that fail in the depths or broadcast to nonsense."""
     with pytest.raises(InputError, match="slice_gaussians: expected mean"):
         slice_gaussians(*map(torch.zeros, shapes))
 
 
-def test_unknown_scheme() -> None:
+def test_unknown_scheme():
     """Catches a misspelt scheme that falls through to another one."""
     with pytest.raises(InputError, match="Did you mean 'cholesky'"):
         slice_gaussians(*tame(0, 1, 1), scheme="cholesk")

@@ -43,7 +43,7 @@ def gaussian(name: str = "stg", **raw: Tensor) -> Any:
     return model
 
 
-def test_the_vector() -> None:
+def test_the_vector():
     """Catches a half in the exponent, coefficients by axis or in reversed order, and a turn before the mean time."""
     model = gaussian()
     sliced = model.slice(QUERY)
@@ -54,7 +54,7 @@ def test_the_vector() -> None:
     torch.testing.assert_close(covariances(sliced), R * S.square()[:, None] @ R.mT, rtol=0, atol=2e-8)
 
 
-def test_a_mean_time_learns_from_the_opacity_alone() -> None:
+def test_a_mean_time_learns_from_the_opacity_alone():
     """Catches a gradient of mu through path or turn, which the authors' code has not, and a lost one of the opacity."""
     model = gaussian()
     sliced = model.slice(QUERY)
@@ -66,7 +66,7 @@ def test_a_mean_time_learns_from_the_opacity_alone() -> None:
     torch.testing.assert_close(gradient[0], (after - before).detach() / 2e-6, rtol=1e-8, atol=0)
 
 
-def test_the_start() -> None:
+def test_the_start():
     """Catches times outside [0, 1], a duration that is taken for a logarithm, and Gaussians that move or turn."""
     model = fresh("stg", 4000, duration=math.exp(-2))
     values = raw(model)
@@ -77,7 +77,7 @@ def test_the_start() -> None:
     assert not values["turns"].any()
 
 
-def test_a_frozen_gaussian_has_the_mean_quaternion() -> None:
+def test_a_frozen_gaussian_has_the_mean_quaternion():
     """Catches a frozen Gaussian that keeps the quaternion of its mean time."""
     model, queries = gaussian(), [CameraTime.at(CAMERA, time) for time in (0.2, 0.7)]
     weights = torch.tensor([[0.25], [0.75]])
@@ -86,7 +86,7 @@ def test_a_frozen_gaussian_has_the_mean_quaternion() -> None:
 
 
 @pytest.mark.parametrize("kind", ["clone", "split"])
-def test_clones_and_children_have_new_times(kind: str) -> None:
+def test_clones_and_children_have_new_times(kind):
     """Catches a copy with its parent's time, an original that loses its time, and draws from elsewhere."""
     fitted = trainer("stg", f"train.densify.clone_below={1e3 if kind == 'clone' else 1e-9}")
     rule, model = fitted.density.rule, fitted.model
@@ -122,7 +122,7 @@ def seen_along(x: float, y: float, z: float) -> Camera:
     return Camera(viewmat, K, 1, 1)
 
 
-def test_the_features_of_the_vector() -> None:
+def test_the_features_of_the_vector():
     """Catches features of time that are not multiplied by t - mu, and base features that are clipped as colours are."""
     features = {"view_features": VIEW, "time_features": TIME}
     for base in (BASE, -BASE):
@@ -134,7 +134,7 @@ def test_the_features_of_the_vector() -> None:
 @pytest.mark.parametrize(
     ("saturate", "pixel"), [(True, (0.72183223, 0.75329802, 0.78038574)), (False, (0.95356830, 1.0, 1.0))]
 )
-def test_the_decoded_vector(saturate: bool, pixel: tuple[float, ...]) -> None:
+def test_the_decoded_vector(saturate, pixel):
     """Catches inputs in another order, rays of the camera's own space or of another length, and a bias."""
     model: Any = lively("stg_full", saturate=saturate)
     model.decoder[0].weight.data, model.decoder[1].weight.data = layer(0, 6, 12), layer(1, 3, 6)
@@ -142,7 +142,7 @@ def test_the_decoded_vector(saturate: bool, pixel: tuple[float, ...]) -> None:
     torch.testing.assert_close(image[0, 0], row(*pixel), **DIGITS)
 
 
-def test_a_ray_meets_what_its_pixel_shows() -> None:
+def test_a_ray_meets_what_its_pixel_shows():
     """Catches pixels counted by columns or from their corners, and a rotation to the camera instead of from it."""
     camera = replace(pinhole(6, 4), viewmat=torch.eye(4).double())
     camera.viewmat[:3, :3], camera.viewmat[:3, 3] = rotation(row(0.8, 0.3, -0.2, 0.5))[0], row(1, 2, 3)[0]
@@ -156,7 +156,7 @@ def test_a_ray_meets_what_its_pixel_shows() -> None:
 
 
 @pytest.mark.parametrize("saturate", [True, False])
-def test_the_decoder_has_the_gradients_of_its_values(saturate: bool) -> None:
+def test_the_decoder_has_the_gradients_of_its_values(saturate):
     """Catches a gradient that a kernel, the clip or the sigmoid loses, by features and by both layers."""
     model: Any = lively("stg_full", saturate=saturate)
     weights, (width, height) = [layer.weight for layer in model.decoder], (3, 2)
@@ -168,7 +168,7 @@ def test_the_decoder_has_the_gradients_of_its_values(saturate: bool) -> None:
     assert torch.autograd.gradcheck(image, [blended, *weights])
 
 
-def test_an_image_by_kernels_is_that_of_torch() -> None:
+def test_an_image_by_kernels_is_that_of_torch():
     """Catches channels that a kernel mixes up, a background behind features, and a decoder without portable layers."""
     model, camera = lively("stg_full", 24), pinhole(20, 16)
     single = lively("stg_full", 24).float()
@@ -184,7 +184,7 @@ def test_an_image_by_kernels_is_that_of_torch() -> None:
     torch.testing.assert_close(model.decode(torch.cat(triples, -1), camera)[0].detach(), image)
 
 
-def test_a_training_of_the_full_model() -> None:
+def test_a_training_of_the_full_model():
     """Catches a decoder that does not learn or that a checkpoint lacks, and scores of images that are not decoded."""
     fitted, _ = assert_resumes(lambda: trainer("stg_full", "model.options.saturate=false"), 30)
     model: Any = fitted.model
@@ -204,7 +204,7 @@ def test_a_training_of_the_full_model() -> None:
 
 
 @pytest.mark.parametrize("key", ["gate=both", "static_above=0.5"])
-def test_it_is_not_simplified(key: str) -> None:
+def test_it_is_not_simplified(key):
     """Catches errors of simplified Gaussians that are predicted without the decoder."""
     with pytest.raises(InputError, match="SpacetimeFeatureModel decodes what is blended"):
         trainer("stg_full", f"effects.{key}")

@@ -37,7 +37,7 @@ def covariance(gaussians: TrainedGaussians) -> Tensor:
 
 # A row-scaled triangle cannot express every shape: CholeskyLayout.parameters.
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if not name.endswith("row_scaled")])
-def test_the_shape_in_space_is_that_of_the_ply(variant: str) -> None:
+def test_the_shape_in_space_is_that_of_the_ply(variant):
     """Catches axes in another order, a mirrored quaternion, time or direction that leak into space, and in 3DGS a
     detour over covariances that loses digits."""
     gaussians = trained()
@@ -56,7 +56,7 @@ def test_the_shape_in_space_is_that_of_the_ply(variant: str) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize(("in_ply", "in_model"), [(0, 3), (1, 2), (3, 1), (4, 3), (3, 0)])
-def test_harmonics_of_another_degree(name: str, in_ply: int, in_model: int) -> None:
+def test_harmonics_of_another_degree(name, in_ply, in_model):
     """Catches harmonics that move to another degree or wave, and colours that differ where both have them."""
     gaussians, opaque = trained(in_ply), torch.ones(N)
     shared = (min(in_ply, in_model) + 1) ** 2 - 1
@@ -69,7 +69,7 @@ def test_harmonics_of_another_degree(name: str, in_ply: int, in_model: int) -> N
     assert colors[0].std() > 0.1
 
 
-def test_a_flat_gaussian_has_a_triangle() -> None:
+def test_a_flat_gaussian_has_a_triangle():
     """Catches a logarithm of zero: 2D Gaussians that were written as 3D ones have a scale of 1e-20 or so."""
     gaussians = trained()
     gaussians.log_scales[:, 1] = -46
@@ -77,7 +77,7 @@ def test_a_flat_gaussian_has_a_triangle() -> None:
         assert all(parameter.isfinite().all() for parameter in started_from(gaussians, name).splats.values())
 
 
-def test_quaternions_in_space() -> None:
+def test_quaternions_in_space():
     """Catches a 4D rotation that turns time."""
     quats = torch.nn.functional.normalize(trained().quats.double(), dim=1)
     expected = torch.eye(4, dtype=torch.float64).repeat(N, 1, 1)
@@ -85,7 +85,7 @@ def test_quaternions_in_space() -> None:
     torch.testing.assert_close(rotation4d(*quaternions_in_space(quats)), expected)
 
 
-def test_a_model_that_is_not_known_starts_with_spheres() -> None:
+def test_a_model_that_is_not_known_starts_with_spheres():
     """Catches a new model that cannot start from a PLY."""
     model, gaussians = Balls(), trained()
     model.start_from(gaussians, 2.0, seeded(0))

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +18,7 @@ LONG |= {"faint_crowd"}
 
 
 @pytest.mark.timeout(900)
-def test_the_short_audit_passes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_short_audit_passes(tmp_path, monkeypatch, capsys):
     """Catches a default that loses digits, is not finite or leaks a gradient in a hard case, in any backend.
 
     Det of a splat of 10^9 pixels overflowed, a gradient of a static 4DGS was off by 95 %, a NaN in a photograph was
@@ -38,7 +35,7 @@ def test_the_short_audit_passes(
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_the_whole_audit_passes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_whole_audit_passes(tmp_path, capsys):
     """Catches a default over its bound in what the short audit leaves out: other models, seeds, long trainings."""
     assert command.main(["--out", str(tmp_path)]) == 0, capsys.readouterr().out
     drifts = [line for line in (tmp_path / "table.md").read_text().splitlines() if "single_against_double" in line]
@@ -46,7 +43,7 @@ def test_the_whole_audit_passes(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize("order", population.FACTOR_ORDERS)
-def test_schemes_on_hard_slices(order: str) -> None:
+def test_schemes_on_hard_slices(order):
     """Catches a default beyond its bounds, and an audit so blind that the schemes that subtract pass it."""
     cells, _ = population.hard_slices(order, 4_000, BACKENDS)
     for cell in cells:
@@ -54,7 +51,7 @@ def test_schemes_on_hard_slices(order: str) -> None:
         assert cell.is_default or cell.bad > 0.3, cell
 
 
-def test_splats_of_a_billion_pixels_have_a_gradient() -> None:
+def test_splats_of_a_billion_pixels_have_a_gradient():
     """Catches units in which det of the 2D covariance leaves float32: the gradient was 0."""
     arguments = CASES["larger_than_the_scene"]()[-1] | {"Ks": pictures.intrinsics(1e4, 1e4)}
     arguments["means"] = arguments["means"] * torch.tensor([1e-3, 1e-3, 1.0])
@@ -73,13 +70,13 @@ def cell(scheme: str, forward: float) -> Cell:
     [("square_root", 1e-6, 0), ("square_root", 1.0, 1), ("square_root", math.nan, 1), ("schur", 1.0, 0)],
 )
 def test_page_and_exit_code(
-    scheme: str,
-    forward: float,
-    code: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    scheme,
+    forward,
+    code,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     """Catches a default over its bound, NaN included, that is not marked or ends in 0; others may break theirs.
 
     Also a short audit that does not say where to look, and a page without its table, figures or machine.
@@ -99,7 +96,7 @@ def test_page_and_exit_code(
     assert ("static (7dgs, cpu)" in lines[-1]) == bool(code)
 
 
-def test_a_folder_that_takes_no_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_takes_no_file_is_one_line(tmp_path, capsys):
     """Catches a stack trace after the minutes of the audit, as --out is a file."""
     (tmp_path / "out").write_bytes(b"")
     assert command.main(["--out", str(tmp_path / "out")]) == 2
@@ -107,7 +104,7 @@ def test_a_folder_that_takes_no_file_is_one_line(tmp_path: Path, capsys: pytest.
     assert f"{tmp_path / 'out'}: File exists" in line
 
 
-def test_missing_numbers_are_not_good_ones() -> None:
+def test_missing_numbers_are_not_good_ones():
     """Catches a NaN error that passes a comparison, and an infinite one hidden by a percentile."""
     assert not cell("square_root", math.nan).holds
     assert page.show(cell("square_root", 2.0)).startswith(page.MARK)
@@ -116,7 +113,7 @@ def test_missing_numbers_are_not_good_ones() -> None:
     assert population.percentile(errors) == math.inf
 
 
-def test_every_case_has_a_reason_and_a_judge() -> None:
+def test_every_case_has_a_reason_and_a_judge():
     """Catches a case without its line on the page, and one in an area that no judge looks at."""
     assert min(len(case.stresses) for case in CASES.values()) > 40
     assert {case.area for case in CASES.values()} == {*audit.FIXED, *page.RUNS}
@@ -126,7 +123,7 @@ def test_every_case_has_a_reason_and_a_judge() -> None:
 
 
 @pytest.mark.parametrize(("spread", "holds"), [(0.0, False), (0.1, False), (1.0, True)])
-def test_drift_is_that_of_the_worst_seed(spread: float, holds: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_is_that_of_the_worst_seed(spread, holds, monkeypatch):
     """Catches a drift on training views, of one seed, or averaged over seeds until it is small.
 
     It is excused if small changes of the start values move both kinds of trainings as far, and only then.
@@ -154,7 +151,7 @@ def test_drift_is_that_of_the_worst_seed(spread: float, holds: bool, monkeypatch
     assert "seed 1: 29.5000 dB" in drift.note
 
 
-def test_a_shaken_start_is_64_roundings_away() -> None:
+def test_a_shaken_start_is_64_roundings_away():
     """Catches start values that stay, that move by more than what ten steps round, or that two seeds move alike."""
     models = [torch.nn.ParameterList([torch.linspace(-3, 3, 50).double()]) for _ in range(3)]
     for model, seed in zip(models[1:], (1, 2), strict=True):
@@ -164,7 +161,7 @@ def test_a_shaken_start_is_64_roundings_away() -> None:
     assert not torch.equal(first, second)
 
 
-def test_a_seed_of_the_drift_is_that_of_the_points_too() -> None:
+def test_a_seed_of_the_drift_is_that_of_the_points_too():
     """Catches three seeds that all start from the same points."""
     drifts = [CASES["single_against_double"](model="7dgs", run_seed=seed) for seed in (0, 1)]
     assert [training.config.seed for training in drifts] == [0, 1]
@@ -172,7 +169,7 @@ def test_a_seed_of_the_drift_is_that_of_the_points_too() -> None:
     assert not torch.equal(first, second)
 
 
-def test_a_scene_in_float64_is_trained_in_float64() -> None:
+def test_a_scene_in_float64_is_trained_in_float64():
     """Catches a tensor of the trainer that stays float32: the drift is measured against such a training."""
     scene = trainings.double(trainings.moving_square())
     fitted = trainings.fit(trainings.Training("3dgs", trainings.compose("3dgs", 2), scene), "reference")

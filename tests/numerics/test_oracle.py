@@ -20,7 +20,7 @@ def row(observed: Observed, i: int) -> list[float]:
     return torch.cat([value[i].flatten() for value in observed.raw.values()]).tolist()
 
 
-def test_independent_position() -> None:
+def test_independent_position():
     """Catches a covariance that is not S_pp where p does not correlate, and an opacity factor that is not marginal."""
     observed = CASES["ordinary_gaussians"](model="7dgs")
     for kind in KINDS:
@@ -40,7 +40,7 @@ def test_independent_position() -> None:
 
 
 @pytest.mark.parametrize("model", ["4dgs", "7dgs"])
-def test_digits_suffice(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_digits_suffice(model, monkeypatch):
     """Catches a precision too low for the hardest case: half as many digits again change nothing in float64."""
     observed = CASES["diagonals_over_eight_decades"](model=model)
     function, x = exact_slice(observed), row(observed, 1)
@@ -50,7 +50,7 @@ def test_digits_suffice(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose([float(v) for v in coarse], [float(v) for v in better], rtol=1e-14, atol=1e-300)
 
 
-def test_harmonics() -> None:
+def test_harmonics():
     """Catches a sign or factor of a Y_lm: the models' table of constants is the general formula."""
     direction = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64), dim=0)
     with mp.workdps(30):
@@ -63,14 +63,14 @@ def test_harmonics() -> None:
 
 
 @pytest.mark.parametrize("order", ["paper", "conditioned_first"])
-def test_the_reference_of_the_million(order: str) -> None:
+def test_the_reference_of_the_million(order):
     """Catches a wrong covariance or gradient in float64, which a million slices are held to: mpmath agrees to 1e-6."""
     hard = population.draw(torch.Generator().manual_seed(7), 6, order)
     assert population.verify(hard, order, 6) < 1e-6
 
 
 @pytest.mark.parametrize("part", ["outputs", "gradient"])
-def test_the_reference_of_moving_slices(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reference_of_moving_slices(part, monkeypatch):
     """Catches a check of the float64 slices against mpmath that looks at their values or at their gradients alone."""
     observed = population.draw_moving(torch.Generator().manual_seed(7), "freetime", 4)
     assert population.verify_moving(observed) < 1e-6

@@ -94,7 +94,7 @@ def searched(examples: int) -> tuple[Any, Any, Any]:
 
 
 @pytest.mark.parametrize("search", searched(240), ids=["hard", "wild", "drawn"])
-def test_no_number_is_not_finite(search: Any) -> None:
+def test_no_number_is_not_finite(search):
     """Catches 0 x inf, an overflow or a division by zero anywhere between raw parameters and their gradients."""
     search()
 
@@ -102,6 +102,6 @@ def test_no_number_is_not_finite(search: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("search", searched(10_000), ids=["hard", "wild", "drawn"])
-def test_no_number_of_10000_is_not_finite(search: Any) -> None:
+def test_no_number_of_10000_is_not_finite(search):
     """The same, 10,000 times."""
     search()

@@ -106,7 +106,7 @@ def test_the_group_counts_in_what_is_available(monkeypatch):
     assert memory.available() == 12345
 
 
-def test_the_address_space_counts_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_address_space_counts_whole(monkeypatch):
     """Catches a limit of the address space from which only the resident memory is taken."""
     monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 50)
     status = Path("/proc/self/status").read_text().splitlines()
@@ -114,7 +114,7 @@ def test_the_address_space_counts_whole(monkeypatch: pytest.MonkeyPatch) -> None
     assert (1 << 50) - memory._address_space() == pytest.approx(used, rel=0.1)
 
 
-def test_what_cannot_be_read_is_no_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_read_is_no_limit(monkeypatch):
     """Catches a system without /proc whose memory counts as used up."""
     monkeypatch.setattr(memory, "_address_space_limit", lambda: 1 << 30)
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError()))

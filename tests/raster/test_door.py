@@ -50,7 +50,7 @@ def intrinsics(*rows: list[float]) -> Tensor:
     return torch.tensor([rows], dtype=torch.float64)
 
 
-def test_the_scene_itself_is_accepted() -> None:
+def test_the_scene_itself_is_accepted():
     """Catches a scene that is refused for another reason than the one tested; finite values whose sum is not, too."""
     assert {k: tuple(scene()[k].shape) for k in TENSORS} == TENSORS
     rasterize(**scene())
@@ -59,7 +59,7 @@ def test_the_scene_itself_is_accepted() -> None:
 
 
 @pytest.mark.parametrize("name", TENSORS)
-def test_shapes_types_and_values_of_tensors(name: str) -> None:
+def test_shapes_types_and_values_of_tensors(name):
     """Catches a shape that is let in and fails in the depths, or draws nonsense by broadcasting; mixed precision,
     integers, and a tensor on another device; NaN and infinities, which would be drawn as nothing and train as NaN."""
     shape, value = TENSORS[name], scene()[name]
@@ -81,7 +81,7 @@ def test_shapes_types_and_values_of_tensors(name: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu", "auto"])
-def test_kinds_of_tensors(backend: str) -> None:
+def test_kinds_of_tensors(backend):
     """Catches half precision, sparse and complex tensors that fail in the depths or are drawn in too few digits."""
     kinds = {
         "got float16: convert it by .to(torch.float32)": Tensor.half,
@@ -156,12 +156,12 @@ def test_kinds_of_tensors(backend: str) -> None:
         ],
     ],
 )
-def test_values(changes: dict[str, Any], message: str) -> None:
+def test_values(changes, message):
     """Catches a number out of its range, or rows that do not agree, that would draw an empty or a wrong picture."""
     refused(changes, message)
 
 
-def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gaussians_are_counted_for_every_camera(monkeypatch):
     """Catches more splats than int32 numbers because there are several cameras: 40 Gaussians in 2 are 80."""
     single = scene(torch.float32) | {"backend": "cpu"}
     monkeypatch.setattr(native, "MAX_PAIRS", 79)
@@ -172,7 +172,7 @@ def test_gaussians_are_counted_for_every_camera(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_memory_is_asked_for(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_asked_for(backend, monkeypatch):
     """Catches an image, or colours of stride 0, that take more memory than there is and end the process."""
     monkeypatch.setattr(memory, "available", lambda: 24 << 30)
     refused({"width": 10**7, "height": 10**7, "backend": backend}, "GiB are available")
@@ -189,9 +189,7 @@ def test_memory_is_asked_for(backend: str, monkeypatch: pytest.MonkeyPatch) -> N
         (False, False, "cpu", "kernels are not built .* is slow; reinstall with a C\\+\\+20 compiler"),
     ],
 )
-def test_auto_warns_once_that_it_is_slow(
-    built: bool, has_kernels: bool, device: str, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auto_warns_once_that_it_is_slow(built, has_kernels, device, message, monkeypatch):
     """Catches a GPU that is missing, or has no kernels, or an installation without a compiler, passed over in silence,
     and a warning at every picture."""
     backends._warn_once.cache_clear()
@@ -216,9 +214,7 @@ def test_auto_warns_once_that_it_is_slow(
         (True, True, "does not render on device 'cpu': use device=cuda"),
     ],
 )
-def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(
-    built: bool, device: bool, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(built, device, message, monkeypatch):
     """Catches a run that asks for the GPU and finds out in the depths, or in the first picture, that it cannot."""
     monkeypatch.setattr(cuda, "built", lambda: built)
     monkeypatch.setattr(cuda, "available", lambda: device)
@@ -227,7 +223,7 @@ def test_cuda_without_its_kernels_its_gpu_or_tensors_on_it(
         resolve("cuda", "cpu")
 
 
-def test_auto_falls_back_to_the_reference() -> None:
+def test_auto_falls_back_to_the_reference():
     """Catches `auto` choosing a backend that cannot serve the tensors: the native one has no float64."""
     assert not AUTO.serves(torch.zeros(1, dtype=torch.float64))
     assert not REFERENCE.serves(torch.zeros(1))

@@ -62,7 +62,7 @@ def check(seeds: Iterable[int]) -> None:
 
 
 @pytest.mark.parametrize("instruction_set", kernels.native().instruction_sets() if kernels.available() else [])
-def test_no_error_is_above_its_bound(instruction_set: str) -> None:
+def test_no_error_is_above_its_bound(instruction_set):
     """Catches an error that the analysis leaves out, in any instruction set, and a bound that says nothing."""
     best = kernels.native().instruction_sets()[-1]
     kernels.use_instruction_set(instruction_set)
@@ -72,7 +72,7 @@ def test_no_error_is_above_its_bound(instruction_set: str) -> None:
         kernels.use_instruction_set(best)
 
 
-def test_every_instruction_set_and_number_of_threads_has_the_same_bits() -> None:
+def test_every_instruction_set_and_number_of_threads_has_the_same_bits():
     """Catches a fused product, an exponential of a library, and a sum whose order depends on threads."""
     sets, threads = kernels.native().instruction_sets(), torch.get_num_threads()
     true: dict[int, Tensor] = {}
@@ -93,13 +93,13 @@ def test_every_instruction_set_and_number_of_threads_has_the_same_bits() -> None
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_no_error_of_2000_scenes_is_above_its_bound() -> None:
+def test_no_error_of_2000_scenes_is_above_its_bound():
     """The same, 2,000 times."""
     check(range(100, 2_100))
 
 
 @pytest.mark.parametrize("name", ["3dgs", "4dgs", "6dgs", "7dgs", "7dgs_agr", "ubs", "dbs", "freetime"])
-def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
+def test_errors_of_slicing_are_in_the_bound(name):
     """Catches a slice, a colour or a shape whose rounding is not carried to the pixels."""
     gaussians = model(name.removesuffix("_agr"), 2_000, agr=name.endswith("_agr"), sigma=0.05)
     viewmat, K = (x[0] for x in camera(32))
@@ -116,7 +116,7 @@ def test_errors_of_slicing_are_in_the_bound(name: str) -> None:
     assert exact_image(exact, wrong, viewmat, K, 32, 32).bound.max() > 3e-4
 
 
-def test_the_exact_image_is_that_of_brute_force() -> None:
+def test_the_exact_image_is_that_of_brute_force():
     """Catches a box, a tile or a stop that leaves out a pixel of the exact image."""
     for name in ("ordinary_crowd", "beta_crowd", "opaque_stack", "equal_depths"):
         (arguments,) = CASES[name]()
@@ -133,9 +133,7 @@ HARD_AND_EASY = (  # the severity and the number of a case in which rounding dec
 
 
 @pytest.mark.parametrize(("branch", "name", "hard", "easy"), HARD_AND_EASY)
-def test_a_branch_that_rounding_decides_is_named(
-    branch: int, name: str, hard: tuple[float, int], easy: tuple[float, int]
-) -> None:
+def test_a_branch_that_rounding_decides_is_named(branch, name, hard, easy):
     """Catches a pixel that may jump and is not counted, and one that is counted where nothing can jump."""
     cases = hard, easy
     for (severity, which), undecided in zip(cases, (True, False), strict=True):
@@ -144,7 +142,7 @@ def test_a_branch_that_rounding_decides_is_named(
         assert float(bounded.bound.max()) > 1e-5 or not undecided
 
 
-def test_the_culprit_is_the_gaussian_with_the_error() -> None:
+def test_the_culprit_is_the_gaussian_with_the_error():
     """Catches a culprit that is only the brightest, the nearest or the last Gaussian."""
     arguments = pictures.crowd(torch.Generator().manual_seed(0), 5, 1.0)
     arguments["opacities"] = torch.full((5,), 0.3)
@@ -156,7 +154,7 @@ def test_the_culprit_is_the_gaussian_with_the_error() -> None:
     assert (bounded.culprit == third).double().mean() > 0.9
 
 
-def test_without_gaussians_the_image_is_the_background() -> None:
+def test_without_gaussians_the_image_is_the_background():
     """Catches an error where a scene, or a tile, has no Gaussian."""
     for arguments in CASES["no_gaussians"]():
         image, bounded, _ = images(arguments)
@@ -166,7 +164,7 @@ def test_without_gaussians_the_image_is_the_background() -> None:
         assert bounded.bound.max() < 1e-6
 
 
-def test_other_gaussians_are_refused() -> None:
+def test_other_gaussians_are_refused():
     """Catches float64 taken for float32, and two sets of Gaussians that differ in number."""
     arguments = pictures.crowd(torch.Generator().manual_seed(0), 4, 1.0)
     single = tuple(arguments.get(name) for name in NAMES)

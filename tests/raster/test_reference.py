@@ -26,7 +26,7 @@ def brute_force(arguments: dict[str, Any], **more: Any) -> Picture:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_picture_is_the_brute_force_one(name: str) -> None:
+def test_picture_is_the_brute_force_one(name):
     """Catches any wrong rule of the picture, a tile, bound or padding that loses or invents a Gaussian; radii that miss
     a pixel drawn or hide a Gaussian from density control, and depths of another camera."""
     arguments = case(name)
@@ -47,7 +47,7 @@ def test_picture_is_the_brute_force_one(name: str) -> None:
     assert info.pairs >= drawn
 
 
-def test_tiles_are_blended_together_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_are_blended_together_as_far_as_memory_allows(monkeypatch):
     """Catches tiles that are blended one at a time, and a tile above the limit that is never blended."""
     arguments, pieces, blend = case("random"), [], reference._blend_tiles
     monkeypatch.setattr(reference, "_blend_tiles", lambda *tiles: pieces.append(tiles) or blend(*tiles))
@@ -59,7 +59,7 @@ def test_tiles_are_blended_together_as_far_as_memory_allows(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_picture_in_single_precision(name: str) -> None:
+def test_picture_in_single_precision(name):
     """Catches cancellation: float32 keeps 1e-4 wherever no rounding can flip a decision of the picture's rules; NaN by
     way of what is not drawn (behind the camera, singular, transparent), and a picture without an autograd graph."""
     arguments = case(name, torch.float32)
@@ -80,9 +80,7 @@ def test_picture_in_single_precision(name: str) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.none() | st.floats(-3, 6), st.floats(-3, 4), st.floats(0, 1))
-def test_any_scene_is_drawn_as_by_brute_force(
-    seed: int, exponent: float | None, log_size: float, opacity: float
-) -> None:
+def test_any_scene_is_drawn_as_by_brute_force(seed, exponent, log_size, opacity):
     """Catches what no case shows: a camera that is not the inverse of its pose, a use of F other than by F F^T, a sort
     by index, a background that is not dimmed; in float32 NaN and more light than there is, at any size."""
     g = torch.Generator().manual_seed(seed)
@@ -125,7 +123,7 @@ GRADIENT_CASES = (
 
 
 @pytest.mark.parametrize("name", GRADIENT_CASES)
-def test_gradients_of_every_input(name: str) -> None:
+def test_gradients_of_every_input(name):
     """Catches a wrong or missing derivative of any input, cameras and background included (central differences)."""
     arguments = smooth(name)
     # Of Ks the four numbers: the others are fixed, and refused when central differences move them.
@@ -147,7 +145,7 @@ def test_gradients_of_every_input(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["random", "off_screen", "three_cameras"])
-def test_gradient_of_2d_means(name: str) -> None:
+def test_gradient_of_2d_means(name):
     """Catches `info.means2d` off the path of the loss: its gradient, which drives densification, would be None."""
     arguments = smooth(name)
     arguments["means"].requires_grad_()
@@ -168,7 +166,7 @@ def test_gradient_of_2d_means(name: str) -> None:
     assert np.abs(expected).max() > 1e-2
 
 
-def test_a_point_without_filter() -> None:
+def test_a_point_without_filter():
     """Catches 0/0 where nothing is added to a covariance of zero: not drawn, and no NaN in any gradient."""
     arguments = case("random") | {"eps2d": 0.0}
     arguments["factors"][::2] = 0
@@ -181,13 +179,13 @@ def test_a_point_without_filter() -> None:
     assert output.info.radii[:, 1::2].any()
 
 
-def test_beta_vector() -> None:
+def test_beta_vector():
     """Catches another formula of a Beta profile than that of Universal Beta Splatting, in value, size and gradient."""
     assert_beta_vector("reference", torch.float64, 1e-4)
 
 
 @pytest.mark.parametrize("shape", [1e-6, 0.3, 1.0])
-def test_gradients_at_the_rim_are_held(shape: float) -> None:
+def test_gradients_at_the_rim_are_held(shape):
     """Catches an infinite gradient, or a missing one, where 1 - r^2 is below 1e-6 and the exponent below 1."""
     rim = torch.tensor([0.99, 1 - 1e-6, 1 - 1e-9, 1 - 1e-16, 1.0, 1.1, 1e300], dtype=torch.float64, requires_grad=True)
     exponents = torch.full((7,), shape, dtype=torch.float64, requires_grad=True)
@@ -201,7 +199,7 @@ def test_gradients_at_the_rim_are_held(shape: float) -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_same_bits_twice() -> None:
+def test_same_bits_twice():
     """Catches sums whose order depends on the threads, in the picture and in every gradient.
 
     Large enough that torch runs its scatters in parallel: with 2 threads `table[index]` failed this.

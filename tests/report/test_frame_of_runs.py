@@ -36,7 +36,7 @@ def test_every_metric_and_cost_has_a_column_in_its_unit():
     assert (run.frame_ms, run.gaussians) == (cost.render_ms.p50, cost.num_gaussians)
 
 
-def test_a_run_counts_once(tmp_path: Path):
+def test_a_run_counts_once(tmp_path):
     """Would catch a copied record that counts as another seed."""
     for folder in ("a", "b"):
         files.write(make(), tmp_path / folder / files.FILE_NAME)

@@ -1,13 +1,12 @@
 """Records that somebody changed by hand: what cannot be is in no table, and is told with its place and the reason."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from records import but, elsewhere, make, on_demand, run, write_all
 
 from gsbench.measure.curve import Point
-from gsbench.measure.record import LengthChoice, Record, Region, Stop
+from gsbench.measure.record import LengthChoice, Region, Stop
 from gsbench.report import study
 from gsbench.report.frame import load
 
@@ -57,7 +56,7 @@ GATED = on_demand([make(seed=9)])[0]
         ),
     ],
 )
-def test_what_cannot_be_is_left_out_in_a_line(edited: Record, reason: str, tmp_path: Path) -> None:
+def test_what_cannot_be_is_left_out_in_a_line(edited, reason, tmp_path):
     """Catches a record that was changed by hand and ranks among others, also where it is a row of a study."""
     write_all([make(), edited], tmp_path / "results")
     study.write([make(), edited], tmp_path / "study")
@@ -69,7 +68,7 @@ def test_what_cannot_be_is_left_out_in_a_line(edited: Record, reason: str, tmp_p
         assert reason in fault
 
 
-def test_what_can_be_is_kept(tmp_path: Path) -> None:
+def test_what_can_be_is_kept(tmp_path):
     """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a negative z."""
     screen = replace(GATED.on_demand.screen, z=-1.7)
     gained = but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-0.3)], "screen": screen})

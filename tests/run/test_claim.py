@@ -61,7 +61,7 @@ def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
 
 @pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
 @pytest.mark.parametrize("mounts", ["one folder", "two mounts"], indirect=True)
-def test_of_many_processes_one_has_the_run(left: str, mounts: list[Path], tmp_path: Path) -> None:
+def test_of_many_processes_one_has_the_run(left, mounts, tmp_path):
     """Catches a claim that is looked for and then made, so that several make it, one that nobody takes over, and a run
     that two hosts do, as their mounts show each other's files late."""
     folders = [tmp_path / "disk" / str(number) for number in range(ROUNDS)]
@@ -83,7 +83,7 @@ def test_of_many_processes_one_has_the_run(left: str, mounts: list[Path], tmp_pa
         assert names(folder) == [FILE_NAME, f"won.{progress.read(folder / FILE_NAME).pid}"]
 
 
-def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -> None:
+def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path):
     """Catches a run that two commands of one job do, one that a requeued job waits for, and a later claim removed."""
     claim = Progress([], job="7")
     elsewhere = replace(claim, host="elsewhere", job=None)
@@ -107,7 +107,7 @@ def test_a_claim_is_left_to_the_living_and_taken_from_the_dead(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("times", [2, 1000])
-def test_a_stale_handle_makes_no_claim_a_dead_one(times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stale_handle_makes_no_claim_a_dead_one(times, tmp_path, monkeypatch):
     """Catches a live claim that is removed because its file was replaced on the server while it was read."""
     elsewhere, opened, stale = Progress([], host="elsewhere"), os.open, iter(range(times))
     progress.write(tmp_path, elsewhere)
@@ -125,7 +125,7 @@ def test_a_stale_handle_makes_no_claim_a_dead_one(times: int, tmp_path: Path, mo
     assert progress.read(tmp_path / FILE_NAME) == elsewhere
 
 
-def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path: Path) -> None:
+def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path):
     """Catches a claim that is removed by a process which read the one before it."""
     dead, claim = progress.encode(Progress([], born=1)), Progress([])
     progress.write(tmp_path, claim)
@@ -135,7 +135,7 @@ def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("alive", [True, False])
-def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_process_alone_removes_a_dead_claim(alive, tmp_path, monkeypatch):
     """Catches two processes that remove a claim in turn, and a run that none can do as one was killed at that."""
     monkeypatch.setattr(progress, "PAUSE", 0)
     progress.write(tmp_path, Progress([], born=1))
@@ -154,7 +154,7 @@ def test_one_process_alone_removes_a_dead_claim(alive: bool, tmp_path: Path, mon
 
 
 @pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP])
-def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_links_has_claims(number, tmp_path, monkeypatch):
     """Catches runs that cannot be done on a FAT disk."""
 
     def link(*_: object) -> None:
@@ -167,9 +167,7 @@ def test_a_file_system_without_links_has_claims(number: int, tmp_path: Path, mon
     assert names(tmp_path) == [FILE_NAME]
 
 
-def test_a_run_that_another_process_does_is_left_to_it(
-    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_another_process_does_is_left_to_it(square, tmp_path, monkeypatch, capsys):
     """Catches two sweeps on one folder that train the same run twice, and a claim made once the scene is loaded."""
     spec = spec_of(overrides(square, tmp_path, "model=3dgs", "train.iterations=3"))
     loaded, claims = execution.load_scene, list[Path]()

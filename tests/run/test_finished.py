@@ -119,13 +119,13 @@ QUANTISED = "what is measured is another (protocol.quantise True instead of Fals
 )
 @pytest.mark.usefixtures("trains")
 def test_what_differs_is_named_and_nothing_else_is_done(
-    words: tuple[str, ...],
-    change: Callable[[Finished], None],
-    reason: str,
-    run: Finished,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+    words,
+    change,
+    reason,
+    run,
+    tmp_path,
+    capfd,
+):
     """Catches a training of hours that is announced as a measurement, repeated because data were moved, or done for no
     reason that is said, and a stranger who takes a kept record's seconds for his own machine's."""
     (tmp_path / "moved").symlink_to(run.data)
@@ -140,7 +140,7 @@ def test_what_differs_is_named_and_nothing_else_is_done(
 
 
 @pytest.mark.usefixtures("trains")
-def test_a_release_trains_nothing_again(run: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_release_trains_nothing_again(run, monkeypatch):
     """Catches a version in the name of a run, in its hash or in its checkpoint, which would cost every training."""
     monkeypatch.setattr(provenance, "__version__", "9.9.9")
     assert run.again() == run.first
@@ -150,9 +150,7 @@ def test_a_release_trains_nothing_again(run: Finished, monkeypatch: pytest.Monke
 
 
 @pytest.mark.usefixtures("trains")
-def test_weights_that_come_and_go_cost_no_training(
-    run: Finished, weights: set[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_that_come_and_go_cost_no_training(run, weights, tmp_path, capfd):
     """Catches a training that LPIPS weights cost, a column that stays empty although they are there, one that is lost
     as they go, and a finished record lost to a path that is wrong."""
     assert run.first.metrics["lpips_vgg"] is None
@@ -173,13 +171,13 @@ def test_weights_that_come_and_go_cost_no_training(
     assert "whose weights are here now, but its checkpoint is gone: kept without" in capfd.readouterr().err
 
 
-def test_weights_that_are_named_must_exist(tmp_path: Path) -> None:
+def test_weights_that_are_named_must_exist(tmp_path):
     """Catches a file that is named and missing, in whose place another is loaded."""
     with pytest.raises(InputError):
         perceptual.load("vgg", tmp_path / "gone.pth")
 
 
-def test_a_run_that_ends_well_at_last_leaves_its_record_alone(tmp_path: Path) -> None:
+def test_a_run_that_ends_well_at_last_leaves_its_record_alone(tmp_path):
     """Catches the record of an earlier success that stays beside a later one."""
     folder = tmp_path / "run"
     for each, count in ((make(), 1), (lost(make()), 2), (lost(make()), 2), (make(), 1)):

@@ -44,7 +44,7 @@ def named(*words: str) -> RunSpec:
         ),
     ],
 )
-def test_a_folder_says_what_is_not_the_experiments_own(words: list[str], folder: str) -> None:
+def test_a_folder_says_what_is_not_the_experiments_own(words, folder):
     """Catches two runs in one folder, and a folder named after what the experiment does anyway."""
     run = named(*words)
     assert run.folder == Path(f"results/mini/suzanne/{folder}/seed{run.config.seed}")
@@ -63,13 +63,13 @@ TRAINING = (
 
 
 @pytest.mark.parametrize("word", [*MEASURING, *TRAINING])
-def test_what_changes_the_training_changes_its_hash_and_nothing_else_does(word: str) -> None:
+def test_what_changes_the_training_changes_its_hash_and_nothing_else_does(word):
     """Catches a training repeated because it is measured in another way, and another run's checkpoint that is taken."""
     assert (training_hash(named(word).plain) == training_hash(named().plain)) == (word in MEASURING)
     assert word in TRAINING or named(word).variant == ""
 
 
-def test_a_file_to_start_from_is_training(tmp_path: Path) -> None:
+def test_a_file_to_start_from_is_training(tmp_path):
     """Catches a run that is taken for one that started from another file, and one that depends on the file's place."""
     runs = []
     for name, content in (("a", b"1"), ("b", b"2"), ("c", b"1")):
@@ -82,7 +82,7 @@ def test_a_file_to_start_from_is_training(tmp_path: Path) -> None:
     assert a.plain["init"]["ply_sha256"] == a.config.init.ply_sha256 == hashlib.sha256(b"1").hexdigest()
 
 
-def test_the_protocol_of_dgs_is_whole_and_its_parts_can_be_set() -> None:
+def test_the_protocol_of_dgs_is_whole_and_its_parts_can_be_set():
     """Catches a name that stands over another filter, rounding, batch or number of tests than its authors'."""
     words = ["+exp=dnerf", "data.root=/d", "scene=lego", "model=dgs", "protocol=dgs2026"]
     config = spec_of(words).config
@@ -93,7 +93,7 @@ def test_the_protocol_of_dgs_is_whole_and_its_parts_can_be_set() -> None:
     assert spec_of([*words, "+recipe=mcmc", "train.batch_size=1"]).config.train.batch_size == 1
 
 
-def test_a_comparison_is_training_and_its_candidates_count_only_with_it() -> None:
+def test_a_comparison_is_training_and_its_candidates_count_only_with_it():
     """Catches model=auto that trains every finished run again, as its settings have candidates to compare."""
     words, other = ("model=auto", "effects.compare=true"), "model.compared.moving_4dgs.options.time_degree=1"
     runs = [named("model=auto"), named(*words), named(*words, "effects.gate=off"), named(*words, other)]
@@ -112,14 +112,14 @@ def test_a_comparison_is_training_and_its_candidates_count_only_with_it() -> Non
         ("scene.name=published", "another name than 'published'"),
     ],
 )
-def test_what_cannot_name_a_run_is_refused(words: str, message: str) -> None:
+def test_what_cannot_name_a_run_is_refused(words, message):
     """Catches another training in the folder of the default, as a class has other defaults than YAML, and a run whose
     record every table passes by, as it lies among those that are published."""
     with pytest.raises(InputError, match=message):
         named(*words.split())
 
 
-def test_long_names_are_cut_at_a_word_and_stay_different() -> None:
+def test_long_names_are_cut_at_a_word_and_stay_different():
     """Catches folders that no file system takes, and two runs that are cut to one name."""
     keys = ("means", "times", "directions", "shape", "motion")
     many = [f"model.lr.{key}.start={i}e-3" for i, key in enumerate(keys, 1)]
@@ -131,7 +131,7 @@ def test_long_names_are_cut_at_a_word_and_stay_different() -> None:
     assert named(*many[::-1]).variant == first.variant  # whatever the order of the words
 
 
-def test_the_words_repeat_the_run(tmp_path: Path) -> None:
+def test_the_words_repeat_the_run(tmp_path):
     """Catches a record whose command line does another run than its own."""
     run = named("train.iterations=10", f"results={tmp_path}", "seed=2")
     assert run.overrides == ["+exp=mini", "scene=suzanne", "seed=2", "train.iterations=10"]

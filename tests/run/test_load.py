@@ -21,7 +21,7 @@ def folder(square: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_here(*overrides(square, tmp_path_factory.mktemp("r"), "model=7dgs", "train.iterations=20"))[1]
 
 
-def test_the_loaded_model_renders_what_was_measured(folder: Path) -> None:
+def test_the_loaded_model_renders_what_was_measured(folder):
     """Catches a model that comes back without its active components, its background, AGR or lambda."""
     run = package.load_run(folder)
     measured = record.read(folder / record.FILE_NAME)
@@ -34,14 +34,14 @@ def test_the_loaded_model_renders_what_was_measured(folder: Path) -> None:
         assert float(-10 * mse.log10()) == pytest.approx(score.psnr, abs=1e-4)
 
 
-def test_a_folder_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
     """Catches a stack trace for a wrong path."""
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(InputError, match="expected the folder of a run with a checkpoint"):
             load_run(path)
 
 
-def test_a_checkpoint_whose_config_is_of_another_model_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_whose_config_is_of_another_model_is_refused(folder, tmp_path):
     """Catches parameters of one model that are rendered as another's, and a config that is no config."""
     saved = checkpoint.read(folder / checkpoint.FILE_NAME)
     other = {**saved.config, "agr": False}

@@ -61,7 +61,7 @@ def run_in(folder: Path, log: str | None = None) -> Any:
     )
 
 
-def test_a_resumed_run_repeats_no_line(tmp_path: Path) -> None:
+def test_a_resumed_run_repeats_no_line(tmp_path):
     """Catches lines after the last checkpoint that come twice, a half-written line, and a loss that a resume loses."""
     killed = trainer((10, 1.0, 20.0))
     log = RunLog(run_in(tmp_path), killed)
@@ -87,7 +87,7 @@ def test_a_resumed_run_repeats_no_line(tmp_path: Path) -> None:
     assert lines(tmp_path) == []  # a run that starts over
 
 
-def test_lines_that_cannot_be_written_cost_no_run(tmp_path: Path) -> None:
+def test_lines_that_cannot_be_written_cost_no_run(tmp_path):
     """Catches a full disk, or here a folder in the place of the file, that ends a training."""
     (tmp_path / FILE_NAME).mkdir()
     training = trainer()
@@ -122,9 +122,7 @@ def sent_to(name: str, packages: dict[str, MagicMock]) -> tuple[dict[int, dict[s
     ("name", "ended"),
     [("tensorboard", call()), ("wandb", call(exit_code=0)), ("mlflow", call("made_anew_0", "FINISHED"))],
 )
-def test_a_tracker_is_sent_the_curve_and_the_results(
-    name: str, ended: object, packages: dict[str, MagicMock], square: Path, tmp_path: Path
-) -> None:
+def test_a_tracker_is_sent_the_curve_and_the_results(name, ended, packages, square, tmp_path):
     """Catches a point or a result that does not arrive, steps that are off by one, and settings of another run."""
     record, folder = run_here(*overrides(square, tmp_path, "model=3dgs", f"log={name}"))
     by_step, settings, end = sent_to(name, packages)
@@ -143,7 +141,7 @@ def test_a_tracker_is_sent_the_curve_and_the_results(
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
-def test_a_resumed_run_has_the_same_id(name: str, packages: dict[str, MagicMock], tmp_path: Path) -> None:
+def test_a_resumed_run_has_the_same_id(name, packages, tmp_path):
     """Catches a run that is two runs of the tracker, one that starts over under its old id, and an id with a path."""
     ids = []
     for step in (0, 10, 0):
@@ -171,7 +169,7 @@ def test_a_resumed_run_has_the_same_id(name: str, packages: dict[str, MagicMock]
         assert packages[name].finish.call_args == call(exit_code=1)
 
 
-def test_tensorboard_hides_what_is_trained_again(packages: dict[str, MagicMock], tmp_path: Path) -> None:
+def test_tensorboard_hides_what_is_trained_again(packages, tmp_path):
     """Catches a curve that goes back in time after a kill."""
     RunLog(run_in(tmp_path, "tensorboard"), trainer((10, 1.0, 20.0)))
     writer = packages["torch.utils.tensorboard"].SummaryWriter
@@ -179,9 +177,7 @@ def test_tensorboard_hides_what_is_trained_again(packages: dict[str, MagicMock],
 
 
 @pytest.mark.parametrize("broken", ["start", "add", "end"])
-def test_a_tracker_that_fails_is_told_once_and_costs_nothing(
-    broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tracker_that_fails_is_told_once_and_costs_nothing(broken, tmp_path, monkeypatch, capsys):
     """Catches a server that is down and ends a run, or fills its log with the same warning."""
     start = MagicMock()
     part = start if broken == "start" else getattr(start.return_value, broken)
@@ -206,9 +202,7 @@ def test_a_tracker_that_fails_is_told_once_and_costs_nothing(
         ("tensorbord", "log 'tensorbord' is not known. Did you mean 'tensorboard'"),
     ],
 )
-def test_what_is_not_installed_or_known_is_refused_at_the_door(
-    name: str, message: str, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_installed_or_known_is_refused_at_the_door(name, message, square, tmp_path, monkeypatch):
     """Catches a run that trains for hours before it says so, or a finished run whose record becomes a failed one."""
     _, folder = run_here(*overrides(square, tmp_path, "model=3dgs"))
     record = (folder / "record.json").read_bytes()

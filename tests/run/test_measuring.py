@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from report.records import make
@@ -20,9 +19,7 @@ SCRIPTED = {10: (20.0, 30.0), 20: (24.0, 31.0), 30: (22.0, 33.0)}
 
 
 @pytest.mark.parametrize(("split", "on_val", "on_test"), [("test", 31.0, 33.0), ("val", None, 24.0)])
-def test_the_best_iteration_is_chosen_on_val(
-    split: str, on_val: float | None, on_test: float, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_iteration_is_chosen_on_val(split, on_val, on_test, square, tmp_path, monkeypatch):
     """Catches PSNR on val in place of that on test, the last iteration or the best on test in place of the best on val,
     and a number where results are measured on val themselves."""
 
@@ -49,7 +46,7 @@ def test_the_best_iteration_is_chosen_on_val(
         (None, None),
     ],
 )
-def test_a_training_that_was_better_earlier_says_so(last: float | None, sentence: str | None) -> None:
+def test_a_training_that_was_better_earlier_says_so(last, sentence):
     """Catches a training that overfits in silence, and one that is called too long for less than seeds differ by."""
     record = replace(make(), curve=[Point(300, 1.0, 24.0), Point(600, 2.0, 25.0), Point(900, 3.0, last)])
     assert (sentence or "PSNR") in summary(record)
@@ -58,21 +55,21 @@ def test_a_training_that_was_better_earlier_says_so(last: float | None, sentence
     assert sentence or "higher" not in summary(record)
 
 
-def test_views_at_the_cap_are_named() -> None:
+def test_views_at_the_cap_are_named():
     """Catches a PSNR that nobody can tell from one without a view that is rendered exactly."""
     exact = summary(replace(make(), exact=["test/r_3"]))
     assert ". PSNR of test/r_3 is infinite or nearly so and counts as 100 dB" in exact
     assert "counts as" not in summary(make())
 
 
-def test_the_line_of_a_run_begins_with_its_psnr() -> None:
+def test_the_line_of_a_run_begins_with_its_psnr():
     """Catches a run that seems to have no PSNR, and a stack trace for one that has none."""
     psnr = make().metrics["psnr"]
     assert summary(make()).startswith(f"PSNR {psnr:.2f} dB, ")
     assert summary(replace(make(), metrics={"psnr": None})).startswith("PSNR - dB, ")
 
 
-def test_a_film_has_its_flicker_in_the_record(square: Path, tmp_path: Path) -> None:
+def test_a_film_has_its_flicker_in_the_record(square, tmp_path):
     """Catches numbers of 8 bits in place of floats, a film without a picture, and a static model that moves."""
     data = shutil.copytree(square, tmp_path / "data")
     path = data / "square/transforms_test.json"

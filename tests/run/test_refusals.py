@@ -68,7 +68,7 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("3dgs", "train.coarse=[[2,3000]]", "train.coarse, after the factor 2: expected images of at least 11 pixels"),
     ],
 )
-def test_settings_are_refused_before_the_first_step(model: str, words: str, message: str | None) -> None:
+def test_settings_are_refused_before_the_first_step(model, words, message):
     """Catches a key that does nothing, a typo that trains by another rule than was asked for, a training of no step,
     and results on the views by which a choice was made."""
     square, config = moving_square(), compose(model, 15, *words.split())

@@ -132,9 +132,7 @@ def screen(decision: str, seconds: float = 0.0) -> TimeScreen:
 # ---- both choices
 
 
-def test_the_best_on_val_has_the_bits_of_its_training_alone(
-    choice: Choice, whole: tuple[Record, Path], square: Path, tmp_path: Path
-) -> None:
+def test_the_best_on_val_has_the_bits_of_its_training_alone(choice, whole, square, tmp_path):
     """Catches another choice than the best on val, other bits than the candidate alone has, and hidden costs."""
     record, folder = whole
     best, after, tried = chosen_in(record)
@@ -164,9 +162,7 @@ def test_the_best_on_val_has_the_bits_of_its_training_alone(
 
 
 @pytest.mark.parametrize("when", ["midway", "chosen"])
-def test_a_kill_repeats_no_step(
-    when: str, choice: Choice, whole: tuple[Record, Path], square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_repeats_no_step(when, choice, whole, square, tmp_path, monkeypatch):
     """Catches a candidate that is trained again, a lost choice, and other bits: killed after every few saves."""
     steps, words = counted_steps(monkeypatch), overrides(square, tmp_path, *choice.words)
     record, folder = run_through_kills(choice.saves[when], monkeypatch, lambda: run_here(*words))
@@ -180,9 +176,7 @@ def test_a_kill_repeats_no_step(
     assert logged(folder) == [point.iteration for point in record.curve]
 
 
-def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
-    choice: Choice, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_finished_run_is_kept_and_measured_again_with_its_choice(choice, square, tmp_path, capsys, monkeypatch):
     """Catches a second call that trains, a record that loses the choice when images are measured again, and a tracker
     that lacks the steps before the choice, and a progress that starts over with each candidate."""
     words, tracker = overrides(square, tmp_path, *choice.words, "log=json"), MagicMock()
@@ -208,9 +202,7 @@ def test_a_finished_run_is_kept_and_measured_again_with_its_choice(
     assert measured.metrics == record.metrics
 
 
-def test_a_candidate_that_fails_loses(
-    choice: Choice, square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_candidate_that_fails_loses(choice, square, tmp_path, monkeypatch):
     """Catches a run that fails because some of its candidates did: on scene10_texture 6DGS prunes all Gaussians."""
     descend, (diverging, emptied) = Trainer.train_step, choice.failing
 
@@ -246,9 +238,7 @@ def test_a_candidate_that_fails_loses(
         (None, ("4dgs",), "4dgs", False),
     ],
 )
-def test_a_scene_that_may_move_has_a_model_with_time(
-    decision: str | None, words: tuple[str, ...], model: str, agr: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_that_may_move_has_a_model_with_time(decision, words, model, agr, monkeypatch):
     """Catches an undecided scene that loses its motion, AGR in a static model, and a screen for a model with a name."""
     monkeypatch.setattr(selection, "screen_time", lambda *_: screen(str(decision)))
     config = compose(words[0], 10, *words[1:])
@@ -257,7 +247,7 @@ def test_a_scene_that_may_move_has_a_model_with_time(
     assert (chosen.config.model.name, chosen.config.agr, screened) == (model, agr, decision)
 
 
-def test_a_scene_without_times_is_static_and_not_compared(tmp_path: Path) -> None:
+def test_a_scene_without_times_is_static_and_not_compared(tmp_path):
     """Catches model=auto that is refused, as AGR is, for images without times, and models with time that it trains."""
     data = write_moving_square(tmp_path / "data")
     for path in data.glob("*/*.json"):
@@ -273,9 +263,7 @@ def test_a_scene_without_times_is_static_and_not_compared(tmp_path: Path) -> Non
     assert checkpoint.read(folder / checkpoint.FILE_NAME).config["model"]["name"] == "6dgs"
 
 
-def test_resume_false_starts_every_candidate_over(
-    square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resume_false_starts_every_candidate_over(square, tmp_path, monkeypatch, capsys):
     """Catches a candidate of an earlier attempt that is taken although the user asked to start over."""
     save = checkpoint.save
     with monkeypatch.context() as patched:
@@ -288,7 +276,7 @@ def test_resume_false_starts_every_candidate_over(
     assert not (folder / FOLDER).exists()
 
 
-def test_candidates_are_those_of_the_settings() -> None:
+def test_candidates_are_those_of_the_settings():
     """Catches AGR in a candidate that has none, equal candidates twice, and names that hide one another."""
     by_label = candidates(compose("auto", 10, "effects.compare=true"))
     assert {label: (config.model.name, config.agr, config.model.gate) for label, config in by_label.items()} == {
@@ -309,13 +297,13 @@ def test_candidates_are_those_of_the_settings() -> None:
 
 @pytest.mark.parametrize(("most", "best"), [(5.0, "hexplane"), (4.9, "4dgs")])
 def test_a_field_is_chosen_without_gates_and_within_the_budget(
-    most: float,
-    best: str,
-    square: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    most,
+    best,
+    square,
+    tmp_path,
+    capsys,
+    monkeypatch,
+):
     """Catches a field that gates refuse or that is loaded with them, slower frames than are allowed, and prices that
     are not in the record or not printed."""
     ms = {"7dgs": 2.0, "hexplane": 5.0}
@@ -339,7 +327,7 @@ def test_a_field_is_chosen_without_gates_and_within_the_budget(
     assert row in [line.split() for line in capsys.readouterr().err.splitlines()]
 
 
-def test_candidates_end_where_their_seconds_do(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_end_where_their_seconds_do(square, tmp_path, monkeypatch):
     """Catches a candidate that trains on although it cannot be chosen, and one that is chosen nevertheless."""
     steps, words = counted_steps(monkeypatch), ("effects.most_seconds=1e-9", *MODELS.words)
     record, _ = run_here(*overrides(square, tmp_path, *words))
@@ -351,14 +339,14 @@ def test_candidates_end_where_their_seconds_do(square: Path, tmp_path: Path, mon
 # ---- train.lengths
 
 
-def test_each_length_is_twice_the_one_before() -> None:
+def test_each_length_is_twice_the_one_before():
     """Catches a last length that is not the one which was asked for, and odd numbers that are not halved."""
     assert [
         (each.train.iterations, each.train.lengths) for each in lengths(compose("7dgs", 75, "train.lengths=3")).values()
     ] == [(18, None), (37, None), (75, None)]
 
 
-def test_the_longest_is_kept_if_each_is_better(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_longest_is_kept_if_each_is_better(square, tmp_path, monkeypatch):
     """Catches trainings that end before the longest although PSNR on val still rises, lengths of another model than
     the screen of model=auto chose, and seconds of the screen that are lost."""
     for length, loss in ((10, 1.0), (40, -1.0), (80, -2.0)):

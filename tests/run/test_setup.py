@@ -28,7 +28,7 @@ def config(root: Path, scene: str) -> Config:
     ("scene", "folder"),
     [("heart1", "heart"), ("heart1", "heart1"), ("heart2", "heart_1600"), ("heart2", "heart2"), ("cloud", "cloud")],
 )
-def test_the_scene_has_the_name_of_the_paper_or_of_the_release(scene: str, folder: str, tmp_path: Path) -> None:
+def test_the_scene_has_the_name_of_the_paper_or_of_the_release(scene, folder, tmp_path):
     """Catches a downloaded release that has to be renamed first, and heart1 taken for the larger heart."""
     for other in ("dust", "heart_800"):
         write_tiny(tmp_path / other)
@@ -47,14 +47,14 @@ def test_the_scene_has_the_name_of_the_paper_or_of_the_release(scene: str, folde
     ("scene", "names", "tried"),
     [("heart1", "'heart1' or 'heart'", "{0}/heart1 and {0}/heart"), ("dust", "'dust'", "{0}/dust")],
 )
-def test_a_missing_scene_is_named_as_in_paper_and_release(scene: str, names: str, tried: str, tmp_path: Path) -> None:
+def test_a_missing_scene_is_named_as_in_paper_and_release(scene, names, tried, tmp_path):
     """Catches a message that sends a reader of the paper, or of the release, after a folder that is not there."""
     places = tried.format(tmp_path)
     with pytest.raises(InputError, match=rf"a folder {names} with a scene.*looked for {places};.*gaozhongpai\.github"):
         scene_folder(config(tmp_path, scene))
 
 
-def test_the_record_has_the_protocol(square: Path, tmp_path: Path) -> None:
+def test_the_record_has_the_protocol(square, tmp_path):
     """Catches images of another filter under a record that is silent about it, and a best on test that is left out."""
     words = overrides(square, tmp_path, "model=dgs", "train.iterations=2", "protocol.pictures=0")
     record, folder = run_here(*words, "protocol=dgs2026")
@@ -70,7 +70,7 @@ def test_the_record_has_the_protocol(square: Path, tmp_path: Path) -> None:
         run_here(*words, "scene.resize=pilow")
 
 
-def test_the_record_names_a_replaced_image(tmp_path: Path) -> None:
+def test_the_record_names_a_replaced_image(tmp_path):
     """Catches an option that the run does not pass on, and numbers of a repaired scene that look like any other's."""
     folder = tmp_path / "Tiny"
     folder.mkdir()
@@ -110,7 +110,7 @@ def words(square: Path, tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("model", ["3dgs", "7dgs"])
-def test_a_run_starts_from_a_ply(model: str, words: list[str], tmp_path: Path) -> None:
+def test_a_run_starts_from_a_ply(model, words, tmp_path):
     """Catches a file that is read and not used, a record that does not say which, and a run that is done again."""
     trained = write_trained(tmp_path / "a.ply")
     words += [f"model={model}", "model.lr.means.start=1e-6"]  # one step moves means by 1e-6 x extent x sqrt(30,000)
@@ -137,14 +137,14 @@ def test_a_run_starts_from_a_ply(model: str, words: list[str], tmp_path: Path) -
     ],
 )
 def test_a_ply_that_cannot_be_the_start_is_refused(
-    count: int,
-    away: int,
-    more: str,
-    reason: str | None,
-    words: list[str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    count,
+    away,
+    more,
+    reason,
+    words,
+    tmp_path,
+    capsys,
+):
     """Catches a refusal without a record, a hash that nothing is compared with, a training of black images, and one of
     a few Gaussians in sight without a line."""
     write_trained(tmp_path / "a.ply", count, away)
@@ -154,7 +154,7 @@ def test_a_ply_that_cannot_be_the_start_is_refused(
     assert ("the training cameras see 25% of the Gaussians" in capsys.readouterr().err) == (away == 6)
 
 
-def test_an_endless_file_is_refused(words: list[str]) -> None:
+def test_an_endless_file_is_refused(words):
     """Catches a file that is read before the run has a name."""
     with pytest.raises(InputError, match=r"init\.ply='/dev/zero': expected a file, found a device"):
         run_here(*words[:-1], "+init.ply=/dev/zero")

@@ -30,7 +30,7 @@ def trains(results: Path) -> bool:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGUSR2, 140)])
-def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, square: Path, tmp_path: Path) -> None:
+def test_a_signal_saves_and_ends_in_one_line(number, code, square, tmp_path):
     """Catches the minutes since the last checkpoint lost, a stack trace, and a run that looks as if it still ran."""
     results = tmp_path / "results"
     process, deadline = Forked(tmp_path, "gsbench", *overrides(square, results, *LONG)), time.monotonic() + 120
@@ -49,7 +49,7 @@ def test_a_signal_saves_and_ends_in_one_line(number: signal.Signals, code: int, 
 
 
 @pytest.mark.parametrize("number", stop.SIGNALS)
-def test_a_signal_is_noted_while_a_run_lasts(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_is_noted_while_a_run_lasts(number, monkeypatch):
     """Catches a handler that stays after its run, a process that cannot be stopped while it saves to a disk that hangs,
     one that `timeout` ends at once, as it signals the process and then its group, and Ctrl-C for a sweep in the
     background."""
@@ -76,7 +76,7 @@ def test_a_signal_is_noted_while_a_run_lasts(number: int, monkeypatch: pytest.Mo
         signal.signal(number, before)
 
 
-def test_a_second_request_ends_a_process_that_had_no_handler() -> None:
+def test_a_second_request_ends_a_process_that_had_no_handler():
     """Catches a process that cannot be ended by its signal while it saves."""
     code = """
 import os, signal
@@ -90,7 +90,7 @@ with stop.requested() as request:
     assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGTERM
 
 
-def test_a_run_reports_once_an_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_reports_once_an_interval(tmp_path, monkeypatch):
     """Catches a run that never reports after its start, which looks dead, and one that reports after each step."""
     clock = SimpleNamespace(monotonic=lambda: now, time=time.time)
     monkeypatch.setattr(progress, "time", clock)
@@ -104,7 +104,7 @@ def test_a_run_reports_once_an_interval(tmp_path: Path, monkeypatch: pytest.Monk
         assert progress.read(tmp_path / progress.FILE_NAME).step == step
 
 
-def test_leftovers_of_killed_processes_go(square: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leftovers_of_killed_processes_go(square, tmp_path, monkeypatch):
     """Catches folders that fill with parts of checkpoints, and a part that another process is just writing removed."""
     words = overrides(square, tmp_path, "model=3dgs", "train.iterations=3", "protocol.pictures=0")
     _, folder = run_here(*words)

@@ -176,7 +176,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_fault_is_one_line_that_names_file_and_field(fault: str, tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_fault_is_one_line_that_names_file_and_field(fault, tiny, capfd):
     """Catches a fault let through, a stack trace from the depths, a message that leaves the user searching, and lines
     of OpenCV or libpng around it."""
     apply, file, field = FAULTS[fault]
@@ -187,7 +187,7 @@ def test_fault_is_one_line_that_names_file_and_field(fault: str, tiny: Path, cap
     assert capfd.readouterr() == ("", "") or fault == "png with too few rows"  # which libpng tells itself
 
 
-def test_tiny_is_right_unless_broken(tiny: Path) -> None:
+def test_tiny_is_right_unless_broken(tiny):
     """Without this, every case above could pass because of one and the same fault; and an error of a rotation just
     below 1e-4, as single precision has it, is a camera."""
     matrix(m01=5e-5)(tiny)
@@ -206,7 +206,7 @@ ARGUMENTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("arguments", "words"), ARGUMENTS)
-def test_a_wrong_argument_is_refused(tiny: Path, arguments: dict[str, Any], words: tuple[str, ...]) -> None:
+def test_a_wrong_argument_is_refused(tiny, arguments, words):
     """Catches a factor that leaves no pixel, images of another colour or protocol, an error of the file system, and an
     option of another layout that is ignored."""
     with pytest.raises(InputError) as caught:
@@ -214,7 +214,7 @@ def test_a_wrong_argument_is_refused(tiny: Path, arguments: dict[str, Any], word
     check_message(caught.value, *words)
 
 
-def test_memory_is_asked_for_before_an_image_is_decoded(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_asked_for_before_an_image_is_decoded(tiny, monkeypatch):
     """Catches images of a few kilobytes that fill the memory with gigabytes of pixels, and a message without sizes."""
     for name in IMAGES:
         (tiny / name).write_bytes(png(8192, 8192, b""))
@@ -225,7 +225,7 @@ def test_memory_is_asked_for_before_an_image_is_decoded(tiny: Path, monkeypatch:
     check_message(caught.value, "4 images of 8192x8192", "need 5.0 GiB of memory, 4.5 GiB are available", "downscale")
 
 
-def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch):
     """Catches threads that together take more than there is: 4 images of 3 GiB in all are kept, 4 GiB decode one."""
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     for free, threads in ((7, 1), (10.9, 1), (11, 2), (10**6, 64)):
@@ -235,7 +235,7 @@ def test_images_are_decoded_by_as_many_threads_as_memory_allows(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("name", ["nothing", "empty"])
-def test_nothing_known_in_the_folder(tmp_path: Path, name: str) -> None:
+def test_nothing_known_in_the_folder(tmp_path, name):
     """A wrong path is the commonest fault: says what was looked for, the layout, where such data is published."""
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError) as caught:
@@ -247,7 +247,7 @@ GOOD_PNG = (folder() / "suzanne" / "test" / "r_000.png").read_bytes()
 
 
 @given(st.integers(0, len(GOOD_PNG) - 1), st.integers(0, 255))
-def test_a_damaged_png_is_refused(at: int, flip: int) -> None:
+def test_a_damaged_png_is_refused(at, flip):
     """Catches a changed byte that becomes wrong pixels in a lenient decoder, and missing rows that come out black."""
     data = bytearray(GOOD_PNG)
     data[at] ^= flip
@@ -280,9 +280,7 @@ CHUNKS = [
     st.integers(0, 500),
 )
 @example((8, 6), 6, 8, None, 6 * 33)
-def test_a_png_of_any_header_is_an_image_or_refused(
-    size: tuple[int, int], color: int, depth: int, extra: tuple[bytes, bytes] | None, zeros: int
-) -> None:
+def test_a_png_of_any_header_is_an_image_or_refused(size, color, depth, extra, zeros):
     """Catches any other exception of a decoder, a text that unpacks to gigabytes, and an image of another size."""
     data = png(*size, bytes(zeros), color, depth, chunk(*extra) if extra else b"")
     try:
@@ -296,7 +294,7 @@ def test_a_png_of_any_header_is_an_image_or_refused(
 
 
 @pytest.mark.parametrize("seed", range(80))
-def test_any_damage_is_an_input_error_or_a_scene(tiny: Path, seed: int) -> None:
+def test_any_damage_is_an_input_error_or_a_scene(tiny, seed):
     """Catches any other exception, a hang, and cameras, images or times that are wrong, whatever the files hold."""
     r = random.Random(seed)
     for name in r.sample((JSON, VAL, TEST, *IMAGES), r.choice((1, 1, 2))):

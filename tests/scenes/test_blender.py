@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,7 +27,7 @@ def project(view: scenes.View, point: list[float]) -> tuple[float, float, float]
 @pytest.mark.parametrize(
     ("name", "counts"), [("moving-matte", (120, 15, 15)), ("pendulum", (132, 10, 20)), ("suzanne", (120, 15, 15))]
 )
-def test_embedded_scenes_are_complete(name: str, counts: tuple[int, int, int]) -> None:
+def test_embedded_scenes_are_complete(name, counts):
     """Catches package data that lacks a file, a wrong split, and an image out of its contract."""
     scene = scenes.load(folder() / name)
     assert (len(scene.train), len(scene.val), len(scene.test)) == counts
@@ -45,7 +44,7 @@ def test_embedded_scenes_are_complete(name: str, counts: tuple[int, int, int]) -
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_camera_of_a_known_frame(downscale: int) -> None:
+def test_camera_of_a_known_frame(downscale):
     """Golden: centre, K and name of suzanne's train/r_003, worked out by hand from its JSON. Catches intrinsics left in
     pixels of the full image, and a centre scaled as if pixel centres were integers."""
     view = scenes.load(folder() / "suzanne", downscale=downscale).train[3]
@@ -57,7 +56,7 @@ def test_camera_of_a_known_frame(downscale: int) -> None:
     torch.testing.assert_close(view.camera.K, torch.tensor([[focal, 0, center], [0, focal, center], [0, 0, 1]]))
 
 
-def test_axes(tiny: Path) -> None:
+def test_axes(tiny):
     """Catches a flipped or swapped axis: right is +u, up is -v, ahead is +depth; sides swapped on another device."""
     scene = scenes.load(tiny)
     f = 4 / math.tan(0.4)
@@ -75,12 +74,12 @@ def test_axes(tiny: Path) -> None:
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_a_large_scene_stays_in_8_bits_and_looks_the_same(
-    background: tuple[float, float, float],
-    channels: int,
-    dtype: type[np.generic],
-    tiny: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    background,
+    channels,
+    dtype,
+    tiny,
+    monkeypatch,
+):
     """Catches 500 views of 800 x 800 that take 4 GB, and 8 bits whose images differ by as much as one bit."""
     random = np.random.default_rng(1)
     rgba = random.integers(0, np.iinfo(dtype).max + 1, (240, 320, channels)).astype(dtype)
@@ -100,9 +99,7 @@ def test_a_large_scene_stays_in_8_bits_and_looks_the_same(
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("downscale", [1, 2, 3])
-def test_area_filter_is_the_mean_of_composited_blocks(
-    tiny: Path, dtype: type[np.generic], channels: int, downscale: int
-) -> None:
+def test_area_filter_is_the_mean_of_composited_blocks(tiny, dtype, channels, downscale):
     """Against a float64 mean: catches 8-bit rounding on the way, RGB/BGR, another filter, bleeding of clear pixels."""
     limit = np.iinfo(dtype).max
     rgba = np.random.default_rng(1).integers(0, limit + 1, (6, 12, channels)).astype(dtype)
@@ -129,9 +126,7 @@ def bicubic(image: np.ndarray, axis: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)])
-def test_pillows_filter_reduces_the_8_bit_composite(
-    tiny: Path, background: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pillows_filter_reduces_the_8_bit_composite(tiny, background, monkeypatch):
     """Catches a mean, a cubic that is not widened, a composite that is rounded up or reduced before it is made, and
     the filter left out where images are composited at each access."""
     rgba = cv2.cvtColor(cv2.imread(str(tiny / "train/r_0.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA) / 255.0
@@ -149,7 +144,7 @@ def test_pillows_filter_reduces_the_8_bit_composite(
     assert torch.equal(scenes.load(tiny, resize="pillow", background=background).train[0].image, whole.image)
 
 
-def test_static_sets_and_sets_without_val(tiny: Path) -> None:
+def test_static_sets_and_sets_without_val(tiny):
     """NeRF-synthetic has no time, and some copies no val: catches an invented time and a refused scene."""
     edit(tiny, lambda c: [frame.pop("time") for frame in c["frames"]], "train", "test")
     (tiny / "transforms_val.json").unlink()
@@ -159,7 +154,7 @@ def test_static_sets_and_sets_without_val(tiny: Path) -> None:
     assert all(view.time is None for view in scene.train + scene.test)
 
 
-def test_val_is_held_out_of_train_where_there_is_none(tiny: Path) -> None:
+def test_val_is_held_out_of_train_where_there_is_none(tiny):
     """Catches views that are in train and val, an extent that changes the rates, and a val that is overwritten."""
     with pytest.raises(InputError, match=r"expected no views of val, tiny has 1"):
         scenes.load(tiny).with_val(2)
@@ -173,7 +168,7 @@ def test_val_is_held_out_of_train_where_there_is_none(tiny: Path) -> None:
         scene.with_val(9)
 
 
-def test_extent_is_that_of_3dgs() -> None:
+def test_extent_is_that_of_3dgs():
     """Against the centres the JSON states: catches a diagonal, test cameras counted in, translations or a rotation the
     wrong way round for centres."""
     frames = json.loads((folder() / "suzanne" / "transforms_train.json").read_text())["frames"]
@@ -182,7 +177,7 @@ def test_extent_is_that_of_3dgs() -> None:
     assert scenes.load(folder() / "suzanne").extent == pytest.approx(1.1 * radius, rel=1e-6)
 
 
-def test_fingerprint_is_what_sha256sum_says(tiny: Path) -> None:
+def test_fingerprint_is_what_sha256sum_says(tiny):
     """The documented recipe, sha256 of sha256sum's lines, sorted by name. Catches a fingerprint that depends on where
     the data lies or on how it is loaded, or misses a file; and scene.json opened, whose effects are to be detected."""
     names = sorted(path.relative_to(tiny).as_posix() for path in tiny.rglob("*.*"))
@@ -203,7 +198,7 @@ def test_fingerprint_is_what_sha256sum_says(tiny: Path) -> None:
     assert len(fingerprints) == len(names)
 
 
-def test_opencv_log_level_is_restored(tiny: Path) -> None:
+def test_opencv_log_level_is_restored(tiny):
     """Catches a loader that leaves the whole process's OpenCV silent, after success and after failure."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_INFO)
     scenes.load(tiny)
@@ -213,7 +208,7 @@ def test_opencv_log_level_is_restored(tiny: Path) -> None:
     assert cv2.utils.logging.setLogLevel(before) == cv2.utils.logging.LOG_LEVEL_INFO
 
 
-def test_real_lego(shared_data: Path) -> None:
+def test_real_lego(shared_data):
     """D-NeRF's own files: 50/11/20 views, the world's origin in the middle of every picture. Catches a tolerance that
     their matrices of single precision fail."""
     root = shared_data / "dnerf_lego100" / "lego"

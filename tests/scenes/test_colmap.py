@@ -49,7 +49,7 @@ def write_embedded(root: Path, blender: scenes.Scene, kind: str) -> list[scenes.
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kind: str) -> None:
+def test_an_embedded_scene_comes_back(tmp_path, blender, kind):
     """Catches a transposed rotation, a wrong order of numbers, images of other cameras, times and a split askew."""
     views = write_embedded(tmp_path / "own", blender, kind)
     scene = scenes.load(tmp_path / "own")
@@ -72,7 +72,7 @@ def test_an_embedded_scene_comes_back(tmp_path: Path, blender: scenes.Scene, kin
     torch.testing.assert_close(scene.points.colors, torch.tensor([COLOR]).div(255).expand(1000, 3))
 
 
-def test_it_is_trained(tmp_path: Path, blender: scenes.Scene) -> None:
+def test_it_is_trained(tmp_path, blender):
     """Catches a scene that the loader accepts and a run does not, cameras that do not belong to the images, and a
     choice that is printed and then forgotten."""
     write_embedded(tmp_path / "own", blender, "bin")
@@ -117,9 +117,7 @@ def picture(ray: np.ndarray) -> np.ndarray:
         ("OPENCV", (50.0, 54.0, 35.0, 20.0), (-0.2, 0.03, 0.01, -0.02)),
     ],
 )
-def test_distortion_is_undone(
-    tmp_path: Path, model: str, lens: tuple[float, ...], distortion: tuple[float, ...]
-) -> None:
+def test_distortion_is_undone(tmp_path, model, lens, distortion):
     """Catches coefficients in a wrong order, K that is not the image's, blank pixels, and half a pixel of an offset."""
     width, height = WIDTH * 4, HEIGHT * 4
     K = np.array([[lens[0], 0, lens[-2]], [0, lens[-3], lens[-1]], [0, 0, 1]])
@@ -149,7 +147,7 @@ def test_distortion_is_undone(
     assert np.abs(half.image.numpy() - expected)[2:-2, 2:-2].max() < 0.02
 
 
-def test_a_pinhole_stays_exact(taken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pinhole_stays_exact(taken, capsys):
     """Catches a principal point that is moved to the centre, pixels that are resampled without a reason, and images of
     half the size that are refused or read with the intrinsics of the full one."""
     view = scenes.load(taken).train[3]
@@ -170,7 +168,7 @@ NAMINGS: dict[str, tuple[Callable[[int], str], Callable[[int], float], str]] = {
 
 
 @pytest.mark.parametrize("naming", NAMINGS)
-def test_times_of_names(taken: Path, naming: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_times_of_names(taken, naming, capsys):
     """Catches a number of the folder or the camera taken for the time, order by text, JPEGs that are not found, a name
     that is cut at its first space, and a choice that is not printed."""
     name_of, time_of, note = NAMINGS[naming]
@@ -185,7 +183,7 @@ def test_times_of_names(taken: Path, naming: str, capsys: pytest.CaptureFixture[
     assert f"{taken.name}: times: {note}" in capsys.readouterr().err
 
 
-def test_images_that_colmap_did_not_register_are_told(taken: Path) -> None:
+def test_images_that_colmap_did_not_register_are_told(taken):
     """Catches a capture of which a part is left out in silence."""
     assert len(scenes.load(taken).notes) == 1
     (taken / "images" / NAMES[3]).with_name("more.JPG").write_bytes(b"")
@@ -194,7 +192,7 @@ def test_images_that_colmap_did_not_register_are_told(taken: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
-def test_an_exif_orientation_is_told(taken: Path, kind: str) -> None:
+def test_an_exif_orientation_is_told(taken, kind):
     """Catches pixels that other programs turn, and gsbench does not, in silence."""
     exif = Image.Exif()
     exif[274] = 6
@@ -218,7 +216,7 @@ def write_jpegs(taken: Path) -> list[str]:
     return names
 
 
-def test_jpegs_are_read(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jpegs_are_read(taken, monkeypatch):
     """Catches a suffix that is not known, blue in place of red, the PNG of that name, and a scene kept in 8 bits."""
     write_jpegs(taken)
     for most in (images._MOST_FLOATS, 0):  # as floats, and in 8 bits
@@ -239,7 +237,7 @@ def test_jpegs_are_read(taken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @given(at=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=8))
-def test_changed_bytes_of_a_jpeg_are_an_input_error_or_an_image(at: int, value: bytes) -> None:
+def test_changed_bytes_of_a_jpeg_are_an_input_error_or_an_image(at, value):
     """Catches any other exception of the decoder, and an image of another shape than its header says."""
     data = bytearray(cv2.imencode(".jpg", np.arange(WIDTH * HEIGHT * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3))[1])
     start = 3 + at % (len(data) - 3)
@@ -269,7 +267,7 @@ def lean(up: tuple[float, float, float], true: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("turn", [np.eye(3), *(Rotation.random(random_state=seed).as_matrix() for seed in range(3))])
-def test_up_is_level_to_the_cameras_and_turns_with_the_world(turn: np.ndarray) -> None:
+def test_up_is_level_to_the_cameras_and_turns_with_the_world(turn):
     """Catches the mean of up vectors, which leans by 25 degrees on an arc of 120 from which cameras look down, z taken
     for up in a world whose axes are arbitrary, down for up, and a division by zero where cameras stand every way."""
     for degrees, pitch, roll, most in (
@@ -370,7 +368,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_fault_is_one_line_that_says_what_is_wrong(taken: Path, fault: str) -> None:
+def test_fault_is_one_line_that_says_what_is_wrong(taken, fault):
     """Catches a fault let through, missing rows that are read as grey, and a stack trace from the depths."""
     apply, message = FAULTS[fault]
     assert_refused(taken, apply, message)
@@ -387,7 +385,7 @@ def test_fault_is_one_line_that_says_what_is_wrong(taken: Path, fault: str) -> N
         ({"sparse": 9}, "times: "),
     ],
 )
-def test_the_largest_model_is_read(taken: Path, models: dict[str, int], words: str) -> None:
+def test_the_largest_model_is_read(taken, models, words):
     """Catches sparse/0 read in silence where COLMAP could not join the images, and another is larger; a folder alone
     that is refused, and a line for every capture."""
     shutil.rmtree(taken / "sparse")
@@ -409,7 +407,7 @@ LINES: dict[str, Callable[[str], str]] = {
 
 
 @pytest.mark.parametrize("change", LINES)
-def test_images_txt_as_programs_write_it(taken: Path, change: str) -> None:
+def test_images_txt_as_programs_write_it(taken, change):
     """Catches what an editor on Windows adds, which changes no number."""
     expected = scenes.load(taken)
     for part in ("images", "cameras", "points3D"):
@@ -422,7 +420,7 @@ def test_images_txt_as_programs_write_it(taken: Path, change: str) -> None:
 
 
 @pytest.mark.parametrize("which", ["all", "second", "last but one", "numbers for a name", "name with spaces"])
-def test_images_txt_without_second_lines_is_refused(taken: Path, which: str) -> None:
+def test_images_txt_without_second_lines_is_refused(taken, which):
     """Catches every second image dropped in silence."""
     path = taken / "sparse/0/images.txt"
     head, *lines = path.read_text().split("\n")
@@ -448,7 +446,7 @@ BINARY = Capture("OPENCV", WIDTH, HEIGHT, (20.0, 21.0, 8.0, 6.0, 0.1, 0, 0, 0), 
 
 @pytest.mark.parametrize("part", READERS)
 @given(cut=st.integers(1, 10_000), more=st.binary(min_size=1, max_size=60))
-def test_a_binary_file_of_another_length_is_refused(part: str, cut: int, more: bytes) -> None:
+def test_a_binary_file_of_another_length_is_refused(part, cut, more):
     """Catches a truncated file that is read as a smaller model, and bytes after its end."""
     whole = BINARY[part]
     for data in (whole[: -1 - cut % len(whole)], whole + more, b"\xff" * 8 + whole[8:]):
@@ -457,7 +455,7 @@ def test_a_binary_file_of_another_length_is_refused(part: str, cut: int, more: b
 
 
 @pytest.mark.parametrize("number", [-1, 99])
-def test_a_number_that_is_no_model_is_refused(number: int) -> None:
+def test_a_number_that_is_no_model_is_refused(number):
     """Catches a number that counts from the end of the list of models, as -1 does in Python."""
     data = bytearray(BINARY["cameras"])
     data[12:16] = number.to_bytes(4, "little", signed=True)  # after the count and the camera's number
@@ -467,7 +465,7 @@ def test_a_number_that_is_no_model_is_refused(number: int) -> None:
 
 @pytest.mark.parametrize("part", READERS)
 @given(at=st.integers(0, 10_000), value=st.binary(min_size=1, max_size=8))
-def test_changed_bytes_are_an_input_error_or_finite(part: str, at: int, value: bytes) -> None:
+def test_changed_bytes_are_an_input_error_or_finite(part, at, value):
     """Catches any other exception, an endless loop over a huge count, and numbers that are not finite."""
     data = bytearray(BINARY[part])
     start = at % len(data)

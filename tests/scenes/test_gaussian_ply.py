@@ -58,9 +58,7 @@ def path(tmp_path: Path) -> Path:
     ],
 )
 @pytest.mark.parametrize("before", [(), BEFORE])
-def test_files_as_programs_write_them(
-    form: dict[str, Any], degree: int, more: tuple[str, ...], kind: str, before: list[PlyElement], path: Path
-) -> None:
+def test_files_as_programs_write_them(form, degree, more, kind, before, path):
     """Catches columns that are taken by their place, bytes in the wrong order, harmonics with channels mixed up, and
     the values of an element before the vertices, such as a camera, read as those of Gaussians."""
     table, random = rows(degree, *more, kind=kind), np.random.default_rng(0)
@@ -82,7 +80,7 @@ def test_files_as_programs_write_them(
         torch.testing.assert_close(getattr(read, field).reshape(N, -1), expected.float())
 
 
-def test_what_is_written_is_read(path: Path) -> None:
+def test_what_is_written_is_read(path):
     """Catches a column that is written in another place than it is read from; plyfile agrees on the header."""
     g = torch.Generator().manual_seed(0)
     shapes = ((N, 3), (N, 3), (N, 4), (N,), (N, 3), (N, 8, 3))
@@ -97,7 +95,7 @@ def test_what_is_written_is_read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_an_opacity_of_exactly_0_or_1_is_read(text: bool, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_opacity_of_exactly_0_or_1_is_read(text, path, capsys):
     """Catches a PLY that was compressed and converted back, refused for its infinite logits, and a change unsaid."""
     write(path, rows(opacity=[np.inf, 3, -np.inf, np.inf, 20]), text=text)
     opacities = torch.sigmoid(read_trained(path).logits.double())
@@ -139,7 +137,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("table", "message"), REFUSED)
-def test_what_is_not_trained_gaussians_of_3dgs_is_refused(table: np.ndarray, message: str, path: Path) -> None:
+def test_what_is_not_trained_gaussians_of_3dgs_is_refused(table, message, path):
     """Catches a KeyError, values that would be drawn as NaN, and Gaussians that look different from the file's because
     a column of another method was dropped."""
     with pytest.raises(InputError, match=message) as caught:
@@ -149,7 +147,7 @@ def test_what_is_not_trained_gaussians_of_3dgs_is_refused(table: np.ndarray, mes
     assert len(str(caught.value)) < 600
 
 
-def test_columns_that_change_no_image_are_named_in_one_line(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_columns_that_change_no_image_are_named_in_one_line(path, capsys):
     """Catches a column that is dropped in silence, and segmented Gaussians that are refused."""
     more = ("nx", "ny", "nz", "red", "green", "blue", "object_id", "label", "obj_dc_0", "obj_dc_1", "semantic_7")
     assert len(read_trained(write(path, rows(1, *more)))) == N
@@ -160,9 +158,7 @@ def test_columns_that_change_no_image_are_named_in_one_line(path: Path, capsys: 
 
 
 @pytest.mark.parametrize("network", ["deformation.pth", "../../deform/iteration_7/deform.pth"])
-def test_a_deformation_network_beside_the_file_is_named(
-    network: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_deformation_network_beside_the_file_is_named(network, tmp_path, capsys):
     """Catches canonical Gaussians of 4DGaussians or Deformable 3DGS that are taken for those of the trained scene."""
     path = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
     beside = (path.parent / network).resolve()
@@ -173,7 +169,7 @@ def test_a_deformation_network_beside_the_file_is_named(
     assert capsys.readouterr().err == (f"{path}: {beside} is not read: the Gaussians are those before it moves them\n")
 
 
-def test_the_filter_of_mip_splatting_is_fused(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_filter_of_mip_splatting_is_fused(path, capsys):
     """Catches Gaussians without their 3D filter: images are not those of Mip-Splatting's export."""
     draw = np.random.default_rng(0)
     means = draw.normal(size=(N, 3)) * 0.5
@@ -225,9 +221,7 @@ OTHER_FILES: list[tuple[str, Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("name", "create", "message"), OTHER_FILES)
-def test_another_file_says_what_opens_it(
-    name: str, create: Callable[[Path], object], message: str, tmp_path: Path
-) -> None:
+def test_another_file_says_what_opens_it(name, create, message, tmp_path):
     """Catches 'expected a PLY' for a file that only has to be converted, or exported by the program that wrote it."""
     create(tmp_path / name)
     with pytest.raises(InputError) as caught:
@@ -237,7 +231,7 @@ def test_another_file_says_what_opens_it(
     assert message.format(convert=convert) in str(caught.value)
 
 
-def test_the_share_of_gaussians_that_a_camera_sees() -> None:
+def test_the_share_of_gaussians_that_a_camera_sees():
     """Catches Gaussians behind all cameras, beside the image, too transparent, too small or too near that count."""
     eye = torch.eye(4)
     ahead = Camera(eye, torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), 100, 60)

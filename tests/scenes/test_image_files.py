@@ -1,7 +1,6 @@
 """Images are found by the names that files give them: suffixes, backslashes, links, and what a suffix does not say."""
 
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ SPLITS = ("train", "val", "test")
 
 @pytest.mark.parametrize("suffix", [".jpg", ".JPG", ".jpeg", ".Jpeg", ".png", ".PNG"])
 @pytest.mark.parametrize("named", ["", ".jpg", ".png"])
-def test_jpegs_of_a_blender_scene(tiny: Path, suffix: str, named: str) -> None:
+def test_jpegs_of_a_blender_scene(tiny, suffix, named):
     """Catches r_0.jpg.png, a JPEG that is called .png refused, and a suffix left in the names of views."""
     for path in map(tiny.joinpath, IMAGES):
         jpeg = cv2.imencode(".jpg", cv2.imread(str(path), cv2.IMREAD_COLOR))[1].tobytes()
@@ -30,7 +29,7 @@ def test_jpegs_of_a_blender_scene(tiny: Path, suffix: str, named: str) -> None:
     assert scene.notes == ((f"images of another suffix are read: 4 {suffix} for {named}",) if differs else ())
 
 
-def test_the_image_that_is_named_comes_first(tiny: Path) -> None:
+def test_the_image_that_is_named_comes_first(tiny):
     """Catches another file of that name read in its place, and of two others not the PNG."""
     finder, folder = ImageFinder(tiny), tiny / "train"
     for name in ("x.jpg", "x.PNG", "x.y.jpeg", "z"):
@@ -47,7 +46,7 @@ def test_the_image_that_is_named_comes_first(tiny: Path) -> None:
     assert names == {path: [path] * len(asked) for path, asked in expected.items()}
 
 
-def test_names_that_macos_spells_otherwise(tiny: Path) -> None:
+def test_names_that_macos_spells_otherwise(tiny):
     """Catches an umlaut of two characters, as macOS writes it, that is not the one of the file of cameras."""
     for split in SPLITS:
         (tiny / split / "r_0.png").rename(tiny / split / "Ku\u0308che.png")
@@ -55,14 +54,14 @@ def test_names_that_macos_spells_otherwise(tiny: Path) -> None:
     assert scenes.load(tiny).notes == ()
 
 
-def test_images_without_alpha_beside_others_are_told(tiny: Path) -> None:
+def test_images_without_alpha_beside_others_are_told(tiny):
     """Catches test views on the background of the run, and training views on their own."""
     write_image(tiny / "test/r_0.png", np.zeros((6, 8, 3), np.uint8))
     note = "1 of 4 images have no alpha and keep their own background, the others get (1.0, 1.0, 1.0)"
     assert scenes.load(tiny, background=(1.0, 1.0, 1.0)).notes == (note,)
 
 
-def test_links_of_the_user_are_followed(tiny: Path, tmp_path: Path) -> None:
+def test_links_of_the_user_are_followed(tiny, tmp_path):
     """Catches images on another disk, or a whole scene there, refused, of another name or of another fingerprint."""
     expected = scenes.load(tiny)
     shutil.move(tiny / "train", tmp_path / "disk")
@@ -77,7 +76,7 @@ def test_links_of_the_user_are_followed(tiny: Path, tmp_path: Path) -> None:
     assert all((a.image == b.image).all() for a, b in zip(linked.train, expected.train, strict=True))
 
 
-def test_seconds_are_scaled_over_all_splits(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_seconds_are_scaled_over_all_splits(tiny, capsys):
     """Catches seconds refused without a cure, or scaled apart in train and test."""
     for split, seconds in (("train", [0.0, 10.0]), ("val", [2.0]), ("test", [5.0])):
         edit(tiny, lambda c: [f.update(time=s) for f, s in zip(c["frames"], seconds, strict=True)], split)  # noqa: B023
@@ -86,7 +85,7 @@ def test_seconds_are_scaled_over_all_splits(tiny: Path, capsys: pytest.CaptureFi
     assert "times: the field 'time', 0 to 10, scaled to [0, 1] over all splits" in capsys.readouterr().err
 
 
-def test_views_that_splits_share_are_counted(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_that_splits_share_are_counted(tiny, capsys):
     """Catches a test that is the training, in whole or in part, and images that are alike by chance called shared."""
     assert scenes.load(tiny).notes == ()
     shutil.copy(tiny / "train/r_1.png", tiny / "test/r_0.png")  # the image of another pose
@@ -100,7 +99,7 @@ def test_views_that_splits_share_are_counted(tiny: Path, capsys: pytest.CaptureF
     assert capsys.readouterr().err.count("\n") == 4
 
 
-def test_two_images_of_one_camera_and_time_are_refused(tiny: Path) -> None:
+def test_two_images_of_one_camera_and_time_are_refused(tiny):
     """Catches contradictory times, and all times equal where the camera moves, which is a still scene."""
     edit(tiny, lambda c: [f.update(time=0.25) for f in c["frames"]], *SPLITS)
     scene = scenes.load(tiny)
@@ -111,7 +110,7 @@ def test_two_images_of_one_camera_and_time_are_refused(tiny: Path) -> None:
         scenes.load(tiny)
 
 
-def test_a_second_layout_is_not_read_in_silence(tiny: Path) -> None:
+def test_a_second_layout_is_not_read_in_silence(tiny):
     """Catches a folder of two layouts of which one is read without a word."""
     (tiny / "transforms.json").write_text("{}")
     assert scenes.load(tiny).notes == ("transforms_train.json is read, and not transforms.json",)

@@ -45,9 +45,7 @@ def numbers(view: scenes.View) -> tuple[float, float, float, float]:
         (WITHOUT | {"fl_x": 10.0, "w": 8, "h": 6}, {}, (10, 10, 4, 3), (10, 10, 4, 3)),
     ],
 )
-def test_a_frame_comes_before_its_file(
-    tiny: Path, file: dict[str, Any], frame: dict[str, Any], first: tuple[float, ...], second: tuple[float, ...]
-) -> None:
+def test_a_frame_comes_before_its_file(tiny, file, frame, first, second):
     """Catches intrinsics of frames that are left out, and those of one frame used for another."""
     write(tiny, file, frame)
     views = scenes.load(tiny).train
@@ -78,7 +76,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_no_pinhole_or_contradicts_is_refused(tiny: Path, kind: str) -> None:
+def test_what_is_no_pinhole_or_contradicts_is_refused(tiny, kind):
     """Catches a fisheye read as a pinhole, and one of two numbers that contradict taken in silence."""
     file, frame, words = REFUSED[kind]
     write(tiny, file, frame)
@@ -88,14 +86,14 @@ def test_what_is_no_pinhole_or_contradicts_is_refused(tiny: Path, kind: str) -> 
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "opencv", "RADIAL"])
-def test_pinholes_by_any_name(tiny: Path, model: str) -> None:
+def test_pinholes_by_any_name(tiny, model):
     """Catches nerfstudio's files, whose model is OPENCV even if its coefficients are zero, refused."""
     coefficients = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0)
     write(tiny, {"camera_model": model, "is_fisheye": False, **coefficients}, {"distortion_params": [0.0] * 6})
     assert numbers(scenes.load(tiny).train[1])[0] == pytest.approx(ANGLE)
 
 
-def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_smaller_than_the_file_says(tiny, capsys):
     """Catches images of a folder images_2 refused, or read with the intrinsics of the full size, in silence."""
     values = {"w": 17, "h": 12, "fl_x": 20.0, "fl_y": 30.0, "cx": 8.5, "cy": 5.0}
     edit(tiny, lambda content: [content.pop("camera_angle_x"), content.update(values)], "train", "val", "test")
@@ -133,7 +131,7 @@ def test_images_smaller_than_the_file_says(tiny: Path, capsys: pytest.CaptureFix
         ((24, 24), (65, 49), False),
     ],
 )
-def test_one_ratio(image: tuple[int, int], camera: tuple[int, int], fits: bool) -> None:
+def test_one_ratio(image, camera, fits):
     """Catches a cropped image taken for a reduced one, and rounded sizes refused."""
     lens = Lens(*camera, np.eye(3), (0, 0, 0, 0)).resized(*image)
     assert (lens is not None) == fits
@@ -141,7 +139,7 @@ def test_one_ratio(image: tuple[int, int], camera: tuple[int, int], fits: bool) 
         assert lens.K.diagonal() == pytest.approx([image[0] / camera[0], image[1] / camera[1], 1])
 
 
-def test_odd_sizes_are_rounded(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_odd_sizes_are_rounded(tiny, capsys):
     """Catches a refusal of 65 x 49, K divided by the factor where the sides are rounded, and another image."""
     random = np.random.default_rng(0)
     ramp = np.stack([*np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, 1, 11)), np.zeros((11, 13))], -1)
@@ -158,7 +156,7 @@ def test_odd_sizes_are_rounded(tiny: Path, capsys: pytest.CaptureFixture[str]) -
     assert scenes.load(tiny, downscale=2, resize="pillow").train[0].image.shape == (6, 7, 3)
 
 
-def test_unknown_keys_are_named_once(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_keys_are_named_once(tiny, capsys):
     """Catches a key that nobody reads and nobody hears of, and a line for each frame."""
     write(tiny, {"aabb_scale": 16, "a\nb": 1}, {"depth_path": "x", "rotation": 0.1})
     scene = scenes.load(tiny)

@@ -50,7 +50,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_camera_of_the_release() -> None:
+def test_a_camera_of_the_release():
     """Catches axes in another order, a pose that is not inverted, and a principal point off the centre."""
     row = np.zeros(17)
     turn = (Rotation.from_euler("y", 20, degrees=True) * Rotation.from_euler("x", -10, degrees=True)).as_matrix()
@@ -75,7 +75,7 @@ def test_a_camera_of_the_release() -> None:
     np.testing.assert_allclose(pixel[:2], (1026.31756680, 279.37044603), rtol=0, atol=1e-8)
 
 
-def test_films_cameras_times_and_splits(root: Path) -> None:
+def test_films_cameras_times_and_splits(root):
     """Catches films mixed with rows, frames of another time, blue for red, and a test camera that trains."""
     scene = scenes.load(root)
     assert has_estimated_up(scene)
@@ -96,7 +96,7 @@ def test_films_cameras_times_and_splits(root: Path) -> None:
     assert half.image.shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def test_frames_and_cameras_can_be_chosen(root: Path) -> None:
+def test_frames_and_cameras_can_be_chosen(root):
     """Catches frames counted from 1, a row of poses that moves to the next film, a choice that is not told, and
     one name that is read as a list of letters."""
     all_frames = scenes.load(root)
@@ -121,7 +121,7 @@ def test_frames_and_cameras_can_be_chosen(root: Path) -> None:
         scenes.load(root)
 
 
-def test_folders_of_frames_replace_films(root: Path) -> None:
+def test_folders_of_frames_replace_films(root):
     """Catches frames in the order of their texts, and a folder that wins over the film it was made of."""
     first = scenes.load(root).fingerprint
     (root / "cam02.mp4").unlink()
@@ -138,7 +138,7 @@ def test_folders_of_frames_replace_films(root: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "ply"])
-def test_initial_points(root: Path, kind: str) -> None:
+def test_initial_points(root, kind):
     """Catches points of the first frame that are left out, not told, or not part of the fingerprint."""
     without = scenes.load(root).fingerprint
     means = np.array([(0.5, -0.25, 0.0), (0.25, 0.5, 1.0)])
@@ -162,7 +162,7 @@ def anonymous_bytes() -> int:
     return int(re.findall(r"RssAnon:\s*(\d+)", Path("/proc/self/status").read_text())[0]) << 10
 
 
-def test_frames_stay_on_disk(root: Path) -> None:
+def test_frames_stay_on_disk(root):
     """Catches frames that fill the memory when they are loaded or used, that are decoded anew, or are kept stale."""
     noise = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
     frames = [cv2.resize(np.roll(noise, n, 1), (640, 480), interpolation=cv2.INTER_NEAREST) for n in range(20)]
@@ -183,14 +183,14 @@ def test_frames_stay_on_disk(root: Path) -> None:
     assert not torch.equal(scenes.load(root).test[3].pixels, scene.test[3].pixels)
 
 
-def test_a_device_gets_a_frame_when_it_is_used(root: Path) -> None:
+def test_a_device_gets_a_frame_when_it_is_used(root):
     """Catches films that are copied to a GPU as a whole, and frames that stay on the CPU."""
     view = scenes.load(root).to("meta").test[0]
     assert view.pixels.device.type == "cpu"
     assert (view.camera.K.device.type, view.target.device.type, view.image.device.type) == ("meta",) * 3
 
 
-def test_a_scene_of_the_release_fits_into_8_gb() -> None:
+def test_a_scene_of_the_release_fits_into_8_gb():
     """Catches an estimate below what is used, or that counts all frames: 20 cameras of 300 frames at half size."""
     assert n3v.memory_needed((2704, 2028), (1352, 1014), 300) < 8e9
     still = Camera(torch.eye(4), torch.eye(3), 40, 960)
@@ -247,12 +247,12 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
-def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
+def test_faulty_files_are_told(root, apply, message):
     """Catches rows of other films, films out of step or of another size, and playlists that name other files."""
     assert_refused(root, apply, message)
 
 
-def test_damaged_points_are_told_before_frames_are_decoded(root: Path) -> None:
+def test_damaged_points_are_told_before_frames_are_decoded(root):
     """Catches minutes of decoding, and gigabytes, before a message on another file."""
     (root / "points3d.ply").write_bytes(b"")
     with pytest.raises(InputError, match="expected a PLY"):
@@ -260,7 +260,7 @@ def test_damaged_points_are_told_before_frames_are_decoded(root: Path) -> None:
     assert not (root / n3v.DECODED).exists()
 
 
-def test_a_film_that_ends_early_leaves_no_file(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_film_that_ends_early_leaves_no_file(root, monkeypatch):
     """Catches a film with fewer frames than it says, whose first frames would pass for a whole one."""
     with pytest.raises(InputError, match="expected frame 5, got 5"):
         scenes.load(root, frames=(0, 5))
@@ -277,13 +277,13 @@ def test_a_film_that_ends_early_leaves_no_file(root: Path, monkeypatch: pytest.M
     assert len(list((root / n3v.DECODED).iterdir())) == len(CAMERAS)
 
 
-def test_captures_with_llff_poses_stay_captures(taken: Path) -> None:
+def test_captures_with_llff_poses_stay_captures(taken):
     """Catches a COLMAP capture that is taken for films because poses_bounds.npy lies beside its model."""
     (taken / "poses_bounds.npy").touch()
     assert len(scenes.load(taken).test) == 1
 
 
-def test_a_full_disk_is_told_before_frames_are_decoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_told_before_frames_are_decoded(root, monkeypatch):
     """Catches films that fill the disk one after the other."""
     left = 3 * FRAMES * WIDTH * HEIGHT * len(CAMERAS) - 1
     monkeypatch.setattr(n3v.shutil, "disk_usage", lambda _: SimpleNamespace(free=left))

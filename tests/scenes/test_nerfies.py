@@ -57,7 +57,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_camera_of_the_release() -> None:
+def test_a_camera_of_the_release():
     """Catches an orientation that is transposed, a lost aspect ratio, and distortion in another order."""
     content = camera(
         np.eye(4),
@@ -82,7 +82,7 @@ def test_a_camera_of_the_release() -> None:
     np.testing.assert_allclose(distorted[0, 0], (315.20377160, 450.09678750), rtol=0, atol=1e-5)
 
 
-def test_cameras_times_and_splits(root: Path) -> None:
+def test_cameras_times_and_splits(root):
     """Catches images mixed with cameras, a test view that trains, and intrinsics of another size."""
     scene = scenes.load(root)
     assert has_estimated_up(scene)
@@ -125,6 +125,6 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
-def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
+def test_faulty_files_are_told(root, apply, message):
     """Catches scenes without a test camera, images without a time, and lenses that are not undone."""
     assert_refused(root, apply, message)

@@ -51,7 +51,7 @@ def change(root: Path, **values: Any) -> None:
     (root / "transforms.json").write_text(json.dumps(content_of(root) | values))
 
 
-def test_it_is_read(root: Path) -> None:
+def test_it_is_read(root):
     """Catches a message that names other files, cameras of other images, another split, and points left out."""
     scene = scenes.load(root)
     assert has_estimated_up(scene)
@@ -72,7 +72,7 @@ def test_it_is_read(root: Path) -> None:
     assert "keys that are not read: 'colmap_im_id'" in text
 
 
-def test_its_own_split(root: Path) -> None:
+def test_its_own_split(root):
     """Catches a split that the file states and that is not used."""
     names = [f"images/frame_{i:05d}.png" for i in range(COUNT)]
     change(root, train_filenames=names[:10], val_filenames=names[10:12], test_filenames=[names[16]])
@@ -82,7 +82,7 @@ def test_its_own_split(root: Path) -> None:
     assert scene.notes[0] == "split: as the file lists, 10, 2 and 1 of 17 views"
 
 
-def test_times_of_the_file_or_of_a_table(root: Path) -> None:
+def test_times_of_the_file_or_of_a_table(root):
     """Catches times of frames that give way to the numbers of names, and the cure of the messages, times.csv, that is
     not read here or not part of the fingerprint."""
     plain = content_of(root)["frames"]
@@ -97,7 +97,7 @@ def test_times_of_the_file_or_of_a_table(root: Path) -> None:
     assert tabled.fingerprint != before
 
 
-def test_fingerprint(root: Path) -> None:
+def test_fingerprint(root):
     """Catches other points, another file or another image under the same fingerprint."""
     before = {scenes.load(root).fingerprint}
     (root / "sparse_pc.ply").write_text(PLY.replace("1 2 3", "1 2 4"))
@@ -151,7 +151,7 @@ FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
 
 
 @pytest.mark.parametrize(("fault", "words"), FAULTS)
-def test_what_is_wrong_is_one_line(root: Path, fault: Any, words: str) -> None:
+def test_what_is_wrong_is_one_line(root, fault, words):
     """Catches a stack trace, lists that name images of no frame, and a scene without a test view."""
     fault(root) if callable(fault) else change(root, **fault)
     with pytest.raises(InputError, match=words) as caught:
@@ -159,7 +159,7 @@ def test_what_is_wrong_is_one_line(root: Path, fault: Any, words: str) -> None:
     check_message(caught.value)
 
 
-def test_views_that_train_and_test_share_are_told(root: Path) -> None:
+def test_views_that_train_and_test_share_are_told(root):
     """Catches lists that overlap, and a frame that is there twice, which may be once in train and once in test."""
     names = [frame["file_path"] for frame in content_of(root)["frames"]]
     change(root, train_filenames=names, test_filenames=names[:2])

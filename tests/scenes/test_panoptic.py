@@ -53,7 +53,7 @@ def edit(change: Callable[[dict[str, Any]], object], split: str = "train") -> Ca
     return apply
 
 
-def test_cameras_times_masks_and_splits(root: Path) -> None:
+def test_cameras_times_masks_and_splits(root):
     """Catches cameras mixed with times, an inverted pose, a mask of another image, and a test camera that trains."""
     scene = scenes.load(root)
     assert has_estimated_up(scene)
@@ -74,13 +74,13 @@ def test_cameras_times_masks_and_splits(root: Path) -> None:
     assert half.regions[0].tolist() == [0] * 3 + [1] * 3
 
 
-def test_whole_cameras_can_be_val(root: Path) -> None:
+def test_whole_cameras_can_be_val(root):
     """Catches views that are not ordered by time and then camera, so that val_every would mix cameras."""
     scene = scenes.load(root).with_val(4)
     assert [view.name for view in scene.val] == ["4/000000", "4/000003", "4/000006"]
 
 
-def test_initial_points(root: Path) -> None:
+def test_initial_points(root):
     """Catches the mask of a point taken for its colour, and a file that the fingerprint does not cover."""
     without = scenes.load(root).fingerprint
     rows = np.array([(0.5, -0.25, 0.25, 1, 0.5, 0, 1), (0.25, 0.5, -0.5, 0, 0.25, 0.75, 0)])
@@ -92,7 +92,7 @@ def test_initial_points(root: Path) -> None:
     assert scene.fingerprint != without
 
 
-def test_what_is_not_understood_is_told(root: Path) -> None:
+def test_what_is_not_understood_is_told(root):
     """Catches a key that is dropped in silence, and a camera of both splits."""
     edit(lambda content: content.update(gain=[1, 2]))(root)
     edit(lambda content: content.update(cam_id=[[3]] * TIMES), "test")(root)
@@ -131,7 +131,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
-def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
+def test_faulty_files_are_told(root, apply, message):
     """Catches lists that are read askew, cameras that are no pinholes, missing files, and pickles."""
     assert_refused(root, apply, message)
 
@@ -161,7 +161,7 @@ def inside(points: np.ndarray, view: View, mask: np.ndarray) -> tuple[np.ndarray
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BASKETBALL.is_dir(), reason="../shared/data/panoptic is not here")
-def test_the_hull_of_the_players_is_where_test_cameras_see_them(tmp_path: Path) -> None:
+def test_the_hull_of_the_players_is_where_test_cameras_see_them(tmp_path):
     """Catches a pose, a time or intrinsics of the wrong camera: the hull of what moves would be empty or elsewhere."""
     for split in ("train", "test"):
         content = json.loads((BASKETBALL / f"{split}_meta.json").read_text())

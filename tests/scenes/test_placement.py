@@ -61,7 +61,7 @@ def cameras_of(scene: Scene) -> torch.Tensor:  # [C, 4, 4]
 
 
 @pytest.mark.parametrize("name", ["moving-matte", "pendulum", "suzanne"])
-def test_embedded_scenes_stay_where_they_are(name: str) -> None:
+def test_embedded_scenes_stay_where_they_are(name):
     """Catches published trainings that change their bits."""
     scene = load_scene(sample.folder() / name, downscale=8)
     assert scene.placement.is_identity
@@ -69,7 +69,7 @@ def test_embedded_scenes_stay_where_they_are(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MOVES)
-def test_a_moved_scene_is_trained_where_it_would_have_been(name: str, tmp_path: Path) -> None:
+def test_a_moved_scene_is_trained_where_it_would_have_been(name, tmp_path):
     """Catches cameras or points that single precision rounds, a unit that is left out, and a direction of the move."""
     scale, offset = MOVES[name]
     plain = load_scene(write_capture(tmp_path / "plain"))
@@ -92,9 +92,7 @@ def test_a_moved_scene_is_trained_where_it_would_have_been(name: str, tmp_path: 
     st.tuples(*[st.floats(-1e6, 1e6)] * 3),
     st.sampled_from(["inwards", "parallel", "outwards"]),
 )
-def test_any_scene_comes_to_a_standard_place(
-    tmp_path_factory: pytest.TempPathFactory, scale: float, offset: tuple[float, ...], kind: str
-) -> None:
+def test_any_scene_comes_to_a_standard_place(tmp_path_factory, scale, offset, kind):
     """Catches a kind of cameras without a place: content is around the origin, cameras a few units away."""
     random, viewmats, points = np.random.default_rng(0), circle(COUNT), None
     if kind == "parallel":  # an array of cameras in front of a wall
@@ -119,7 +117,7 @@ def test_any_scene_comes_to_a_standard_place(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_wrong_poses_do_not_decide(count: int, tmp_path: Path) -> None:
+def test_wrong_poses_do_not_decide(count, tmp_path):
     """Catches a mean and a maximum over cameras: some of 16 poses lie 10,000 units away and look elsewhere."""
     viewmats = circle(COUNT)
     viewmats[3 : 3 + count, :3, 3] += np.array([5e3, 8e3, 1e3]) * np.arange(1, 1 + count)[:, None]
@@ -132,7 +130,7 @@ def test_wrong_poses_do_not_decide(count: int, tmp_path: Path) -> None:
     assert any(f"{count} of 14 training cameras lie far from the others" in note for note in wrong.notes)
 
 
-def test_a_fixed_camera_has_the_size_of_its_points() -> None:
+def test_a_fixed_camera_has_the_size_of_its_points():
     """Catches a division by the spread of the cameras, which is 0."""
     centers, axes = np.zeros((5, 3)), np.tile([0.0, 0, 1], (5, 1))
     points = np.array([[0.0, 0, 3], [0, 1, 4], [1, 0, 5]])
@@ -143,7 +141,7 @@ def test_a_fixed_camera_has_the_size_of_its_points() -> None:
 
 
 @pytest.mark.parametrize("shape", ["cube", "normal", "flat"])
-def test_no_point_of_a_plain_cloud_is_far_outside(shape: str) -> None:
+def test_no_point_of_a_plain_cloud_is_far_outside(shape):
     """Catches a bound so low that random initial points get another size, and other bits."""
     draws = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     if shape != "cube":
@@ -155,7 +153,7 @@ def test_no_point_of_a_plain_cloud_is_far_outside(shape: str) -> None:
 
 
 @pytest.mark.parametrize(("count", "away"), [(1, 1e4), (30, 300.0), (30, 1e6)])
-def test_far_points_do_not_count(count: int, away: float, tmp_path: Path) -> None:
+def test_far_points_do_not_count(count, away, tmp_path):
     """Catches a standard deviation over all points: the clock of 4DGS and the units of AGR follow the size."""
     random = np.random.default_rng(1)
     points = random.normal(0, 0.5, (3000, 3))
@@ -167,7 +165,7 @@ def test_far_points_do_not_count(count: int, away: float, tmp_path: Path) -> Non
     assert any(f"{count} of {3000 + count} points lie far outside" in note for note in scene.notes)
 
 
-def test_points_of_another_place_are_told_or_refused(tmp_path: Path) -> None:
+def test_points_of_another_place_are_told_or_refused(tmp_path):
     """Catches a training from points none of which a camera sees: 12.9 dB instead of 34 without a word."""
     away = np.random.default_rng(1).normal([0, 500, 0], 5, (40, 3))
     with pytest.raises(InputError, match=r"they see none of the 40: .*same coordinates"):
@@ -190,9 +188,7 @@ def moved_square(root: Path, scale: float, offset: tuple[float, float, float]) -
     return root
 
 
-def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(tmp_path, capsys):
     """Catches PLY files in other coordinates than the cameras', and a start from a PLY that is taken as it is."""
     offset = (500.0, -200.0, 300.0)
     records, trained = {}, {}
@@ -222,7 +218,7 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(
 
 
 @pytest.mark.parametrize("near", [None, 1.0, 300.0, 500.0, 600.0])
-def test_a_near_plane_is_in_the_users_units(near: float | None, tmp_path: Path) -> None:
+def test_a_near_plane_is_in_the_users_units(near, tmp_path):
     """Catches a near plane in units of the training, and a training, a measurement or a loaded run without it.
 
     The cameras are at 400 from the square, whose half size is 150. Few of the initial points are farther than 500.
@@ -241,7 +237,7 @@ def test_a_near_plane_is_in_the_users_units(near: float | None, tmp_path: Path) 
     assert (image.mean() < 17) == is_cut  # 14, else 20; the background is black
 
 
-def test_points_that_no_camera_sees_are_refused(tmp_path: Path) -> None:
+def test_points_that_no_camera_sees_are_refused(tmp_path):
     """Catches a training whose Gaussians lie behind all cameras, in silence."""
     data = write_moving_square(tmp_path / "data")
     words = overrides(data, tmp_path / "r", "model=3dgs", "data.initial_half_width=100000")

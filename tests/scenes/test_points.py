@@ -49,7 +49,7 @@ def save(tmp_path: Path, data: bytes) -> Path:
     st.sampled_from(sorted(KINDS)),
     st.integers(0, 255),
 )
-def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, kind: str, red: int) -> None:
+def test_ply_round_trip(tmp_path, means, encoding, kind, red):
     """Catches swapped columns, a wrong stride or width, lost digits and a colour off by its scale, in each encoding."""
     vertices = np.zeros(len(means), [*VERTEX[:3], ("other", kind), *VERTEX[3:]])
     vertices["x"], vertices["y"], vertices["z"] = means.T
@@ -61,7 +61,7 @@ def test_ply_round_trip(tmp_path: Path, means: np.ndarray, encoding: str, kind: 
     np.testing.assert_allclose(points.colors.numpy(), np.tile([red / 255, 0, 1], (len(means), 1)), atol=1e-7)
 
 
-def test_ply_of_3dgs(tmp_path: Path) -> None:
+def test_ply_of_3dgs(tmp_path):
     """3DGS stores f_dc: colour 0.5 + C0 f_dc, clamped. Catches properties in between that are not stepped over, and
     faces after the vertices, which are not read, taken for a list of theirs."""
     names = ("x", "y", "z", "nx", "f_dc_0", "f_dc_1", "f_dc_2")
@@ -72,7 +72,7 @@ def test_ply_of_3dgs(tmp_path: Path) -> None:
     torch.testing.assert_close(colors[1], torch.tensor([0.5 + 0.28209479177387814, 1.0, 0.5]))
 
 
-def test_ply_of_several_frames(tmp_path: Path) -> None:
+def test_ply_of_several_frames(tmp_path):
     """Catches times that are read as positions, in another type, or where a cloud has none."""
     vertices = np.zeros(3, [*VERTEX, ("time", "f4")])
     vertices["time"] = 0.0, 0.25, 1.0
@@ -115,7 +115,7 @@ BAD_PLY = {
 
 
 @pytest.mark.parametrize("fault", BAD_PLY)
-def test_bad_ply(tmp_path: Path, fault: str) -> None:
+def test_bad_ply(tmp_path, fault):
     """Catches a fault let through (a huge count allocates nothing) and a message without file or field."""
     data, part = BAD_PLY[fault]
     with pytest.raises(InputError) as caught:
@@ -125,7 +125,7 @@ def test_bad_ply(tmp_path: Path, fault: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_an_ascii_ply_without_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ascii_ply_without_memory_is_refused(tmp_path, monkeypatch):
     """Catches a process that Linux kills while it parses text, which takes many times the size of the file."""
     path = save(tmp_path, ply(np.ones(120_000, VERTEX), "ascii"))
     monkeypatch.setattr(memory, "available", lambda: 64 << 20)
@@ -149,7 +149,7 @@ NUMBERS = ("nan", "inf", "-inf", "1e39", "1e400", "-1", "256", "0x10", "1_0", "9
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("seed", range(40))
-def test_a_damaged_ply_is_finite_or_an_input_error(seed: int, encoding: str, tmp_path: Path) -> None:
+def test_a_damaged_ply_is_finite_or_an_input_error(seed, encoding, tmp_path):
     """Catches any other exception, an array of 10^12 points, a read that does not end, and values that are NaN, in a
     cloud of points and in trained Gaussians: of lines of the header, values, bytes and files."""
     r = random.Random(f"{encoding} {seed}")
@@ -183,7 +183,7 @@ def test_a_damaged_ply_is_finite_or_an_input_error(seed: int, encoding: str, tmp
     assert not is_cloud or 0 <= read["colors"].min() <= read["colors"].max() <= 1
 
 
-def test_random_points_fill_the_cube_from_the_seed() -> None:
+def test_random_points_fill_the_cube_from_the_seed():
     """Catches a ball, a half cube, colours off grey, and draws that do not come from the generator."""
     points = random_points(20_000, 1.3, torch.Generator().manual_seed(7))
     again = random_points(20_000, 1.3, torch.Generator().manual_seed(7))
@@ -210,7 +210,7 @@ def scene_of(cameras: list[Camera], points: Points | None = None) -> Scene:
     return Scene("opposed", train, [], [], (0.0, 0.0, 0.0), 1.0, points, "made here")
 
 
-def test_cameras_that_look_away_are_told() -> None:
+def test_cameras_that_look_away_are_told():
     """Catches poses of OpenCV in a file of OpenGL's, and a message that asks for another cube only."""
     config = DataConfig(initial_points=200, initial_half_width=1.3)
     with pytest.raises(InputError, match="2 of 2 cameras look away from it: are their axes right"):
@@ -219,7 +219,7 @@ def test_cameras_that_look_away_are_told() -> None:
 
 @pytest.mark.parametrize("half_width", [1.3, None])
 @pytest.mark.parametrize("points", [None, Points(torch.zeros(9, 3), torch.ones(9, 3))])
-def test_a_near_plane_beyond_all_points_is_refused(points: Points | None, half_width: float | None) -> None:
+def test_a_near_plane_beyond_all_points_is_refused(points, half_width):
     """Catches a training of an empty picture, as no camera draws a Gaussian nearer than data.near."""
     config, g = DataConfig(initial_points=200, initial_half_width=half_width), torch.Generator().manual_seed(0)
     scene = scene_of(opposed(8.0), points)
@@ -230,7 +230,7 @@ def test_a_near_plane_beyond_all_points_is_refused(points: Points | None, half_w
         initial_points(replace(config, near=1000.0), scene.with_near(1000.0), g)
 
 
-def test_points_between_cameras_that_face_each_other() -> None:
+def test_points_between_cameras_that_face_each_other():
     """Catches points behind a camera, whose projections are mirrored into its image, points of a scene at which only
     its first camera looks, and cameras back to back, which see nothing in common."""
     cameras = opposed(8.0)
@@ -248,7 +248,7 @@ def test_points_between_cameras_that_face_each_other() -> None:
         frustum_points(300, opposed(-8.0), 1.0, g)
 
 
-def test_nearest_distances_against_brute_force() -> None:
+def test_nearest_distances_against_brute_force():
     """Catches the point itself among its neighbours, a mean of distances for a mean of squares, a missing root."""
     means = torch.rand(200, 3, generator=torch.Generator().manual_seed(3))
     pairs = torch.cdist(means.double(), means.double()).fill_diagonal_(math.inf)
@@ -256,7 +256,7 @@ def test_nearest_distances_against_brute_force() -> None:
     torch.testing.assert_close(nearest_distances(means), expected.float())
 
 
-def test_nearest_distances_at_their_ends() -> None:
+def test_nearest_distances_at_their_ends():
     """3DGS clamps distCUDA2 at 1e-7. Catches a scale of zero, whose logarithm is not finite, an infinite spacing of too
     few points, and a crash in the tree for points that are not finite."""
     torch.testing.assert_close(nearest_distances(torch.ones(5, 3)), torch.full((5,), math.sqrt(1e-7)))

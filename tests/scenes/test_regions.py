@@ -28,9 +28,7 @@ def write_masks(root: Path) -> None:
 
 @pytest.mark.parametrize("in_8_bits", [False, True])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_alpha_is_kept_as_stored(
-    dtype: type[np.generic], in_8_bits: bool, tiny: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_alpha_is_kept_as_stored(dtype, in_8_bits, tiny, monkeypatch):
     """Catches an alpha lost to the composite, taken from a colour, or rounded down from 16 bits."""
     limit = np.iinfo(dtype).max
     rgba = np.random.default_rng(1).integers(0, limit + 1, (6, 8, 4)).astype(dtype)
@@ -42,7 +40,7 @@ def test_alpha_is_kept_as_stored(
         np.testing.assert_array_equal(view.alpha, np.rint(rgba[..., 3] * (255 / limit)))
 
 
-def test_alpha_is_averaged_with_the_image(tiny: Path) -> None:
+def test_alpha_is_averaged_with_the_image(tiny):
     """Catches an alpha of the full size beside a reduced image, one that is cut out of it, and one of opaque images."""
     alpha = cv2.imread(str(tiny / "train/r_1.png"), cv2.IMREAD_UNCHANGED)[..., 3].astype(float)
     view = scenes.load(tiny, downscale=2).train[1]
@@ -52,7 +50,7 @@ def test_alpha_is_averaged_with_the_image(tiny: Path) -> None:
     assert all(view.alpha is None for view in scene.train + scene.val + scene.test)
 
 
-def test_regions_are_the_masks_beside_the_images(tiny: Path) -> None:
+def test_regions_are_the_masks_beside_the_images(tiny):
     """Catches the mask of another view, changed numbers, another fingerprint, and images without masks refused."""
     before = scenes.load(tiny)
     assert all(view.regions is None for view in before.train + before.val + before.test)
@@ -68,7 +66,7 @@ def test_regions_are_the_masks_beside_the_images(tiny: Path) -> None:
 
 
 @pytest.mark.parametrize("downscale", [2, 3])
-def test_regions_are_not_averaged(tiny: Path, downscale: int) -> None:
+def test_regions_are_not_averaged(tiny, downscale):
     """Catches the mean of two object numbers, which is a third object, and regions of another size than the image."""
     numbers = np.arange(72, dtype=np.uint8).reshape(6, 12)
     write_masks(tiny)
@@ -80,7 +78,7 @@ def test_regions_are_not_averaged(tiny: Path, downscale: int) -> None:
     np.testing.assert_array_equal(view.regions, numbers[1::downscale, 1::downscale])
 
 
-def test_a_coarse_view_drops_both(tiny: Path) -> None:
+def test_a_coarse_view_drops_both(tiny):
     """Catches the full-size alpha and regions of a view whose image was reduced for an early step."""
     write_masks(tiny)
     coarse = reduced(scenes.load(tiny).train[0], 2)
@@ -98,7 +96,7 @@ DAMAGES: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("damage", "words"), DAMAGES)
-def test_a_damaged_mask_is_refused(damage: Callable[[Path], object], words: str, tiny: Path, tmp_path: Path) -> None:
+def test_a_damaged_mask_is_refused(damage, words, tiny, tmp_path):
     """Catches a mask that is left out, of another size, of colours or cut off; and a link of the user refused."""
     write_masks(tiny)
     mask = tiny / "train" / "masks" / "r_1.png"
@@ -112,7 +110,7 @@ def test_a_damaged_mask_is_refused(damage: Callable[[Path], object], words: str,
 
 
 @pytest.mark.skipif(not MUJOCO.is_dir(), reason="../shared/data/mujoco is not here")
-def test_regions_of_a_mujoco_scene(tmp_path: Path) -> None:
+def test_regions_of_a_mujoco_scene(tmp_path):
     """Catches the layout of a published data set that has masks: every object is seen where the image is opaque."""
     (root,) = MUJOCO.glob("scene1_*")
     for split in ("train", "val", "test"):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +39,7 @@ def root(tmp_path: Path) -> Path:
     return folder
 
 
-def test_cameras_times_and_splits(root: Path) -> None:
+def test_cameras_times_and_splits(root):
     """Catches a transposed rotation, a centre in the middle, a held-out camera that trains, and times of raw frames."""
     scene = scenes.load(root)
     assert has_estimated_up(scene)
@@ -60,7 +59,7 @@ def test_cameras_times_and_splits(root: Path) -> None:
     torch.testing.assert_close(half.camera.K[:2], torch.tensor([[5.0, 0, 1.75], [0, 7.5, 1.25]]))
 
 
-def test_points_keep_their_times(root: Path) -> None:
+def test_points_keep_their_times(root):
     """Catches times that are lost where a scene comes to its standard place, and a fingerprint without the points."""
     before = scenes.load(root).fingerprint
     properties = [
@@ -76,7 +75,7 @@ def test_points_keep_their_times(root: Path) -> None:
     assert points.means.dtype == points.times.dtype == torch.float32
 
 
-def test_frames_can_be_chosen(root: Path) -> None:
+def test_frames_can_be_chosen(root):
     """Catches frames counted from 0, and a last one that is left out."""
     scene = scenes.load(root, frames=(101, 102))
     assert [view.name for view in scene.test] == ["Tiny_undist_00101_10", "Tiny_undist_00102_10"]
@@ -86,7 +85,7 @@ def test_frames_can_be_chosen(root: Path) -> None:
             scenes.load(root, frames=frames)  # type: ignore[arg-type]
 
 
-def test_columns_are_read_by_name(root: Path) -> None:
+def test_columns_are_read_by_name(root):
     """Catches numbers taken by their place: releases differ in their columns, and originals have d1 d2 after sk."""
     turned = [" ".join(reversed(line.split())) for line in (root / CAMERAS).read_text().splitlines()]
     first = scenes.load(root).test[0].camera
@@ -96,7 +95,7 @@ def test_columns_are_read_by_name(root: Path) -> None:
     assert torch.equal(first.K, other.K)
 
 
-def test_what_is_not_read_is_told(root: Path) -> None:
+def test_what_is_not_read_is_told(root):
     """Catches a column of distortion and a rounded size in silence, and Windows' mark at the start of a table."""
     header, *rows = (root / CAMERAS).read_text().splitlines()
     (root / CAMERAS).write_text("\n".join([f"\ufeff{header} d3", *(f"{row} 0.1" for row in rows)]))
@@ -128,7 +127,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
-def test_faulty_files_are_told(root: Path, apply: Callable[[Path], object], message: str) -> None:
+def test_faulty_files_are_told(root, apply, message):
     """Catches distorted originals taken for undistorted ones, tables that are read askew, a missing view, one of
     another size, and two scenes in one folder."""
     assert_refused(root, apply, message)
@@ -141,7 +140,7 @@ def damage(root: Path, name: str) -> Path:
     return path
 
 
-def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_image_is_replaced_if_it_is_named(root, capsys):
     """Catches an image of another camera or frame, and a replacement that no message, scene or fingerprint tells."""
     whole = scenes.load(root)
     damage(root, "Tiny_undist_00101_09")
@@ -176,7 +175,7 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root: Path, capsys: pytest.C
         ("00101_09", "Tiny_undist_00101_09", "repair: expected names such as"),
     ],
 )
-def test_what_cannot_be_replaced_is_refused(root: Path, damaged: str, repair: Any, message: str) -> None:
+def test_what_cannot_be_replaced_is_refused(root, damaged, repair, message):
     """Catches a whole image that is thrown away, a test on another frame's image, an image made of nothing, and one
     name that is read as a list of letters."""
     for single in damaged.split():
@@ -186,7 +185,7 @@ def test_what_cannot_be_replaced_is_refused(root: Path, damaged: str, repair: An
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
-def test_points_of_colmap(root: Path, kind: str) -> None:
+def test_points_of_colmap(root, kind):
     """Catches points of a reconstruction that are left out, not moved with the cameras, or said to be left out."""
     means = np.array([(0.5, -0.25, 4.0), (1.5, 2.0, 5.0)])
     capture = Capture("PINHOLE", WIDTH, HEIGHT, (1, 1, 1, 1), [], np.empty((0, 4, 4)), means)
@@ -197,7 +196,7 @@ def test_points_of_colmap(root: Path, kind: str) -> None:
     assert not any("and not sparse" in note for note in scene.notes)
 
 
-def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
+def test_points_in_the_frustum_are_seen_by_all(root):
     """Catches initial points behind the array or beside what it sees, which would never get a gradient."""
     scene = scenes.load(root)
     cameras = [view.camera for view in scene.train[:15]]
@@ -215,7 +214,7 @@ def test_points_in_the_frustum_are_seen_by_all(root: Path) -> None:
 
 
 @pytest.mark.skipif(not PLAYROOM.is_dir(), reason="../shared/data/scenes/playroom is not here")
-def test_playrooms_points_project_onto_their_colours() -> None:
+def test_playrooms_points_project_onto_their_colours():
     """Catches a pose that is inverted or mirrored: points of the scene have the colours of the pixels they fall on."""
     scene = scenes.load(PLAYROOM)
     for view in scene.train[:15:7]:

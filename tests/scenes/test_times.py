@@ -64,7 +64,7 @@ FORMS: dict[str, Callable[[int, int], str]] = {
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("moves", [False, True])
-def test_the_time_of_a_rig(form: str, moves: bool) -> None:
+def test_the_time_of_a_rig(form, moves):
     """Catches the number of the camera taken for the time, in any order of folders, where poses repeat or nearly do."""
     names, viewmats, expected = fixed(FORMS[form])
     timed = of_names(names, nudged(viewmats) if moves else viewmats)
@@ -113,7 +113,7 @@ MOVING: dict[str, Callable[[int], str]] = {
 
 
 @pytest.mark.parametrize("form", MOVING)
-def test_the_time_of_a_moving_camera(form: str) -> None:
+def test_the_time_of_a_moving_camera(form):
     """Catches the size of the picture, the digits after the point, and the seconds of a clock taken for the time."""
     count = 10
     names = [MOVING[form](i) for i in range(count)]
@@ -124,7 +124,7 @@ def test_the_time_of_a_moving_camera(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["frame_0003/cam01", "0003/1"])
-def test_two_cameras_that_move(form: str) -> None:
+def test_two_cameras_that_move(form):
     """Catches the last number, that of the camera, where no pose repeats: words decide, or else the shorter steps."""
     listed = [(f, c) for f in range(8) for c in range(2)]
     path = circle(200)
@@ -133,7 +133,7 @@ def test_two_cameras_that_move(form: str) -> None:
     assert of_names([write(*single) for single in listed], viewmats).values == pytest.approx([f / 7 for f, _ in listed])
 
 
-def test_no_time() -> None:
+def test_no_time():
     """Catches times from numbers that do not change, from those of a still rig, and from nowhere."""
     for names in ([f"{letter}_1080p.png" for letter in "abcde"], [*"abcde"], [f"cam{i:02d}.png" for i in range(5)]):
         timed = of_names(names, circle(5))
@@ -179,7 +179,7 @@ REFUSED: dict[str, tuple[list[str], np.ndarray, str]] = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_contradictory_names_are_refused(kind: str) -> None:
+def test_contradictory_names_are_refused(kind):
     """Catches views of one camera at one time, and a guess where several numbers change."""
     names, viewmats, words = REFUSED[kind]
     with pytest.raises(InputError, match=words) as caught:
@@ -188,7 +188,7 @@ def test_contradictory_names_are_refused(kind: str) -> None:
     assert "times.csv" in str(caught.value) or kind == "endless"
 
 
-def test_digits_beyond_a_float_count() -> None:
+def test_digits_beyond_a_float_count():
     """Catches nanoseconds of a clock that are rounded, and a number of thousands of decimals that stops Python."""
     names = [f"{10**18 + i}.png" for i in range(3)]
     assert of_names(names, circle(3)).values == [0, 0.5, 1]
@@ -215,7 +215,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_tables_as_programs_write_them(kind: str) -> None:
+def test_tables_as_programs_write_them(kind):
     """Catches a table that is refused for what a spreadsheet adds to it."""
     names = ["a.png", "b.png", "c.png"]
     timed = of_table(TABLES[kind].encode(), names, names)
@@ -234,13 +234,13 @@ def test_tables_as_programs_write_them(kind: str) -> None:
         ("name,time\na,1\nb,2\n", "got none of 'c'"),
     ],
 )
-def test_a_table_that_contradicts_itself_is_refused(content: str, words: str) -> None:
+def test_a_table_that_contradicts_itself_is_refused(content, words):
     """Catches two images of one camera at one time, and a row of another length."""
     with pytest.raises(InputError, match=words):
         of_table(content.encode(), ["a", "b", "c"], [0, 0, 0])
 
 
-def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) -> None:
+def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path):
     """Catches Times.CSV that is left out in silence, a number whose exact value has a hundred million digits, and a
     division by zero where all times are equal, as of many cameras at one moment."""
     (tmp_path / "Times.CSV").write_text("name,time\na,1e-99999999\nb,1\n")
@@ -251,7 +251,7 @@ def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path: Path) ->
     assert timed.values == [None, None]
 
 
-def test_fields_are_scaled_over_all_files() -> None:
+def test_fields_are_scaled_over_all_files():
     """Catches splits that are scaled apart, times in [0, 1] that are changed, and seconds beside shares of the clip."""
     assert times.of_fields({"a": [0.0, 0.7], "b": [0.1]}) == ({"a": [0.0, 0.7], "b": [0.1]}, [])
     timed, (note,) = times.of_fields({"a": [0.0, 0.3], "b": [0.1]})
@@ -266,7 +266,7 @@ def test_fields_are_scaled_over_all_files() -> None:
         times.of_fields({"a": [0.0, 59.0], "b": [0.0, 0.5, 1.0]})
 
 
-def test_places_do_not_depend_on_the_unit() -> None:
+def test_places_do_not_depend_on_the_unit():
     """Catches a tolerance in world units: one place for all cameras of a small scene, or many for one far away."""
     for factor in (1e-4, 1, 1e5):
         viewmats = np.repeat(circle(6), 2, 0)

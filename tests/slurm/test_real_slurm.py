@@ -7,7 +7,7 @@ import pytest
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_sweep_survives_what_a_cluster_does_to_it() -> None:
+def test_a_sweep_survives_what_a_cluster_does_to_it():
     """Catches runs that a real Slurm loses, forgets or changes: see check.py. A fake Slurm would not."""
     reason = cluster.missing()
     if reason:

@@ -95,7 +95,7 @@ def write_ply(path: Path, spread: float = 1.0, count: int = 10) -> Path:
 # ---- the command
 
 
-def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_measured_in_its_test_views(run, capsys):
     """Catches other views than those of the record, another PSNR than it, and an error that its bound does not hold.
 
     Also a picture that --json writes into the run's folder, which may be read-only, and one that is missing.
@@ -123,7 +123,7 @@ def test_a_run_is_measured_in_its_test_views(run: Path, capsys: pytest.CaptureFi
     assert (run / "exactness.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_ply_is_measured_on_an_orbit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_ply_is_measured_on_an_orbit(tmp_path, capsys):
     """Catches a PLY that is not read, is seen from inside, or is said to have a PSNR."""
     assert main([str(write_ply(tmp_path / "third party.ply")), "--out", str(tmp_path / "out")]) == 0
     text = capsys.readouterr().out
@@ -140,7 +140,7 @@ def centers(subject: Subject) -> torch.Tensor:
     return torch.stack([shot.camera.center for shot in subject.shots])
 
 
-def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_orbit_is_a_full_circle_at_a_moment_each(run, monkeypatch):
     """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out.
 
     Also an orbit of another size or middle, one of a PLY without extent, and a PLY seen otherwise than by itself.
@@ -164,7 +164,7 @@ def test_an_orbit_is_a_full_circle_at_a_moment_each(run: Path, monkeypatch: pyte
         stability.load(run, run, "elsewhere")
 
 
-def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_read_or_written_is_one_line(tmp_path, capsys):
     """Catches a stack trace for no run, no PLY, an --out that is a file, and options that are not read."""
     (tmp_path / "broken.ply").write_text("no")
     for arguments, expected in (
@@ -181,7 +181,7 @@ def test_what_cannot_be_read_or_written_is_one_line(tmp_path: Path, capsys: pyte
         assert expected in line
 
 
-def test_an_exact_view_has_no_change(run: Path) -> None:
+def test_an_exact_view_has_no_change(run):
     """Catches a mean PSNR whose change is NaN, infinity less infinity, as one view is the background alone."""
     model = load_run(run).model
     empty = float32_error.Shot("empty", around(model, 4.0, 32, 32, 0.0), 0.0, torch.zeros(32, 32, 3))
@@ -200,7 +200,7 @@ def test_an_exact_view_has_no_change(run: Path) -> None:
     assert "Rounding to 8 bits changes an image 1,443 times as much as float32" in verdict
 
 
-def test_the_report_word_for_word() -> None:
+def test_the_report_word_for_word():
     """Catches a number under another title, a share that is no percentage, and a reason that is not explained."""
     of_front = ViewExactness("front", 0.5, 0.00025, 1.0, 0.125, 0.25, 30.0, -1e-4, 2e-4)
     of_back = ViewExactness("back", 0.1, 0.00005, 0.2, 0.01, 0.0)
@@ -210,7 +210,7 @@ def test_the_report_word_for_word() -> None:
     assert float32_error.BRANCHES.keys() < report.MEANINGS.keys()
 
 
-def test_the_picture_shows_image_error_and_bound(tmp_path: Path) -> None:
+def test_the_picture_shows_image_error_and_bound(tmp_path):
     """Catches panes in another order, and a linear scale, on which all errors are black."""
     image, plane = torch.full((8, 8, 3), 0.5, dtype=torch.float64), torch.ones(8, 8, dtype=torch.float64)
     exact = ExactImage(image, plane / 255, plane.int(), plane.byte())
@@ -223,7 +223,7 @@ def test_the_picture_shows_image_error_and_bound(tmp_path: Path) -> None:
     assert np.median(columns[0]) < np.median(columns[1]) < np.median(columns[2])
 
 
-def test_an_indefinite_covariance_is_a_reason() -> None:
+def test_an_indefinite_covariance_is_a_reason():
     """Catches a Gaussian that is hard for the papers' formula and is not listed so."""
     model = small_model()
     model.splats["motion"].data.normal_(0, 3000.0, generator=generator(0))
@@ -251,7 +251,7 @@ def hard_model() -> GaussianModel:
     return model.requires_grad_(False)
 
 
-def test_why_a_gaussian_is_hard() -> None:
+def test_why_a_gaussian_is_hard():
     """Catches a reason given to the wrong Gaussian."""
     model = hard_model()
     camera = around(model, 4.0, 32, 32, 0.0, 0.0)
@@ -272,7 +272,7 @@ def test_why_a_gaussian_is_hard() -> None:
         assert "huge" not in float32_error.reasons(wide, replace(camera, width=width, height=height), rows)[4]
 
 
-def test_the_first_gaussian_counts() -> None:
+def test_the_first_gaussian_counts():
     """Catches the number 0 taken for none."""
     model = hard_model()
     model.splats["opacities"].data[1:] = -50.0
@@ -282,7 +282,7 @@ def test_the_first_gaussian_counts() -> None:
     assert exactness.views[0].median_bound > 0
 
 
-def test_the_worst_gaussians_have_the_largest_sums() -> None:
+def test_the_worst_gaussians_have_the_largest_sums():
     """Catches the least ones, a Gaussian twice, one of a view in which it is less hard, and a sum of other pixels."""
     model = small_model()
     double, sums = float32_error.float64_model(model), []
@@ -297,7 +297,7 @@ def test_the_worst_gaussians_have_the_largest_sums() -> None:
     assert [culprit.bound for culprit in worst] == pytest.approx((255 * largest[order]).tolist())
 
 
-def test_what_is_said_of_a_view() -> None:
+def test_what_is_said_of_a_view():
     """Catches a number in other units, and a bound on the change of PSNR that is not that of its pixels."""
     image, plane = torch.full((2, 2, 3), 0.5, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64)
     branches = torch.tensor([[0, 1], [0, 0]], dtype=torch.uint8)
@@ -316,7 +316,7 @@ def test_what_is_said_of_a_view() -> None:
 
 
 @pytest.mark.parametrize(("name", "motion"), [("7dgs", 300), ("7dgs_nodir", 3000)])
-def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name: str, motion: int) -> None:
+def test_the_papers_formula_is_indefinite_for_correlated_gaussians(name, motion):
     """Catches a Gaussian whose published covariance is indefinite in float32 and is not named, or the reverse."""
     model = build(name, sh_degree=0, lambda_t=0.5, **({"lambda_d": 0.5} if name == "7dgs" else {}))
     g = torch.Generator().manual_seed(0)
@@ -345,7 +345,7 @@ def with_factors(log_diagonal: Sequence[float], motion: float = 0.0, shape: floa
     return model.double()
 
 
-def test_condition_numbers() -> None:
+def test_condition_numbers():
     """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too.
 
     Also a share of indefinite covariances by the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3.
@@ -373,7 +373,7 @@ def psnr_float32(model: GaussianModel, views: Sequence[View]) -> tuple[float | N
 VIEWS = moving_square().train[:8]
 
 
-def test_it_is_the_largest_change_of_three_spaced_views(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_the_largest_change_of_three_spaced_views(monkeypatch):
     """Catches a mean or a sum instead of the largest change, other views, and a bound instead of a change."""
     model = small_model()
     change, why = psnr_float32(model, VIEWS)
@@ -388,7 +388,7 @@ def test_it_is_the_largest_change_of_three_spaced_views(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("kind", [RuntimeError, TypeError])
-def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_of_float32_alone_loses_no_run(kind, monkeypatch):
     """Catches an error of a user's model in float64 that ends a trained run, and images of two backends compared."""
     assert psnr_float32(small_model(backend="reference"), VIEWS)[0] is None
     assert "needs raster.backend=cpu" in psnr_float32(small_model(backend="reference"), VIEWS)[1]
@@ -405,7 +405,7 @@ def test_a_model_of_float32_alone_loses_no_run(kind: type[Exception], monkeypatc
     assert psnr_float32(model, VIEWS) == (None, reason)
 
 
-def test_equal_images_have_no_change() -> None:
+def test_equal_images_have_no_change():
     """Catches an infinity where an image equals its view, whose PSNR is capped, and one of two images not filtered."""
     model = small_model()
     double = float32_error.float64_model(model)

@@ -42,7 +42,7 @@ def count(average: Average, *steps: int) -> Average:
     ("psnr", "ends_at", "kept"),
     [(-99.0, 70.0, 50), (-69.0, 99.0, 0), (-70.0, 99.0, 0), (0.0, 99.0, 0), (math.nan, 70.0, 50)],
 )
-def test_it_is_the_mean_of_every_tenth_step_if_this_is_better(psnr: float, ends_at: float, kept: int) -> None:
+def test_it_is_the_mean_of_every_tenth_step_if_this_is_better(psnr, ends_at, kept):
     """Catches a mean of all steps, one that starts a step late, a parameter that is left out, a mean that replaces
     better parameters, and last parameters that are not put back."""
     average = count(average_from(50), 100)
@@ -52,7 +52,7 @@ def test_it_is_the_mean_of_every_tenth_step_if_this_is_better(psnr: float, ends_
     assert (average.kept, average.count, average.results()) == (kept, 0, {"averaged": kept})
 
 
-def test_it_starts_anew_when_gaussians_change() -> None:
+def test_it_starts_anew_when_gaussians_change():
     """Catches means of rows that are others now."""
     average = count(average_from(50), 75)
     average.reindex(torch.arange(3), torch.zeros(3, dtype=torch.bool))
@@ -61,7 +61,7 @@ def test_it_starts_anew_when_gaussians_change() -> None:
     assert average.kept == 20  # iterations: the parameters of steps 80 to 99 have had a part in the mean
 
 
-def test_a_checkpoint_has_it() -> None:
+def test_a_checkpoint_has_it():
     """Catches a resumed training whose mean lacks the steps before, and state of another model."""
     whole, resumed = count(average_from(50), 100), average_from(50)
     state = copy.deepcopy(count(average_from(50), 65).state_dict())
@@ -88,7 +88,7 @@ def test_a_checkpoint_has_it() -> None:
 
 
 @pytest.mark.parametrize(("split", "views", "kept"), [("test", 3, 50), ("val", 3, 0), ("test", 0, 0)])
-def test_parameters_are_averaged_where_val_may_choose(split: str, views: int, kept: int) -> None:
+def test_parameters_are_averaged_where_val_may_choose(split, views, kept):
     """Catches results on the views by which they were chosen, and means that nothing chose."""
     fitted = trainer("7dgs", "train.average_from=15000", f"scene.eval_split={split}", "train.patience=null")
     fitted.scene = replace(fitted.scene, val=fitted.scene.val[:views])

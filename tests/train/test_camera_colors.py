@@ -18,7 +18,7 @@ ON = ("train.camera_colors=true", "train.batch_size=3")
 START = 10  # of 100 steps
 
 
-def test_the_numbers_of_the_sheet() -> None:
+def test_the_numbers_of_the_sheet():
     """Catches the matrix transposed, or without the identity (RIVALS.md, section 8)."""
     of_camera = torch.tensor([[0.02, 0, 0.01], [0, -0.03, 0], [0.01, 0, 0], [0.01, 0, -0.02]], dtype=torch.float64)
     image = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64).expand(1, 5, 7, 3)
@@ -27,7 +27,7 @@ def test_the_numbers_of_the_sheet() -> None:
     assert shown.shape == image.shape
 
 
-def test_the_gradient() -> None:
+def test_the_gradient():
     """Catches a gradient that lacks a row of pixels, a channel, or the identity."""
     generator = torch.Generator().manual_seed(0)
     image, of_camera = (
@@ -51,7 +51,7 @@ def of_array(offsets: Sequence[float], *overrides: str) -> Trainer:
     return trainer("4dgs", *ON, *overrides, scene=array(offsets))
 
 
-def test_cameras_learn_in_what_they_differ() -> None:
+def test_cameras_learn_in_what_they_differ():
     """Catches a map of another camera, one of each view, one that is never updated, and a start before its step."""
     training = train(of_array((0.1, 0.0, -0.1)), until=START - 1)
     hook = training.hook(CameraColors)
@@ -63,7 +63,7 @@ def test_cameras_learn_in_what_they_differ() -> None:
     assert hook.results()["camera_colors"] == {"cameras": 3, "largest_change": float(hook.maps.data.abs().max())}
 
 
-def test_images_are_measured_without() -> None:
+def test_images_are_measured_without():
     """Catches a measured image in the colours of a training camera."""
     training = train(of_array((0.1, 0.0, -0.1)), until=20)
     before = training.render(training.views[0])
@@ -72,7 +72,7 @@ def test_images_are_measured_without() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_training_resumes_with_equal_bits_for_any_threads() -> None:
+def test_a_training_resumes_with_equal_bits_for_any_threads():
     """Catches maps or moments that a checkpoint lacks, and sums whose order depends on the threads."""
     torch.set_num_threads(1)
     whole, _ = assert_resumes(lambda: of_array((0.1, 0.0, -0.1)), 50)
@@ -82,7 +82,7 @@ def test_a_training_resumes_with_equal_bits_for_any_threads() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_gradients_of_large_images_do_not_depend_on_threads() -> None:
+def test_gradients_of_large_images_do_not_depend_on_threads():
     """Catches a sum over all pixels at once, which torch splits among threads."""
     image = torch.rand(1, 700, 900, 3, generator=torch.Generator().manual_seed(0))
     gradients = []

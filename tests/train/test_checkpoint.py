@@ -6,7 +6,6 @@ import pickle
 import signal
 import time
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,6 @@ from gsbench.measure import record
 from gsbench.train import checkpoint
 from gsbench.train.checkpoint import Checkpoint
 from gsbench.train.hooks.average import Average
-from gsbench.train.loop import Trainer
 
 RUN = (
     *("model=7dgs", "train.iterations=60", "train.densify.every=10", "train.checkpoint_minutes=0"),
@@ -44,7 +42,7 @@ def comparable_state(results: Path) -> object:
     return checkpoint.without_times(final_state(results))
 
 
-def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_path: Path) -> None:
+def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square, tmp_path):
     """Catches anything that the next step depends on and the checkpoint lacks: SIGKILL twice, at no chosen moment.
 
     The model has everything there is to lose: AGR, moments of cloned and split Gaussians, statistics of density
@@ -88,7 +86,7 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square: Path, tmp_pa
     ],
     ids=["relocation and average", "several views", "neighbours", "patience"],
 )
-def test_a_training_continues_from_its_state(start: Callable[[], Trainer], step: int) -> None:
+def test_a_training_continues_from_its_state(start, step):
     """Catches random numbers, sums, scores, counts or neighbours of a rule or a hook that a checkpoint does not have,
     and a checkpoint that has lost the best iteration, or how long ago it was."""
     whole, stopped = assert_resumes(start, step)
@@ -100,7 +98,7 @@ def test_a_training_continues_from_its_state(start: Callable[[], Trainer], step:
         assert len(whole.model) > len(stopped.model)
 
 
-def test_every_key_of_a_state_is_reproduced_or_a_time(square: Path, tmp_path: Path) -> None:
+def test_every_key_of_a_state_is_reproduced_or_a_time(square, tmp_path):
     """Catches a new key of the state that nobody sorted: seconds among what must be equal failed every comparison once.
 
     Gates are in the state too, and measure times of their own.
@@ -130,7 +128,7 @@ class Exploit:
 
 
 @pytest.mark.parametrize("state", [None, [], {}, {"seen": 1}, {"seen": torch.zeros(3)}, {"seen": torch.zeros(2).int()}])
-def test_a_tensor_of_a_checkpoint_is_the_one_expected(state: object) -> None:
+def test_a_tensor_of_a_checkpoint_is_the_one_expected(state):
     """Catches a stack trace for a part of another kind, and a tensor that broadcasts or is converted."""
     with pytest.raises(InputError, match="checkpoint: expected 'seen' as "):
         checkpoint.tensor(state, "seen", (2,), torch.float32)
@@ -138,9 +136,7 @@ def test_a_tensor_of_a_checkpoint_is_the_one_expected(state: object) -> None:
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", pickle.dumps(Exploit()), json.dumps({}).encode()])
-def test_a_file_that_is_no_checkpoint_is_refused(
-    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path, monkeypatch):
     """Catches a stack trace for a damaged file, and code that runs because a file says so."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / checkpoint.FILE_NAME
@@ -150,7 +146,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(
     assert not Path("owned").exists()
 
 
-def test_a_checkpoint_is_written_without_a_copy_in_memory(tmp_path: Path) -> None:
+def test_a_checkpoint_is_written_without_a_copy_in_memory(tmp_path):
     """Catches a state of gigabytes that is copied to write it: a training at the limit of the memory would end then."""
     state = {"model": torch.zeros(1 << 20)}
     tracemalloc.start()
@@ -160,7 +156,7 @@ def test_a_checkpoint_is_written_without_a_copy_in_memory(tmp_path: Path) -> Non
     assert peak < state["model"].nbytes / 2
 
 
-def test_a_checkpoint_of_another_run_is_not_taken(tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_run_is_not_taken(tmp_path):
     """Catches a run that goes on from another config's or another data set's parameters."""
     path = tmp_path / checkpoint.FILE_NAME
     assert checkpoint.load(path, "training", "data", "cpu") is None

@@ -45,7 +45,7 @@ def densified(control: GradientDensification, most: int = 100, has_reset: bool =
     return control.model.splats["means"].detach()[:, 0].tolist(), refused
 
 
-def test_density_control_clones_small_splits_large_prunes_faint() -> None:
+def test_density_control_clones_small_splits_large_prunes_faint():
     """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures.
 
     Also a clone or a child that goes on with its parent's momentum.
@@ -71,7 +71,7 @@ def test_density_control_clones_small_splits_large_prunes_faint() -> None:
     descend(model, optimizer, 1)
 
 
-def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> None:
+def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first():
     """Catches a threshold of 0 that makes 3.3 million Gaussians in 21 steps, and a cap that depends on the rows' order
     in a sort that is not stable, or takes the first rows whatever their gradients."""
     _, _, control = control_of(6, threshold=0.0)
@@ -82,7 +82,7 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first() -> Non
         assert densified(control, most)[1] == len(control.model) == 9
 
 
-def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
+def test_what_no_view_of_an_epoch_drew_is_pruned():
     """Catches dead weight that stays, Gaussians dropped before every view has looked, and counts or gradients that stay
     where they were while the Gaussians move."""
     _, _, control = control_of(4)
@@ -104,7 +104,7 @@ def test_what_no_view_of_an_epoch_drew_is_pruned() -> None:
     assert control.gradient.tolist() == control.times_visible.tolist() == [0, 0, 0]
 
 
-def test_large_gaussians_are_pruned_only_when_asked() -> None:
+def test_large_gaussians_are_pruned_only_when_asked():
     """Catches pruning by size before the first opacity reset."""
     model, _, control = control_of(4)
     with torch.no_grad():
@@ -114,7 +114,7 @@ def test_large_gaussians_are_pruned_only_when_asked() -> None:
     assert densified(control, has_reset=True)[0] == [1, 2, 3]
 
 
-def test_the_rule_is_called_as_the_schedule_says() -> None:
+def test_the_rule_is_called_as_the_schedule_says():
     """Catches a last densification that does not know the views before it, counting for none (2 % of a step), children
     that are scattered alike in every round or not by the seed, and pruning by size before opacities were reset."""
     fitted = trainer("3dgs", "train.batch_size=1")
@@ -142,7 +142,7 @@ def test_the_rule_is_called_as_the_schedule_says() -> None:
     assert resets == [False, False, True]
 
 
-def test_what_is_long_in_time_is_split_along_its_path_near_the_clip() -> None:
+def test_what_is_long_in_time_is_split_along_its_path_near_the_clip():
     """Catches 7DGS never splitting in time, where a small Gaussian that asks for density and moves gets two times, and
     a split that draws from all of a Gaussian that lasts for ever: AGR read times of -240."""
     fitted = trainer("7dgs")
@@ -168,14 +168,14 @@ def test_what_is_long_in_time_is_split_along_its_path_near_the_clip() -> None:
         (800, 2_000, 400_000, 2_000_000),
     ],
 )
-def test_the_limit_follows_from_the_training_pixels(number: int, side: int, initial: int, most: int) -> None:
+def test_the_limit_follows_from_the_training_pixels(number, side, initial, most):
     """Catches a limit of the views' number or of one view, one that many initial points exceed, and one without end."""
     views: list[Any] = [SimpleNamespace(camera=SimpleNamespace(width=side, height=side))] * number
     assert gaussian_limit(None, views, initial) == most
     assert gaussian_limit(500, views, initial) == 500
 
 
-def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_training_keeps_to_it_and_says_so_once(capsys):
     """Catches a limit that no round of densification gets, and a training that is silent about what it left out."""
     square = moving_square()
     points = replace(square.points, means=square.points.means[:20], colors=square.points.colors[:20])
@@ -189,7 +189,7 @@ def test_a_training_keeps_to_it_and_says_so_once(capsys: pytest.CaptureFixture[s
     assert printed.count(f"{fitted.density.limit} Gaussians are the most (default of train.densify.max_gaussians)") == 1
 
 
-def test_the_lightest_gaussians_go_and_moments_follow() -> None:
+def test_the_lightest_gaussians_go_and_moments_follow():
     """Catches the heaviest that go, a weight of the wrong rows, and moments or counts of other Gaussians."""
     fitted = trainer("3dgs", "train.densify.thin_to=0.5")
     fitted.train_step()
@@ -203,7 +203,7 @@ def test_the_lightest_gaussians_go_and_moments_follow() -> None:
     assert len(fitted.density.rule.unseen) == len(kept)
 
 
-def test_blend_weights_add_up_to_alpha() -> None:
+def test_blend_weights_add_up_to_alpha():
     """Catches weights of another channel count or view: the weights of a pixel add up to its alpha."""
     fitted = trainer("3dgs")
     view = fitted.scene.train[0]

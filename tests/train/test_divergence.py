@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 import torch
@@ -36,7 +35,7 @@ def parameter(gradient: list[float] | None) -> nn.Parameter:
         (0.5, None, None),
     ],
 )
-def test_the_parameter_is_named_at_its_step(loss: float, gradient: list[float] | None, message: str | None) -> None:
+def test_the_parameter_is_named_at_its_step(loss, gradient, message):
     """Catches a bad gradient that reaches its parameter, or is blamed on another parameter or step, a check of the sum
     alone, and a parameter without a gradient taken for a fault."""
     groups = {"means": [parameter([1.0, 2.0])], "refinement": [parameter([1.0, 1.0]), parameter(gradient)]}
@@ -50,7 +49,7 @@ def test_the_parameter_is_named_at_its_step(loss: float, gradient: list[float] |
             check.end(3)
 
 
-def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
+def test_a_bad_step_found_later_changes_nothing_meanwhile():
     """Catches a GPU's training, looked at now and then, that applies a bad gradient, or a good one after it."""
     finite_check = FiniteCheck("cpu")
     finite_check.every = 4
@@ -76,7 +75,7 @@ def test_a_bad_step_found_later_changes_nothing_meanwhile() -> None:
 POISONED = 7
 
 
-def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
+def test_the_step_the_parameter_and_the_gaussian(tmp_path):
     """Catches a NaN that is noticed steps later, is blamed on something else, or reaches a parameter or checkpoint."""
     run = trainer("7dgs", "train.curve_points=1", "train.checkpoint_minutes=0")
     real = run.gradients
@@ -99,7 +98,7 @@ def test_the_step_the_parameter_and_the_gaussian(tmp_path: Path) -> None:
     assert all(value.isfinite().all() for value in state["model"].values())
 
 
-def test_without_harmonics() -> None:
+def test_without_harmonics():
     """Catches a diagnosis of no coefficients, which leaves no record, and one without any Gaussian to blame."""
     model, points = models.build("3dgs", sh_degree=0), moving_square().points
     model.initialise(points, 4.4, generator(0))

@@ -36,9 +36,7 @@ def with_val(psnr: dict[int, float], *more: str) -> Trainer:
         ({}, 100, ("train.curve_points=4", "train.patience=0.05")),  # not over before it is measured again
     ],
 )
-def test_a_training_stops_after_its_best_and_keeps_it(
-    psnr: dict[int, float], kept: int, words: tuple[str, ...]
-) -> None:
+def test_a_training_stops_after_its_best_and_keeps_it(psnr, kept, words):
     """Catches a training that goes on, one that keeps its last state, a state that the next steps have changed, and a
     training that patience changes where it has nothing to do."""
     fitted, saved = with_val(psnr, "effects.gate=off", *words), list[dict[str, Any]]()
@@ -53,7 +51,7 @@ def test_a_training_stops_after_its_best_and_keeps_it(
     assert "early_stop" not in fitted.state_of_gaussians()["hooks"]  # or a kept state would hold the one before it
 
 
-def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
+def test_effects_are_removed_from_the_gaussians_that_are_kept():
     """Catches gates at the end whose rows are those of the last iteration: more Gaussians than the kept one has."""
     fitted, plain = train(with_val({40: 50.0})), train(with_val({40: 50.0}, "effects.gate=off"))
     assert 0 < len(fitted.model) <= len(plain.model)
@@ -63,7 +61,7 @@ def test_effects_are_removed_from_the_gaussians_that_are_kept() -> None:
 @pytest.mark.parametrize(
     "changed", [{"best": 3}, {"best": ("a", 1.0)}, {"kept": 3}, {"kept": {}}, {"stop": {"iteration": "x"}}, {}]
 )
-def test_a_damaged_checkpoint_is_refused(changed: dict[str, Any]) -> None:
+def test_a_damaged_checkpoint_is_refused(changed):
     """Catches a stack trace from what a checkpoint says was kept."""
     fitted = with_val({})
     state = fitted.state_dict()

@@ -16,7 +16,7 @@ from gsbench.train.hooks.best import Best
 from gsbench.train.optim import rate_at
 
 
-def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
+def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split():
     """Catches a curve measured on test, and a best on val that stores val's own score."""
     fitted = trainer()
     scores = {id(fitted.scene.val): [20.0, 21.0, 20.5], id(fitted.views): [15.0, 14.0, 16.0]}
@@ -29,7 +29,7 @@ def test_the_curve_is_of_val_and_the_best_of_the_evaluated_split() -> None:
     assert (best.val, best.eval_at_best_val, best.eval) == (21.0, 14.0, None)
 
 
-def test_opacities_are_reset_when_the_schedule_says_and_after_measuring() -> None:
+def test_opacities_are_reset_when_the_schedule_says_and_after_measuring():
     """Catches a reset that is never called, is called every step, leaves any of Adam's two moments, or lowers far, and
     a curve, and a best on val, of models whose opacities were lowered a moment ago."""
     fitted, measured = trainer(), list[float]()
@@ -47,7 +47,7 @@ def test_opacities_are_reset_when_the_schedule_says_and_after_measuring() -> Non
     assert not state["exp_avg_sq"].any()
 
 
-def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_fall_in_the_optimizer(monkeypatch):
     """Catches rates that are set once, or rates to another parameter: those of a step reach Adam."""
     fitted, rates = trainer("7dgs"), {}
 
@@ -65,9 +65,7 @@ def test_rates_fall_in_the_optimizer(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(rates) >= 10
 
 
-def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bar_tells_seconds_and_val_without_reading_the_clock(capsys, monkeypatch):
     """Catches a bar that says neither, and one that waits for a GPU at every step to say it."""
     fitted = trainer("3dgs", "train.curve_points=4")
     reads, seconds = [], StageClock.seconds.fget
@@ -79,7 +77,7 @@ def test_the_bar_tells_seconds_and_val_without_reading_the_clock(
     assert re.search(r"\d+ s of training, val \d+\.\d\d dB \([+-]\d", last)
 
 
-def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch):
     """Catches Python between stages that no second holds, val, checkpoints and reports that are held to be training,
     a curve of another clock, and a stopped run that loses seconds or counts them twice."""
     now, saved = [0.0], list[dict[str, Any]]()
@@ -111,7 +109,7 @@ def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch: 
     assert [(p.iteration, p.seconds) for p in fitted.curve.points] == [(n, 3.0 * n) for n in (2, 4, 6, 8, 10)]
 
 
-def test_a_hook_has_a_name() -> None:
+def test_a_hook_has_a_name():
     """Catches a hook whose training fails at its end, when a checkpoint asks for the name."""
     with pytest.raises(InputError, match="Nameless: expected the hook's `name`"):
         type("Nameless", (Hook,), {})

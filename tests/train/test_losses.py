@@ -24,13 +24,13 @@ def ssim_by_scipy(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("size", [(11, 11), (17, 33), (1, 1), (5, 40)])
-def test_ssim_is_the_definition(size: tuple[int, int]) -> None:
+def test_ssim_is_the_definition(size):
     """Catches a wrong window, padding or constant: the filter of scipy is the truth."""
     a, b = pair(*size)
     assert structural_similarity(a, b).item() == pytest.approx(ssim_by_scipy(a.numpy(), b.numpy()), rel=1e-10)
 
 
-def test_weights() -> None:
+def test_weights():
     """Catches swapped or missing weights: (1 - w) L1 + w (1 - SSIM), 3DGS eq. 7."""
     a, b = pair(20, 24)
     l1, ssim = (a - b).abs().mean().item(), structural_similarity(a, b).item()
@@ -38,7 +38,7 @@ def test_weights() -> None:
         assert photometric(a, b, w).item() == pytest.approx((1 - w) * l1 + w * (1 - ssim), rel=1e-12)
 
 
-def test_gradient() -> None:
+def test_gradient():
     """Catches a detached term: the gradient is that of finite differences."""
     a, b = pair(12, 13)
     assert torch.autograd.gradcheck(lambda x: photometric(x, b, 0.2), (a.requires_grad_(),))

@@ -44,7 +44,7 @@ def rule(model: GaussianModel, noise: float = 0.0) -> tuple[MCMCDensification, M
     ("o", "n", "new", "c"),
     [(0.9, 2, 0.6838, 0.8679), (0.5, 2, 0.2929, 0.9522), (0.5, 6, 0.1091, 0.9219), (0.1, 3, 0.0345, 0.9898)],
 )
-def test_the_sums_of_relocation(o: float, n: int, new: float, c: float) -> None:
+def test_the_sums_of_relocation(o, n, new, c):
     """Catches a binomial of the wrong row, a lost sign and sums in float32, with numbers computed elsewhere."""
     results = relocated(torch.tensor([o, 0.3]), torch.tensor([n, 1]))
     assert [float(x[0]) for x in results] == pytest.approx([new, c], abs=6e-5)
@@ -52,7 +52,7 @@ def test_the_sums_of_relocation(o: float, n: int, new: float, c: float) -> None:
 
 
 @pytest.mark.parametrize("o", [0.01, 0.9, 1 - 1e-6])
-def test_many_copies_do_not_cancel(o: float) -> None:
+def test_many_copies_do_not_cancel(o):
     """Catches alternating sums that lose their digits at 51 copies: against the paper's double sum by fractions."""
     new, c = (float(x[0]) for x in relocated(torch.tensor([o], dtype=torch.float64), torch.tensor([51])))
     exact = Fraction(new)
@@ -64,7 +64,7 @@ def test_many_copies_do_not_cancel(o: float) -> None:
     assert c == pytest.approx(o / float(total), rel=1e-9)
 
 
-def test_rows_are_drawn_in_proportion() -> None:
+def test_rows_are_drawn_in_proportion():
     """Catches rows of weight zero that are drawn, and weights that are not proportions."""
     counts = drawn(torch.tensor([0.0, 1.0, 0.0, 3.0, 0.0]), 4000, generator(0)).bincount(minlength=5)
     assert counts[[0, 2, 4]].sum() == 0
@@ -72,7 +72,7 @@ def test_rows_are_drawn_in_proportion() -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_dead_gaussians_move_to_living_ones(name: str) -> None:
+def test_dead_gaussians_move_to_living_ones(name):
     """Catches copies that are not all of the source, a limit that is passed, and moments that stay with old rows."""
     model = moved(started(build(name, **OPTIONS[name]), 40))
     with torch.no_grad():
@@ -96,7 +96,7 @@ def test_dead_gaussians_move_to_living_ones(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_shrinking_keeps_position_and_life(name: str) -> None:
+def test_shrinking_keeps_position_and_life(name):
     """Catches a factor that also changes how a slice moves or fades, or a covariance that is not smaller by c^2."""
     model = started(build(name, **OPTIONS[name])).double()
     model = model if name == "4dgs" else moved(model)  # 4DGS: exact where rotations mix no time, as at the start
@@ -113,7 +113,7 @@ def test_shrinking_keeps_position_and_life(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_noise_is_of_the_covariance_and_of_the_transparent(name: str) -> None:
+def test_noise_is_of_the_covariance_and_of_the_transparent(name):
     """Catches noise on Gaussians that are seen, of another shape than theirs, or without the rate of the means."""
     model = started(build(name, **OPTIONS[name]), 4000).double()
     with torch.no_grad():

@@ -50,7 +50,7 @@ def flat(name: str) -> tuple[GaussianModel, Tensor, list[int]]:
         ([camera(2.0, focal=(50.0, 80.0))], 3.0 / 80),
     ],
 )
-def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras: list[Camera], pixel: float) -> None:
+def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras, pixel):
     """Catches the farthest camera, a mean over cameras, one on the other side, and a focal length that is left out, or
     the smaller of two."""
     model = flat("3dgs")[0]
@@ -60,7 +60,7 @@ def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras: list[Camera]
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_no_camera_sees_the_floor_and_only_sizes_in_space_are_held(name: str) -> None:
+def test_no_camera_sees_the_floor_and_only_sizes_in_space_are_held(name):
     """Catches a bound that touches the image, one on another axis, and one that is not held, that lengthens what is
     short in time, or that widens what is narrow in direction."""
     (model, sizes, space), eye = flat(name), camera(4.0)
@@ -90,14 +90,14 @@ def test_no_camera_sees_the_floor_and_only_sizes_in_space_are_held(name: str) ->
         ((None, None), None),
     ],
 )
-def test_it_is_half_the_gap_between_the_times_of_training(times: tuple[Any, ...], least: float | None) -> None:
+def test_it_is_half_the_gap_between_the_times_of_training(times, least):
     """Catches the gap between views of the same time, the mean or longest gap, and a static scene or model with one."""
     assert MinimumLifetime(training_of(build("4dgs"), time=[*times])).least == (least and pytest.approx(least))
     for name in ("3dgs", "dbs_static", "ubs_static"):
         assert MinimumLifetime(training_of(build(name), time=[*times])).least is None
 
 
-def test_every_step_of_a_training_holds_them() -> None:
+def test_every_step_of_a_training_holds_them():
     """Catches a training that never holds a minimum, computes the gap from views of val or test, or has the minimum
     scale of other Gaussians once rows were moved."""
     square = moving_square()

@@ -56,7 +56,7 @@ def deformed(*words: str) -> Trainer:
     return Trainer(model, replace(square, val=square.train[:3]), square.train[3:5], config)
 
 
-def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times() -> None:
+def test_a_model_brings_a_network_a_penalty_a_warm_up_and_points_with_times():
     """Catches a network that never learns or that a checkpoint lacks, a penalty without effect, and no warm-up."""
     start = deformed()
     model: Any = start.model

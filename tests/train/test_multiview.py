@@ -61,7 +61,7 @@ def wrong_on_the_left(model: GaussianModel, view: View, by: float) -> View:
     return replace(view, pixels=image)
 
 
-def test_scores_are_the_sums_by_hand() -> None:
+def test_scores_are_the_sums_by_hand():
     """Catches pixels that are not flagged, errors of another range, losses of other views, and a mean that is a sum."""
     model = four_gaussians()
     views = [wrong_on_the_left(model, *pair) for pair in zip(moving_square().train[:3], (0.2, 0.5, 1.0), strict=True)]
@@ -82,7 +82,7 @@ def test_scores_are_the_sums_by_hand() -> None:
     assert 0.05 < badness.sort().values[-2] < 0.95
 
 
-def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
+def test_perfect_images_and_models_without_gaussians_are_scored():
     """Catches a division by a range of equal errors, and the least of no numbers: all Gaussians may be pruned."""
     model = four_gaussians()
     exact = [
@@ -98,7 +98,7 @@ def test_perfect_images_and_models_without_gaussians_are_scored() -> None:
     assert len(model) == 0
 
 
-def test_ten_different_views_are_drawn_anew() -> None:
+def test_ten_different_views_are_drawn_anew():
     """Catches a view that is drawn twice, more views than ten, and the same ones in every round."""
     score = scores_of(four_gaussians(), moving_square().train)
     real, looked_at = score._of_view, list[str]()
@@ -128,7 +128,7 @@ def copies(model: GaussianModel, means: torch.Tensor) -> list[int]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_only_important_gaussians_of_large_gradient_are_cloned(name: str) -> None:
+def test_only_important_gaussians_of_large_gradient_are_cloned(name):
     """Catches a rule that asks for one of the two, a threshold that is not above, and opacities left above 0.8."""
     density, means = of_eight(name, [3.0, 1.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.0] * 8)
     density.gradient[:4], density.times_visible[:] = 5.0, 1.0
@@ -143,7 +143,7 @@ def test_only_important_gaussians_of_large_gradient_are_cloned(name: str) -> Non
 
 
 @pytest.mark.parametrize(("has_reset", "left"), [(False, [0, 1, 1, 1, 1, 1, 1, 0]), (True, [0, 1, 1, 1, 1, 0, 1, 0])])
-def test_half_as_many_as_candidates_are_drawn_from_all(has_reset: bool, left: list[int]) -> None:
+def test_half_as_many_as_candidates_are_drawn_from_all(has_reset, left):
     """Catches candidates that all go, Gaussians that go without being one, draws of the good ones, large Gaussians that
     are never candidates, and unseen ones that have to be drawn."""
     density, means = of_eight("3dgs", [-8.0] * 4 + [0.0] * 4, [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
@@ -155,7 +155,7 @@ def test_half_as_many_as_candidates_are_drawn_from_all(has_reset: bool, left: li
     assert copies(density.model, means) == left
 
 
-def test_children_are_drawn_as_their_parent() -> None:
+def test_children_are_drawn_as_their_parent():
     """Catches scores of the rows before the split that are given to other rows after it."""
     density, means = of_eight("3dgs", [0.0, 0.0, -8.0, 0.0, 0.0, 0.0, 0.0, -8.0], [0.0, 0.0, 1.0] + [0.0] * 5)
     with torch.no_grad():
@@ -166,7 +166,7 @@ def test_children_are_drawn_as_their_parent() -> None:
     assert len(density.model) == 8
 
 
-def test_rows_are_drawn_once_in_proportion() -> None:
+def test_rows_are_drawn_once_in_proportion():
     """Catches a row that is drawn twice, and weights that are not proportions."""
     assert sorted(drawn_once(torch.tensor([1.0, 1e6, 1e-6]), 3, generator(0)).tolist()) == [0, 1, 2]
     firsts = [int(drawn_once(torch.tensor([1.0, 3.0]), 1, generator(seed))) for seed in range(1000)]
@@ -174,7 +174,7 @@ def test_rows_are_drawn_once_in_proportion() -> None:
 
 
 @pytest.mark.usefixtures("threads")
-def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
+def test_scores_have_the_same_bits_for_any_number_of_threads():
     """Catches views whose weights are added in the order that threads come by."""
     model = started(build("7dgs", **OPTIONS["7dgs"]), 300)
     score, scores = scores_of(model, moving_square().train), []
@@ -187,7 +187,7 @@ def test_scores_have_the_same_bits_for_any_number_of_threads() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_model_trains_by_it(name: str) -> None:
+def test_every_model_trains_by_it(name):
     """Catches a model whose slices give no blend weights, and state of the training that does not follow the rows."""
     fitted = trainer(name, *ROUNDS)
     before = len(fitted.model)

@@ -53,13 +53,13 @@ PER_EXTENT, PER_RUN = LearningRate(1.6e-4, 1.6e-6, per_extent=True), LearningRat
         (LearningRate(1e-2, 1e-4, until=15_000), 170, 200, 1e-4),
     ],
 )
-def test_a_rate_falls_log_linearly(rate: LearningRate, step: int, iterations: int, expected: float) -> None:
+def test_a_rate_falls_log_linearly(rate, step, iterations, expected):
     """Catches a linear decay, and a factor of the scene or the run's length
     that is left out or applied where it was not asked for."""
     assert rate_at(rate, step, TrainConfig(iterations=iterations), 5) == pytest.approx(expected)
 
 
-def test_all_rates_fall_to_a_tenth_in_a_cooldown() -> None:
+def test_all_rates_fall_to_a_tenth_in_a_cooldown():
     """Catches a cooldown that begins at a step of this run, forgets constant rates or ends elsewhere."""
     train = TrainConfig(iterations=100, recipe_iterations=1000, cooldown_from=800)
     for rate in (LearningRate(0.05), LearningRate(1.6e-4, 1.6e-6)):
@@ -70,7 +70,7 @@ def test_all_rates_fall_to_a_tenth_in_a_cooldown() -> None:
         assert cooled[100] / plain[100] == pytest.approx(0.1)
 
 
-def test_rates_and_parameters_must_match() -> None:
+def test_rates_and_parameters_must_match():
     """Catches a parameter that silently never learns, and a misspelt rate that silently does nothing."""
     with pytest.raises(InputError, match="'quats' has none"):
         fitted(rates={n: r for n, r in RATES.items() if n != "quats"})
@@ -79,7 +79,7 @@ def test_rates_and_parameters_must_match() -> None:
 
 
 @pytest.mark.parametrize("kind", ["adam", "sparse_adam"])
-def test_what_a_step_leaves_alone(kind: str) -> None:
+def test_what_a_step_leaves_alone(kind):
     """Catches rows without a view that coast on or lose their moments, a wrong bias correction or rate of sparse Adam,
     and an update, or a count of it, where the finite check of a GPU has said that a gradient was not finite."""
     (plain, adam), (model, optimizer) = fitted(), fitted(kind=kind)

@@ -53,7 +53,7 @@ def grid(count: int = 12) -> torch.Tensor:
     return torch.rand(count, 3, generator=seeded(1), dtype=torch.float64) * 2 - 1
 
 
-def test_only_a_translation_has_no_strain() -> None:
+def test_only_a_translation_has_no_strain():
     """Catches a penalty of motion itself, which holds a moving object still, or one that a rotation escapes."""
     x = grid()
     turn = torch.stack([-x[:, 1], x[:, 0], torch.zeros_like(x[:, 0])], -1)
@@ -62,7 +62,7 @@ def test_only_a_translation_has_no_strain() -> None:
         assert strain > 0.1 if is_strained else strain < 1e-25
 
 
-def test_two_points_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_points_by_hand(monkeypatch):
     """Catches a missing factor: of the time step, the frames, the distance, the weight, or the number of pairs."""
     monkeypatch.setattr(regularisers, "NEIGHBOURS", 1)
     x = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [10, 0, 0], [10.5, 0, 0]], dtype=torch.float64)
@@ -92,7 +92,7 @@ def lively(name: str, agr: bool, noise: float = 0.05) -> GaussianModel:
 @pytest.mark.parametrize(
     ("name", "agr"), [(name, agr) for name in TIMED for agr in (False, True) if (name, agr) != ("dgs", True)]
 )
-def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
+def test_the_gradient_is_that_of_the_velocities(name, agr):
     """Catches a gradient that is lost on its way through a model, or that flows through weights or distances."""
     model = lively(name, agr)
     penalty, asked = prepared(model), []
@@ -124,7 +124,7 @@ def test_the_gradient_is_that_of_the_velocities(name: str, agr: bool) -> None:
         torch.testing.assert_close((ends[0] - ends[1]) / 2, (x.grad * step).sum(), rtol=1e-4, atol=1e-14)
 
 
-def test_what_is_culled_later_does_not_count() -> None:
+def test_what_is_culled_later_does_not_count():
     """Catches the jump of a mean that is culled at t1, and so stays at mu_p, taken for a very large velocity."""
     model = lively("7dgs_nodir", agr=False, noise=0.0)
     splats = {name: x.data for name, x in model.splats.items()}
@@ -143,7 +143,7 @@ def test_what_is_culled_later_does_not_count() -> None:
     assert all(x.grad is None or not x.grad.any() for x in model.splats.values())
 
 
-def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
+def test_draws_are_of_the_seed_the_step_and_the_view():
     """Catches draws from a generator that threads share, and the same draw for all views."""
     model = lively("freetime", True)
     values = [
@@ -154,7 +154,7 @@ def test_draws_are_of_the_seed_the_step_and_the_view() -> None:
     assert len(set(values)) == 4
 
 
-def test_neighbours_are_searched_again() -> None:
+def test_neighbours_are_searched_again():
     """Catches neighbours of rows that have moved to other indices, and ones that are never or always searched."""
     fitted = trainer("freetime", *WEIGHT)
     (penalty,), view = fitted.hook(Penalties).active.values(), fitted.scene.train[0]
@@ -175,7 +175,7 @@ def test_neighbours_are_searched_again() -> None:
 
 
 @pytest.mark.parametrize("place", ["few", "same"])
-def test_neighbours_at_the_edge(place: str) -> None:
+def test_neighbours_at_the_edge(place):
     """Catches an index beyond the Gaussians where there are too few, and a Gaussian that is its own neighbour."""
     x = grid(8) if place == "few" else torch.zeros(30, 3, dtype=torch.float64)
     penalty = prepared(moving(x, grid(len(x))))
@@ -186,7 +186,7 @@ def test_neighbours_at_the_edge(place: str) -> None:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["7dgs", "4dgs", "dgs"])
-def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
+def test_any_number_of_threads_gives_the_same_bits(name):
     """Catches draws that depend on the order of threads, gradients that threads add in any order, and no penalty."""
     ends = []
     for count, words in ((1, WEIGHT), (2, WEIGHT), (1, ())):
@@ -199,7 +199,7 @@ def test_any_number_of_threads_gives_the_same_bits(name: str) -> None:
     assert ends[2]["loss"] != ends[0]["loss"]
 
 
-def test_damaged_neighbours_are_refused() -> None:
+def test_damaged_neighbours_are_refused():
     """Catches an index beyond the Gaussians that a checkpoint brings, and one that forgets when they were searched."""
     fitted = trainer("7dgs", *WEIGHT)
     fitted.step = 7

@@ -20,7 +20,7 @@ ROUNDS = (
 )
 
 
-def test_the_score_of_freetimegs() -> None:
+def test_the_score_of_freetimegs():
     """Catches sums over living rows alone, and weights other than one and one."""
     opacities, gradient = torch.tensor([[0.9, 0.004, 0.3, 0.6], [2e-4, 5e-5, 4e-4, 0.0]], dtype=torch.float64)
     scores = score(opacities, gradient)
@@ -35,7 +35,7 @@ def test_the_score_of_freetimegs() -> None:
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_dead_gaussians_move_to_opaque_ones_and_to_large_gradients(name: str) -> None:
+def test_dead_gaussians_move_to_opaque_ones_and_to_large_gradients(name):
     """Catches a Gaussian that is added, pruned or moved though it lives, a source that is dead or has no score, a copy
     that lacks a parameter, and gradients or moments that outlive the round."""
     model, moments = moved(started(build(name, **OPTIONS[name]), 40)), Moments()
@@ -61,7 +61,7 @@ def test_dead_gaussians_move_to_opaque_ones_and_to_large_gradients(name: str) ->
     assert (torch.sigmoid(model.splats["opacities"]) > 0.004999).all()
 
 
-def test_nothing_moves_without_the_living_or_the_dead() -> None:
+def test_nothing_moves_without_the_living_or_the_dead():
     """Catches weights of zero from which a source is drawn, and gradients that stay when no row has changed."""
     for opacity in (-8.0, 1.0):
         model = started(build("3dgs"), 10)
@@ -75,7 +75,7 @@ def test_nothing_moves_without_the_living_or_the_dead() -> None:
         assert not rule.gradient.any()
 
 
-def test_a_training_with_relocation_continues_from_its_state() -> None:
+def test_a_training_with_relocation_continues_from_its_state():
     """Catches gradients that a checkpoint lacks, a number of Gaussians that changes, and a rule that is not called."""
     whole, stopped = assert_resumes(lambda: trainer("freetime", *ROUNDS), 25)
     assert len(whole.model) == len(stopped.model) == len(trainer("freetime").model)

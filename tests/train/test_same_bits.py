@@ -1,6 +1,5 @@
 """A training has the same bits on processors with and without AVX-512, and of another vendor."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,7 +32,7 @@ SLOW = (
 
 
 @pytest.mark.parametrize("model", ["7dgs", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
-def test_a_training_has_the_same_bits_without_avx512(model: str, tmp_path: Path) -> None:
+def test_a_training_has_the_same_bits_without_avx512(model, tmp_path):
     """Catches an operation of a training, in the kernels or in a library, whose bits depend on the processor."""
     if "v4" not in kernels.native().instruction_sets() or "v3" not in kernels.native().instruction_sets():
         pytest.skip("needs a processor with AVX-512, and the kernels of v3 and v4: make test LEVELS=all")
@@ -76,7 +75,7 @@ class OtherProcessor(TorchDispatchMode):
     ("model", "options"),
     [*OPTIONS.items(), *((name, ()) for name in ("7dgs", *SLOW) if name not in ("7dgs_noagr", "auto"))],
 )
-def test_a_training_does_not_depend_on_the_last_bits_of_mkl(model: str, options: tuple[str, ...]) -> None:
+def test_a_training_does_not_depend_on_the_last_bits_of_mkl(model, options):
     """Catches a float32 function in a training that has other bits on AMD than on Intel, as exp in splits had."""
 
     def trained() -> list[Tensor]:

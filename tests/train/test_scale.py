@@ -26,7 +26,7 @@ def larger(scene: Scene) -> Scene:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_larger_scene_trains_alike(name: str) -> None:
+def test_a_larger_scene_trains_alike(name):
     """Catches a rate in world units without the extent, a rate of time with it, and networks that read metres.
 
     AGR acts and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte.

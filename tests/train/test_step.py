@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_training import SIZE, moving_square, trainer
 
-from gsbench.kernels.backends import AUTO, REFERENCE, Backend
+from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.scenes.scene import View
 from gsbench.train.batches import batch, generator
 from gsbench.train.hooks.penalties import PenaltiesConfig
@@ -28,7 +28,7 @@ def gradient_of_a_step(batch: int) -> tuple[torch.Tensor, torch.Tensor, float]:
     )
 
 
-def test_a_batch_is_a_mean() -> None:
+def test_a_batch_is_a_mean():
     """Catches a loss summed over the batch, and a density gradient that is not scaled back to one view."""
     single, four = gradient_of_a_step(1), gradient_of_a_step(4)
     torch.testing.assert_close(four[0], single[0], rtol=1e-4, atol=1e-8)
@@ -38,7 +38,7 @@ def test_a_batch_is_a_mean() -> None:
 
 
 @pytest.mark.parametrize("backend", [AUTO, REFERENCE], ids=lambda backend: backend.name)
-def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_train_as_floats_do(backend, monkeypatch):
     """Catches a step that makes floats of an image in 8 bits for the kernel, and other gradients by its bytes."""
     square = moving_square()
     in_bytes = [replace(view, pixels=(255 * view.image).round().to(torch.uint8)) for view in square.train]
@@ -54,7 +54,7 @@ def test_bytes_train_as_floats_do(backend: Backend, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("views", range(1, 10))
-def test_any_number_of_workers_gives_the_same_bits(views: int) -> None:
+def test_any_number_of_workers_gives_the_same_bits(views):
     """Catches views of one worker that are added to each other before those in front of them."""
     each = torch.randn(views, 1000, generator=torch.Generator().manual_seed(views))  # some sums round with the order
     totals = []
@@ -66,7 +66,7 @@ def test_any_number_of_workers_gives_the_same_bits(views: int) -> None:
     assert all(torch.equal(total, totals[0]) for total in totals)
 
 
-def test_two_workers_hold_two_sums_and_one_view_has_one() -> None:
+def test_two_workers_hold_two_sums_and_one_view_has_one():
     """Catches a gradient of the whole model for each view, which takes memory and time to zero, and an empty half."""
     sums = deal(8, [0, 4, 8])
     assert len({id(added) for added in sums}) == 2
@@ -77,7 +77,7 @@ def test_two_workers_hold_two_sums_and_one_view_has_one() -> None:
     assert add_up(only)[5] is only[0][5]
 
 
-def test_what_any_view_of_the_batch_saw_is_moved() -> None:
+def test_what_any_view_of_the_batch_saw_is_moved():
     """Catches sparse_adam that moves what the last view saw alone, or the first."""
     fitted = trainer("3dgs", "train.batch_size=3", "optim=sparse_adam")
     N = len(fitted.model)
@@ -95,7 +95,7 @@ def test_what_any_view_of_the_batch_saw_is_moved() -> None:
     assert len(moved) == 2
 
 
-def test_early_steps_see_small_images() -> None:
+def test_early_steps_see_small_images():
     """Catches a resolution that is not the schedule's, a camera that does not shrink with its image, or its centre."""
     fitted, looked = trainer("3dgs", "train.coarse=[[2,15000]]", "train.batch_size=1"), list[View]()
     real, half = fitted.gradients, fitted.schedule.scaled(15_000)
@@ -110,12 +110,12 @@ def test_early_steps_see_small_images() -> None:
     assert not fitted.batches._reduced, "small images that no later step needs"
 
 
-def test_every_penalty_has_its_settings() -> None:
+def test_every_penalty_has_its_settings():
     """Catches a penalty without a weight in the config, and a weight that nothing reads."""
     assert {field.name for field in fields(PenaltiesConfig)} == set(PENALTIES)
 
 
-def test_every_view_is_seen_once_an_epoch() -> None:
+def test_every_view_is_seen_once_an_epoch():
     """Catches sampling with replacement, and batches that lose views where an epoch ends within them."""
     order = [view for step in range(35) for view in batch(step, 7, 3, seed=1)]
     for epoch in range(15):
@@ -123,7 +123,7 @@ def test_every_view_is_seen_once_an_epoch() -> None:
     assert order[:7] != order[7:14]
 
 
-def test_batches_depend_on_seed_and_step_alone() -> None:
+def test_batches_depend_on_seed_and_step_alone():
     """Catches hidden state in the order of views, which a resumed run would not have, and seeds that collide: (0, 1)
     and (1, 0), or a stream that is used again for another purpose."""
     assert batch(12, 60, 4, seed=3) == batch(12, 60, 4, seed=3)

@@ -1,7 +1,6 @@
 """A training whose steps are repeated has the bits of one whose steps are not."""
 
 import math
-from collections import Counter
 from typing import Any
 
 import pytest
@@ -27,9 +26,7 @@ def trained(fitted: Trainer) -> object:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize(("model", "overrides"), [*((name, ()) for name in MODELS), ("7dgs", ("effects.gate=both",))])
-def test_a_training_has_the_same_bits(
-    model: str, overrides: tuple[str, ...], repeats: Counter[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_has_the_same_bits(model, overrides, repeats, monkeypatch):
     """Catches work of a step that depends on something that neither the signature has nor a repetition reads again, or
     on the number of threads."""
     replayed = []
@@ -46,7 +43,7 @@ def test_a_training_has_the_same_bits(
         assert_same_bits(each, launched)
 
 
-def test_a_view_with_more_intersections_is_not_repeated(repeats: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_with_more_intersections_is_not_repeated(repeats, monkeypatch):
     """Catches lists of tiles that write beyond their memory, which was made for the view that was recorded."""
     monkeypatch.setattr("gsbench.kernels.raster.ROOM", 1.0)
     all_losses = []
@@ -62,7 +59,7 @@ def test_a_view_with_more_intersections_is_not_repeated(repeats: Counter[str], m
     assert repeats["outdated"] > 0
 
 
-def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: Counter[str]) -> None:
+def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats):
     """Catches a training that goes on with NaN, because the rasterizer's check was not repeated."""
     fitted = trainer("7dgs")
     train(fitted, until=4)
@@ -74,7 +71,7 @@ def test_a_value_that_is_not_finite_is_found_in_a_repetition(repeats: Counter[st
         fitted.train_step()
 
 
-def test_moments_and_statistics_may_move(repeats: Counter[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moments_and_statistics_may_move(repeats, monkeypatch):
     """Catches repeated updates of the memory in which Adam's moments or density statistics were before."""
     states = []
     for signature in (Step._signature, lambda *_: None):
@@ -86,7 +83,7 @@ def test_moments_and_statistics_may_move(repeats: Counter[str], monkeypatch: pyt
     assert repeats["done"] > 0
 
 
-def test_an_attribute_of_a_model_may_change(repeats: Counter[str]) -> None:
+def test_an_attribute_of_a_model_may_change(repeats):
     """Catches a model of another author whose option, which a schedule of its own changes, is read only once."""
     fitted = trainer("3dgs")
     shade, light, attributes = fitted.model.shade, [], vars(fitted.model)

@@ -3,7 +3,6 @@
 import html
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +17,7 @@ from gsbench.view.comparison_page import write_page
 from gsbench.view.frame import FrameRenderer, FrameRequest
 
 
-def test_it_shows_both_runs_and_their_errors(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+def test_it_shows_both_runs_and_their_errors(folder, other_folder, tmp_path):
     """Catches runs that are swapped, a PSNR that is not the record's, a missing image, and a request of the network."""
     path = tmp_path / "a.html"
     assert main([str(folder), str(other_folder), "--page", str(path)]) == 0
@@ -34,7 +33,7 @@ def test_it_shows_both_runs_and_their_errors(folder: Path, other_folder: Path, t
     assert [*tmp_path.iterdir()] == [path]
 
 
-def test_names_are_escaped(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+def test_names_are_escaped(folder, other_folder, tmp_path):
     """Catches a page that runs what a record of others names its scene."""
     run, other = load_run(folder), load_run(other_folder)
     bad = "<script>alert(1)</script>"
@@ -44,9 +43,7 @@ def test_names_are_escaped(folder: Path, other_folder: Path, tmp_path: Path) -> 
     assert html.escape(bad) in (tmp_path / "a.html").read_text()
 
 
-def test_a_view_rendered_exactly_leaves_the_mean_finite(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_view_rendered_exactly_leaves_the_mean_finite(folder, tmp_path, monkeypatch):
     """Catches one empty view by which the mean of all is infinite."""
     run = load_run(folder)
     views = evaluated_views(scene_of(run), run.config.scene.eval_split)
@@ -59,7 +56,7 @@ def test_a_view_rendered_exactly_leaves_the_mean_finite(
     assert not re.search(r"\b(inf|nan)\b", text)
 
 
-def test_what_cannot_be_compared_is_refused(folder: Path, other_folder: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_refused(folder, other_folder, tmp_path):
     """Catches images of two scenes beside each other, and a third run that is left out without a word."""
     run, other = load_run(folder), load_run(other_folder)
     with pytest.raises(InputError, match="expected two runs"):

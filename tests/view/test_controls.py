@@ -47,7 +47,7 @@ def differ(*pictures: np.ndarray) -> bool:
     return len({picture.tobytes() for picture in pictures}) == len(pictures)
 
 
-def test_the_clip_is_played_and_time_is_frozen(page: Visitor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_clip_is_played_and_time_is_frozen(page, monkeypatch):
     """Catches a slider or a clip without effect, frozen time that goes on, and a clip that starts with a leap."""
     start, end = page.look(), page.set("time", 1.0)
     assert differ(start, end)
@@ -67,7 +67,7 @@ def test_the_clip_is_played_and_time_is_frozen(page: Visitor, monkeypatch: pytes
     page.set("play", False)
 
 
-def test_effects_are_switched_off_and_on(page: Visitor) -> None:
+def test_effects_are_switched_off_and_on(page):
     """Catches a switch without effect or that cannot be undone, and a frozen direction that follows the camera."""
     start = page.look(fov=0.7, image_width=64, image_height=65)
     without_agr = page.set("AGR", False)
@@ -80,7 +80,7 @@ def test_effects_are_switched_off_and_on(page: Visitor) -> None:
     assert differ(start, without_agr, flat, frozen, page.set("freeze direction", False))
 
 
-def test_gaussians_have_the_colours_of_their_classes_or_costs(page: Visitor, viewer: Viewer) -> None:
+def test_gaussians_have_the_colours_of_their_classes_or_costs(page, viewer):
     """Catches colours that nothing explains, a legend that stays when the colours are gone, and a wipe that is cut at
     another place, of other colours or of another model."""
     image, legend = page.look(image_height=66), page.controls.legend
@@ -105,7 +105,7 @@ def test_gaussians_have_the_colours_of_their_classes_or_costs(page: Visitor, vie
     assert not page.control("wipe at").visible
 
 
-def test_two_runs_open_side_by_side(viewer: Viewer) -> None:
+def test_two_runs_open_side_by_side(viewer):
     """Catches a second run that must be looked for, and two images of one model."""
     with visit(viewer) as page:
         assert page.controls.layout == SIDE
@@ -122,9 +122,7 @@ def test_two_runs_open_side_by_side(viewer: Viewer) -> None:
 
 
 @pytest.mark.skipif(not kernels.available(), reason="the kernels are not built")
-def test_the_bound_on_float32_is_shown_when_nothing_moves(
-    page: Visitor, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bound_on_float32_is_shown_when_nothing_moves(page, viewer, monkeypatch):
     """Catches a bound that is not shown or saved, is of another view, or keeps the viewer waiting; a silent refusal."""
     start, legend = page.look(image_height=67), page.controls.legend
     bound = page.set("colours", "float32")
@@ -155,7 +153,7 @@ def test_the_bound_on_float32_is_shown_when_nothing_moves(
     assert "no bound: expected the CPU kernels" in legend.content
 
 
-def test_the_error_against_the_nearest_training_view_is_shown(page: Visitor) -> None:
+def test_the_error_against_the_nearest_training_view_is_shown(page):
     """Catches a view that stays when the camera moves, and an error of another model, effects or background."""
     text = page.controls.comparison
 
@@ -179,7 +177,7 @@ def test_the_error_against_the_nearest_training_view_is_shown(page: Visitor) -> 
     assert captions()[0] != view
 
 
-def test_everything_is_brought_back(page: Visitor) -> None:
+def test_everything_is_brought_back(page):
     """Catches a background without effect, a reset that leaves something as it was, and a background of the training
     that is rounded to 8 bits, or is the first run's in an image of the second."""
     page.set("reset", True)
@@ -196,7 +194,7 @@ def test_everything_is_brought_back(page: Visitor) -> None:
     assert page.controls.layout == SIDE
 
 
-def test_the_image_is_saved_as_it_is_shown(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_image_is_saved_as_it_is_shown(viewer, monkeypatch):
     """Catches a file of another size or of other colours, one without a name, two for a double click, and one that
     nobody asked for, as the page opens."""
     files: list[tuple[str, bytes]] = []
@@ -211,7 +209,7 @@ def test_the_image_is_saved_as_it_is_shown(viewer: Viewer, monkeypatch: pytest.M
     assert same(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], shown)
 
 
-def test_training_cameras_are_shown_except_side_by_side(page: Visitor) -> None:
+def test_training_cameras_are_shown_except_side_by_side(page):
     """Catches frusta that are not there, do not go away, or lie over two images whose cameras are others; and a click
     on one that leaves the camera or the time where they were."""
     handles = page.browser.client.scene._handle_from_node_name
@@ -235,7 +233,7 @@ def test_training_cameras_are_shown_except_side_by_side(page: Visitor) -> None:
     assert visible() == [False] * 6
 
 
-def test_two_browsers_have_controls_of_their_own_and_one_may_leave(viewer: Viewer) -> None:
+def test_two_browsers_have_controls_of_their_own_and_one_may_leave(viewer):
     """Catches a slider that moves everybody's picture, and frames for a browser that is gone."""
     with visit(viewer) as first:
         with visit(viewer) as two:
@@ -247,7 +245,7 @@ def test_two_browsers_have_controls_of_their_own_and_one_may_leave(viewer: Viewe
         assert differ(first.set("time", 0.5), first.set("time", 0.0))
 
 
-def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(folder: Path, other_folder: Path) -> None:
+def test_without_data_there_are_no_cameras_and_runs_of_two_scenes_are_refused(folder, other_folder):
     """Catches a viewer that needs the data set, and models of two scenes under one camera."""
     run, other = load_run(folder), load_run(other_folder)
     run.config.data.root = "/nowhere"

@@ -62,9 +62,7 @@ def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("place", [("--camera", "2"), (*ALONG, "--time", "0.5")])
-def test_a_ply_says_what_it_holds(
-    place: tuple[str, ...], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ply_says_what_it_holds(place, folder, tmp_path, capsys):
     """Catches a count of what is left out that is not that of the file."""
     assert exports(folder, "--ply", "a.ply", *place)
     kept, total = len(read_trained(tmp_path / "a.ply")), len(load_run(folder).model)
@@ -78,9 +76,7 @@ def test_a_ply_says_what_it_holds(
 
 
 @pytest.mark.parametrize("option", [("--ply", "a.ply"), ("--plys", "a", *FOUR)])
-def test_a_ply_says_how_it_differs_from_the_model(
-    option: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_ply_says_how_it_differs_from_the_model(option, folder, monkeypatch, capsys):
     """Catches Beta profiles or an antialiasing filter that are lost without a word, and a word where there are none."""
     assert exports(folder, *option, *ALONG)
     (line,) = capsys.readouterr().out.splitlines()
@@ -97,9 +93,7 @@ def test_a_ply_says_how_it_differs_from_the_model(
 
 
 @pytest.mark.parametrize("place", [("--camera", "2"), ALONG, ()])
-def test_each_file_of_a_clip_is_the_slice_of_its_time(
-    place: tuple[str, ...], folder: Path, other_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_file_of_a_clip_is_the_slice_of_its_time(place, folder, other_folder, tmp_path, capsys):
     """Catches a time that is left out or repeated, a named view's time in every file, and lost harmonics."""
     run = folder if place else other_folder
     (tmp_path / "clip").mkdir()
@@ -120,7 +114,7 @@ def test_each_file_of_a_clip_is_the_slice_of_its_time(
     assert ("harmonics" in text) == (not place)
 
 
-def test_names_of_a_long_clip_sort(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_a_long_clip_sort(folder, tmp_path, monkeypatch):
     """Catches numbers of different width, which viewers sort wrongly."""
     monkeypatch.setattr(slice_ply, "write_ply", lambda _, __, path, **___: path.name)
     names: Any = slice_ply.write_clip(load_run(folder), [None] * 10_001, tmp_path / "a", keep_harmonics=False)  # type: ignore[list-item]
@@ -129,9 +123,7 @@ def test_names_of_a_long_clip_sort(folder: Path, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("still", ["scene", "model"])
-def test_what_stands_still_is_sent_to_a_single_ply(
-    still: str, other_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_stands_still_is_sent_to_a_single_ply(still, other_folder, tmp_path, monkeypatch, capsys):
     """Catches a clip of equal files, and --time without effect in a scene without times."""
     run = load_run(other_folder)
     if still == "scene":
@@ -149,7 +141,7 @@ def test_what_stands_still_is_sent_to_a_single_ply(
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_frame_appears_when_it_is_whole(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_appears_when_it_is_whole(folder, tmp_path, monkeypatch):
     """Catches half a frame after a kill: while a file is flushed, there are only the earlier frames, all whole."""
     plain, present = os.fsync, []
 
@@ -167,13 +159,13 @@ def test_a_frame_appears_when_it_is_whole(folder: Path, tmp_path: Path, monkeypa
 @pytest.mark.parametrize("is_there", [True, False])
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt(), None])
 def test_a_clip_that_fails_leaves_nothing(
-    failure: BaseException | None,
-    is_there: bool,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    failure,
+    is_there,
+    folder,
+    tmp_path,
+    monkeypatch,
+    capsys,
+):
     """Catches a short clip that looks like a whole one, a folder of the user's that is removed, and a time not named.
 
     Without a failure of the disk the model fades out at the end.
@@ -198,7 +190,7 @@ def test_a_clip_that_fails_leaves_nothing(
     assert [*tmp_path.rglob("*")] == ([tmp_path / "clip"] if is_there else [])
 
 
-def test_defaults_are_those_that_the_help_names() -> None:
+def test_defaults_are_those_that_the_help_names():
     """Catches a help that says another default than there is."""
     named = {"fps": 30, "seconds": 4, "supersample": 1, "path": "orbit", "device": "cpu", "json": False}
     options = parser().parse_args(["run", "--video", "a.mp4"])
@@ -210,7 +202,7 @@ def test_defaults_are_those_that_the_help_names() -> None:
         assert words in text
 
 
-def test_a_direction_has_no_length() -> None:
+def test_a_direction_has_no_length():
     """Catches a slice seen from the middle of the model, as a long or a short direction is rounded to none."""
     for text in ("0,3,4", "0,3e38,4e38", "0,3e-45,4e-45"):
         torch.testing.assert_close(direction(text), torch.tensor([0, 0.6, 0.8]))
@@ -228,7 +220,7 @@ def test_a_direction_has_no_length() -> None:
         (("--camera", "train/r_0", "--time", "0.5"), False),
     ],
 )
-def test_time_runs_once_unless_it_stands_still(words: tuple[str, ...], moves: bool, folder: Path) -> None:
+def test_time_runs_once_unless_it_stands_still(words, moves, folder):
     """Catches a clip that is cut off, and --time without effect."""
     assert exports(folder, "--images", "a", *words, *FOUR)
     images = [cv2.imread(str(file)) for file in sorted(Path("a").iterdir())]
@@ -236,7 +228,7 @@ def test_time_runs_once_unless_it_stands_still(words: tuple[str, ...], moves: bo
     assert any((image != images[0]).any() for image in images) == moves
 
 
-def test_images_are_what_the_model_renders(folder: Path) -> None:
+def test_images_are_what_the_model_renders(folder):
     """Catches swapped colours, and test views that are rendered at other times than their own."""
     assert exports(folder, "--images", "a", "--path", "test")
     run = load_run(folder)
@@ -245,14 +237,14 @@ def test_images_are_what_the_model_renders(folder: Path) -> None:
         assert (cv2.imread(str(file))[:, :, ::-1] == to_bytes(rendered.numpy())).all()
 
 
-def test_images_of_a_longer_clip_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_a_longer_clip_are_told(tmp_path, capsys):
     """Catches a clip whose last images are those of an earlier export, in silence."""
     for count, is_told in ((3, False), (2, True), (3, False)):
         video.write_images([np.zeros((2, 2, 3), np.uint8)] * count, tmp_path / "a")
         assert ("0002.png: it was there before" in capsys.readouterr().err) == is_told
 
 
-def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) -> None:
+def test_frames_have_the_size_that_is_asked_for(folder, tmp_path):
     """Catches a video of another length, rate or size, and a side that has not the proportion of the training's."""
     for words, size in (
         (("--width", 34), (34, 34)),
@@ -280,9 +272,7 @@ def test_frames_have_the_size_that_is_asked_for(folder: Path, tmp_path: Path) ->
         ((80, 160), (720, 1440)),
     ],
 )
-def test_a_video_is_large_enough_to_be_looked_at(
-    size: tuple[int, int], expected: tuple[int, int], folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_video_is_large_enough_to_be_looked_at(size, expected, folder, monkeypatch):
     """Catches a stamp of 80 pixels, sides that VP9 cannot encode, other proportions, and PNGs of another size."""
     run = load_run(folder)
     replace_run(monkeypatch, replace(run, scene=replace(run.scene, width=size[0], height=size[1])))
@@ -301,7 +291,7 @@ def test_a_video_is_large_enough_to_be_looked_at(
     assert written == {"a.mp4": {expected}, "a": {size}}
 
 
-def test_another_size_shows_the_same(folder: Path) -> None:
+def test_another_size_shows_the_same(folder):
     """Catches a larger image that is a crop, a wide one that is stretched, and a centre that moves."""
     run = load_run(folder)
     (camera,) = video.orbit(run, 1)
@@ -322,7 +312,7 @@ def test_another_size_shows_the_same(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("up", [cameras.UP, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8)])
-def test_an_orbit_looks_at_the_model(folder: Path, up: tuple[float, float, float]) -> None:
+def test_an_orbit_looks_at_the_model(folder, up):
     """Catches cameras that look away, stand on their heads, are left-handed or turn about another axis."""
     run = load_run(folder)
     run = replace(run, scene=replace(run.scene, up=list(up)))
@@ -338,7 +328,7 @@ def test_an_orbit_looks_at_the_model(folder: Path, up: tuple[float, float, float
         torch.testing.assert_close(center, torch.tensor([0, 0, run.scene.extent]), atol=1e-3, rtol=1e-3)
 
 
-def test_the_middle_is_a_median_by_opacity() -> None:
+def test_the_middle_is_a_median_by_opacity():
     """Catches a mean, which one far Gaussian moves, a Gaussian that is hardly seen counted whole, and another rank."""
     model = build("3dgs")
     means = torch.tensor([0.0, 1, 2, 3, 100])[:, None].expand(5, 3)
@@ -402,9 +392,7 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
         ((*VIDEO, "--path", "orbit", "--camera", "0"), "--path: expected no --camera beside it"),
     ],
 )
-def test_what_is_asked_wrong_is_answered_in_one_line(
-    words: tuple[str, ...], text: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_asked_wrong_is_answered_in_one_line(words, text, folder, tmp_path, capfd):
     """Catches a stack trace, a message that does not name the option, and a file that is left behind."""
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
@@ -416,9 +404,7 @@ def test_what_is_asked_wrong_is_answered_in_one_line(
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "full", tmp_path / "full" / "file"]
 
 
-def test_a_disk_that_refuses_a_video_is_named(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disk_that_refuses_a_video_is_named(folder, tmp_path, monkeypatch, capfd):
     """Catches a video that lacks frames, as OpenCV does not report a full disk, and an error of a temporary file."""
     path, writer_of = tmp_path / "a.mp4", cv2.VideoWriter
 
@@ -452,12 +438,12 @@ def test_a_disk_that_refuses_a_video_is_named(
 
 @pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4", *FOUR), ("--images", "a", *FOUR)])
 def test_memory_that_runs_out_ends_in_one_line(
-    words: tuple[str, ...],
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+    words,
+    folder,
+    tmp_path,
+    monkeypatch,
+    capfd,
+):
     """Catches a traceback for an allocation that fails, a file that it leaves, and a mistake of gsbench called so."""
     errors = [
         RuntimeError("expected a tensor of another shape"),
@@ -482,9 +468,7 @@ def test_memory_that_runs_out_ends_in_one_line(
         exports(folder, *words, "--camera", "0")
 
 
-def test_a_folder_without_a_checkpoint_and_other_data_are_refused(
-    folder: Path, square: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_without_a_checkpoint_and_other_data_are_refused(folder, square, tmp_path, capsys):
     """Catches images of one scene that are taken for another's, and a stack trace for a wrong path."""
     assert not exports(tmp_path, *PLY)
     assert "checkpoint.pt" in capsys.readouterr().err

@@ -44,9 +44,7 @@ def other(other_folder: Path) -> LoadedRun:
         (["r/a", "r/a"], ["r/a", "r/a"]),
     ],
 )
-def test_names_are_what_distinguishes_runs(
-    folders: list[str], names: list[str], run: LoadedRun, other: LoadedRun
-) -> None:
+def test_names_are_what_distinguishes_runs(folders, names, run, other):
     """Catches a name that all runs have, two runs with one name, and words beside models that differ."""
     assert short_names([replace(run, folder=Path(folder)) for folder in folders]) == names
     models = {"7dgs": run, "4dgs": other}
@@ -54,7 +52,7 @@ def test_names_are_what_distinguishes_runs(
     assert short_names(named) == list(models)
 
 
-def test_a_label_says_what_was_measured(run: LoadedRun, tmp_path: Path) -> None:
+def test_a_label_says_what_was_measured(run, tmp_path):
     """Catches numbers of another run, a size in other units than the report's, and a record that hides a failure."""
     kept = record.read(run.folder / record.FILE_NAME)
     assert kept.metrics is not None
@@ -78,7 +76,7 @@ def test_a_label_says_what_was_measured(run: LoadedRun, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
-def test_each_side_of_the_edge_has_its_label(grey: int) -> None:
+def test_each_side_of_the_edge_has_its_label(grey):
     """Catches swapped labels, one that covers the line or the picture, and ink that cannot be seen on a background."""
     image = np.full((300, 600, 3), grey, np.uint8)
     both = labelled(image, 300, ROWS, (*ROWS, "a fourth row"))
@@ -99,7 +97,7 @@ def test_each_side_of_the_edge_has_its_label(grey: int) -> None:
     assert (alone[:, 599 - 299 : 599] == both[:, :299]).all() or (alone[:, 400:599] == both[:, 100:299]).all()
 
 
-def test_labels_are_cut_at_the_border_and_keep_their_size_on_the_screen() -> None:
+def test_labels_are_cut_at_the_border_and_keep_their_size_on_the_screen():
     """Catches an index out of the image, and labels that jump when the resolution falls."""
     for height, width, edge in ((300, 600, 0), (300, 600, 600), (300, 600, 20), (5, 5, 2), (1, 1, 1), (900, 2, 1)):
         assert labelled(np.zeros((height, width, 3), np.uint8), edge, ROWS, ROWS).shape == (height, width, 3)

@@ -35,7 +35,7 @@ def view(name: str, time: float | None) -> View:
     return View(name, Camera(torch.eye(4), torch.eye(3), 4, 4), time, torch.zeros(4, 4, 3))
 
 
-def test_the_table_splits_a_frame_by_stage() -> None:
+def test_the_table_splits_a_frame_by_stage():
     """Catches a sum without one of its stages, another model's column, and FPS of half a frame."""
     ms = {"AGR": 2.0, "conditioning": 1.0, "colours": 0.5, "projection": 0.5, "blending": 4.0}
     costs = [FrameCost("7dgs seed0", ms), FrameCost("3dgs seed0", {"conditioning": 0.25, "raster": 3.75})]
@@ -50,7 +50,7 @@ def test_the_table_splits_a_frame_by_stage() -> None:
     assert "90 x 60" in text
 
 
-def test_the_legend_explains_the_colours_that_there_are() -> None:
+def test_the_legend_explains_the_colours_that_there_are():
     """Catches a count beside the name of another effect set or colour, effect sets that nothing shown has, a scale that
     is not the one the image was drawn on, and a legend of colours that need none."""
     text = legend([shown(CLASS, "7dgs", 1200, 5, 30), shown(CLASS, "4dgs", 0, 700, 0)], 250.0, {})
@@ -65,7 +65,7 @@ def test_the_legend_explains_the_colours_that_there_are() -> None:
     assert legend([shown(IMAGE, "a")], 251.0, {}) == ""
 
 
-def test_the_legend_of_float32_says_what_is_known_of_each_model() -> None:
+def test_the_legend_of_float32_says_what_is_known_of_each_model():
     """Catches another model's bound, a summary of a model that is not shown, and a model without a bound or reason."""
     images = [shown(FLOAT32, name) for name in ("a", "b", "c", "a")]
     error = Float32Error(np.zeros((30, 40, 3), np.uint8), 0.71, 0.00043, 0.0125, 2.04)
@@ -85,7 +85,7 @@ def test_the_legend_of_float32_says_what_is_known_of_each_model() -> None:
     assert legend([shown(IMAGE, "a")], 1.0, {"a": error}) == ""
 
 
-def test_a_comparison_says_with_what_and_how_far() -> None:
+def test_a_comparison_says_with_what_and_how_far():
     """Catches a number without its model, and a view of a static scene that has no time to print."""
     for time in (0.5, None):
         compared = [ViewComparison("a", BLACK, BLACK, BLACK, 31.256)]
@@ -95,7 +95,7 @@ def test_a_comparison_says_with_what_and_how_far() -> None:
         assert text.count("data:image/png;base64,") == 3
 
 
-def test_names_of_folders_are_text() -> None:
+def test_names_of_folders_are_text():
     """Catches a folder or a view whose name is run as a script."""
     bad = "<script>alert(1)</script>"
     texts = (

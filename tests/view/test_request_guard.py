@@ -61,7 +61,7 @@ FOREIGN_PAGES = [
 ]
 
 
-def test_only_its_own_page_is_admitted() -> None:
+def test_only_its_own_page_is_admitted():
     """Catches a page of another site that reads the frames, and a viewer for the network that no address reaches."""
     guard, wide = RequestGuard("localhost", free_port()), RequestGuard("0.0.0.0", free_port())
     twice = Headers(Host="localhost")
@@ -76,7 +76,7 @@ def test_only_its_own_page_is_admitted() -> None:
     assert not wide.admits(Headers(Host="evil.example", Origin="http://evil.example"))
 
 
-def test_a_foreign_page_gets_no_frame(viewer: Viewer) -> None:
+def test_a_foreign_page_gets_no_frame(viewer):
     """Catches a check that is there but that nobody asks."""
     port = viewer.server.get_port()
     with pytest.raises(InvalidStatus, match="403"):
@@ -102,7 +102,7 @@ def fetched(port: int, path: str, host: str) -> tuple[int, str]:
     return answer.status, text.decode()
 
 
-def test_the_page_is_opened_with_all_pixels_of_the_screen(viewer: Viewer) -> None:
+def test_the_page_is_opened_with_all_pixels_of_the_screen(viewer):
     """Catches a page that stays coarse where the browser was slow, and one that leads to itself."""
     port = viewer.server.get_port()
     host = f"localhost:{port}"
@@ -137,7 +137,7 @@ OTHERS: list[object] = [
 ]
 
 
-def test_what_the_page_never_sends_is_not_known() -> None:
+def test_what_the_page_never_sends_is_not_known():
     """Catches a camera that stops its thread, a tunnel to the internet, and a control that is changed in its code."""
     for changed in BAD_CAMERAS:
         assert not is_known(packed(CAMERA, **changed)), changed
@@ -150,7 +150,7 @@ def test_what_the_page_never_sends_is_not_known() -> None:
     assert is_known(packed(CAMERA))
 
 
-def test_viser_is_the_one_that_is_guarded() -> None:
+def test_viser_is_the_one_that_is_guarded():
     """Catches a viser that has changed what its page sends, or that listens in another way, past the guard."""
     with pytest.raises(InputError, match="viser"), RequestGuard("localhost", free_port()).active():
         pass
@@ -159,7 +159,7 @@ def test_viser_is_the_one_that_is_guarded() -> None:
         assert set(getattr(request_guard, name).__struct_fields__) == fields
 
 
-def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer, capfd):
     """Catches a thread or a connection that ends by one message, and a stack trace for it."""
     with joined(viewer) as browser:
         browser.send(packed(CAMERA))
@@ -187,7 +187,7 @@ def test_a_browser_that_sends_nonsense_still_has_its_picture(viewer: Viewer, cap
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_large_or_many_messages_are_not_kept(viewer: Viewer) -> None:
+def test_large_or_many_messages_are_not_kept(viewer):
     """Catches memory that grows by whatever a browser sends, for as long as the viewer runs."""
     with joined(viewer) as browser:
         browser.send(packed({"type": "GuiFormDirtyMessage", "uuid": "x" * 2**20}))
@@ -201,7 +201,7 @@ def test_large_or_many_messages_are_not_kept(viewer: Viewer) -> None:
     assert not [thing for thing in gc.get_objects() if type(thing) is _messages.GuiFormDirtyMessage]
 
 
-def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browsers_are_counted(viewer, monkeypatch):
     """Catches threads without number."""
     until(lambda: not viewer.browsers)
     monkeypatch.setattr(request_guard, "MOST_BROWSERS", 2)
@@ -209,7 +209,7 @@ def test_browsers_are_counted(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -
         joined(viewer)
 
 
-def test_browsers_that_do_not_read_hold_a_frame_each(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browsers_that_do_not_read_hold_a_frame_each(viewer, monkeypatch):
     """Catches memory that grows with the browsers: frames that wait, and a thread that renders for each of them."""
     until(lambda: not viewer.browsers)
     threads, noise = [], np.random.default_rng(0).integers(0, 255, (600, 900, 3), np.uint8)
@@ -248,7 +248,7 @@ def test_browsers_that_do_not_read_hold_a_frame_each(viewer: Viewer, monkeypatch
             browser.socket.shutdown(socket.SHUT_RDWR)
 
 
-def test_aborted_connections_leave_no_browser(viewer: Viewer) -> None:
+def test_aborted_connections_leave_no_browser(viewer):
     """Catches a browser that is cut off and for which frames are still rendered, and one for which a thread is kept."""
     with joined(viewer) as browser:
         browser.send(packed(CAMERA))
@@ -265,7 +265,7 @@ def test_aborted_connections_leave_no_browser(viewer: Viewer) -> None:
     until(lambda: not viewer.browsers and threading.active_count() <= before)
 
 
-def test_a_port_that_is_taken_is_passed_over() -> None:
+def test_a_port_that_is_taken_is_passed_over():
     """Catches a viewer that fails because another one runs, and one that a notebook, which has a loop, cannot open."""
 
     async def cell() -> int:

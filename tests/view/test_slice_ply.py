@@ -82,7 +82,7 @@ def drawn(data: bytes, view: Camera) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_ply_is_the_image(variant: str) -> None:
+def test_the_ply_is_the_image(variant):
     """Catches scales, rotations, colours or opacities in another convention, and a mirrored rotation."""
     model, view = trained(variant), camera(0.3, -4.0, 1.0)
     gaussians = trained_of(model, CameraTime.of(view, 0.4))
@@ -92,7 +92,7 @@ def test_the_ply_is_the_image(variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", ["3dgs", "3dgs_agr", "4dgs", "4dgs_agr", "4dgs_constant_colors"])
-def test_harmonics_are_right_from_everywhere(variant: str) -> None:
+def test_harmonics_are_right_from_everywhere(variant):
     """Catches f_rest in the wrong order, waves of time that are left out, or mean times that AGR has not moved."""
     model = trained(variant)
     data = ply_of(trained_of(model, CameraTime.at(torch.zeros(3), 0.4), keep_harmonics=True))
@@ -101,7 +101,7 @@ def test_harmonics_are_right_from_everywhere(variant: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_what_is_culled_is_left_out(name: str) -> None:
+def test_what_is_culled_is_left_out(name):
     """Catches a file of Gaussians that nobody sees, and an empty file."""
     model = trained(name)
     model.splats["opacities"][:20] = -20.0
@@ -111,7 +111,7 @@ def test_what_is_culled_is_left_out(name: str) -> None:
         trained_of(model, CameraTime.of(camera(0.0, -4.0, 0.0), 0.4))
 
 
-def test_factors_are_decomposed() -> None:
+def test_factors_are_decomposed():
     """Catches left-handed axes, and a scale of zero whose logarithm is not finite."""
     factors = torch.randn(200, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     factors[:5, :, 0] = 0
@@ -122,7 +122,7 @@ def test_factors_are_decomposed() -> None:
     torch.testing.assert_close(S @ S.mT, factors @ factors.mT, atol=1e-5, rtol=1e-5)
 
 
-def test_a_ply_of_a_diverged_model_is_refused() -> None:
+def test_a_ply_of_a_diverged_model_is_refused():
     """Catches a file of NaN."""
     model = trained("3dgs")
     model.splats["means"][3, 1] = float("nan")

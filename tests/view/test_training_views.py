@@ -1,7 +1,6 @@
 """Training views: which one is nearest to a camera, how a model is compared with it, and images made smaller."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -32,7 +31,7 @@ def scene(*cameras_and_times: tuple[Camera, float | None]) -> Scene:
     return Scene("line", views, [], [], (0.0, 0.0, 0.0), EXTENT, None, "0")
 
 
-def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
+def test_the_nearest_view_stands_and_looks_as_the_camera_does():
     """Catches a choice by place alone or by direction alone, a rotation that is inverted, and wrong distances."""
     views = scene((camera(0.0), 0.0), (camera(1.0), 0.0), (camera(0.0, towards=0.5), 0.0))
     assert nearest_view(views, camera(0.2), 0.0).view.name == "0"
@@ -43,7 +42,7 @@ def test_the_nearest_view_stands_and_looks_as_the_camera_does() -> None:
     assert nearest.degrees == pytest.approx(30.96 - 26.57, abs=0.02)
 
 
-def test_the_nearest_view_in_a_rig_and_in_extents() -> None:
+def test_the_nearest_view_in_a_rig_and_in_extents():
     """Catches metres added to radians, a rig whose first frame is always shown, and a time that outweighs the place."""
     views = scene((camera(1.0), 0.0), (camera(0.4, towards=0.3), 0.0))
     assert nearest_view(views, camera(0.4), 0.0).view.name == "0"  # 0.6 of an extent of 4 is less than 17 degrees
@@ -53,7 +52,7 @@ def test_the_nearest_view_in_a_rig_and_in_extents() -> None:
     assert nearest_view(scene((camera(0.0), None), (camera(1.0), None)), camera(0.9), None).view.name == "1"
 
 
-def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
+def test_a_model_is_compared_as_it_is_measured(folder):
     """Catches another PSNR than the run's own measure, swapped images, and a protocol's rounding that is left out."""
     run = load_run(folder)
     view = scene_of(run).train[1]
@@ -71,7 +70,7 @@ def test_a_model_is_compared_as_it_is_measured(folder: Path) -> None:
     assert compare(renderer, exact, FrameRequest(view.time)).psnr == 100.0, "a mean over views would be infinite"
 
 
-def test_large_images_are_made_smaller_after_they_are_measured(folder: Path) -> None:
+def test_large_images_are_made_smaller_after_they_are_measured(folder):
     """Catches megabytes for each movement of the camera, and a PSNR of images that were made smaller."""
     run = load_run(folder)
     small = scene_of(run).train[0]

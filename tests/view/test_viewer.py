@@ -4,7 +4,6 @@ import math
 import threading
 from concurrent.futures import Future
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,7 @@ from gsbench.view.controls import ONE, SIDE, WIPE, ViserPose
 from gsbench.view.viewer import LEAST_PIXELS, MOST_PIXELS, MOVING_MS, Browser, Resolution
 
 
-def test_resolution_falls_while_the_camera_moves() -> None:
+def test_resolution_falls_while_the_camera_moves():
     """Catches a large window that stutters, a frame at rest that stays coarse, and a size of zero."""
     resolution = Resolution(MOVING_MS)
     for _ in range(3):  # 1 us a pixel and 10 ms a slice: 30,000 pixels
@@ -35,7 +34,7 @@ def test_resolution_falls_while_the_camera_moves() -> None:
     assert min(resolution.size(1, 3000, limited=True)) >= 1
 
 
-def test_a_browsers_camera_is_ours() -> None:
+def test_a_browsers_camera_is_ours():
     """Catches a pose that is inverted, mirrored or with the horizontal field of view."""
     camera = replace(camera_of(0.7, renderer()), width=60, height=40)
     camera.K[0, 2], camera.K[1, 2] = 30, 20
@@ -62,7 +61,7 @@ def browser_of(renderer: Any, layout: str) -> Browser:
 
 @pytest.mark.parametrize("window", [(1200, 900), (900, 1200), (2400, 600), (390, 844)])
 @pytest.mark.parametrize("size", [(16, 16), (32, 18), (18, 32)])
-def test_each_half_shows_the_whole(window: tuple[int, int], size: tuple[int, int]) -> None:
+def test_each_half_shows_the_whole(window, size):
     """Catches a half that is cut at its sides, pixels that are not square, and another camera for one whole image."""
     shown = SimpleNamespace(run=SimpleNamespace(scene=SimpleNamespace(width=size[0], height=size[1])))
     width, height = window[0] // 2, window[1]
@@ -100,7 +99,7 @@ class Steps(Browser):
         self.done.append("bound")
 
 
-def test_frames_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_come_in_order(monkeypatch):
     """Catches a frame of all pixels while something moves, a bound that is kept after a change, a busy wait, and an
     error of one model that stops the frames of all browsers."""
     now = 0.0
@@ -136,9 +135,7 @@ def test_frames_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     assert browser.controls.costs.content == "a &lt;bad&gt; model"
 
 
-def test_a_wrong_command_is_answered_in_one_line(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_command_is_answered_in_one_line(folder, tmp_path, capsys):
     """Catches a stack trace, a server that serves nothing, a wait for a port without end, and "" open to everybody."""
     hosts = ("no.such.host.invalid", "", "\0", "a" * 300, "192.0.2.1", "\x1b[31m", "1.2.3.4.5", "é..x")
     wrong = [

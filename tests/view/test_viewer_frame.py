@@ -76,7 +76,7 @@ def image_of(model: Any, camera: Camera) -> Pixels:
     return to_bytes(render(model, camera, 0.4, BLACK).cpu().numpy())
 
 
-def test_a_frame_is_the_models_image(agr: FrameRenderer) -> None:
+def test_a_frame_is_the_models_image(agr):
     """Catches a viewer that shows another picture than the one that is measured, and times of zero."""
     camera = camera_of(0.5, agr)
     frame = agr.render(camera, NOW)
@@ -86,7 +86,7 @@ def test_a_frame_is_the_models_image(agr: FrameRenderer) -> None:
     assert frame.ms(RASTER) > 0
 
 
-def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
+def test_settings_are_those_of_one_frame(agr):
     """Catches AGR, a degree or a viewpoint without effect, or that the next frame still has, or that training had not.
 
     A frozen viewpoint slices from there and draws from here.
@@ -118,7 +118,7 @@ def test_settings_are_those_of_one_frame(agr: FrameRenderer) -> None:
     [("7dgs_agr", None), ("7dgs_agr", EffectSets(16, 32, torch.full((80,), 3, dtype=torch.int32))), ("stg_full", None)],
     ids=["without effect sets", "with effect sets", "decoded"],
 )
-def test_colours_are_those_of_the_picture_of_effect_sets(variant: str, effect_sets: EffectSets | None) -> None:
+def test_colours_are_those_of_the_picture_of_effect_sets(variant, effect_sets):
     """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background, and
     an image that is not decoded, or a legend that is."""
     gated = renderer(effect_sets=effect_sets, variant=variant)
@@ -145,9 +145,7 @@ def test_colours_are_those_of_the_picture_of_effect_sets(variant: str, effect_se
         ("blend", "blending"),
     ],
 )
-def test_a_kernels_time_is_its_stages(
-    agr: FrameRenderer, kernel: str, stage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernels_time_is_its_stages(agr, kernel, stage, monkeypatch):
     """Catches time that counts for another stage, or for none."""
     run, slow = Library._run, 0.02
 
@@ -163,7 +161,7 @@ def test_a_kernels_time_is_its_stages(
     assert cost.ms[stage] >= 1000 * slow
 
 
-def test_what_one_call_computes_is_not_divided() -> None:
+def test_what_one_call_computes_is_not_divided():
     """Catches a GPU's rasterizer whose time counts for the stage that is noted first, or that runs again."""
     watch, image = StageWatch("cpu"), torch.zeros(3)
     assert watch.record(raster._project, [], (), ([image], {})) == [image]
@@ -171,7 +169,7 @@ def test_what_one_call_computes_is_not_divided() -> None:
     assert [*watch.ms] == [RASTER]
 
 
-def test_what_torch_computes_alone_is_not_divided(agr: FrameRenderer) -> None:
+def test_what_torch_computes_alone_is_not_divided(agr):
     """Catches stages of zero milliseconds, and time that is not counted, without kernels."""
     (cost,) = renderer(REFERENCE).render(camera_of(0.5, agr), NOW).costs
     assert list(cost.ms) == [SLICE, RASTER]
@@ -181,7 +179,7 @@ def test_what_torch_computes_alone_is_not_divided(agr: FrameRenderer) -> None:
     assert "AGR" not in without_agr.ms
 
 
-def test_two_models_share_an_image() -> None:
+def test_two_models_share_an_image():
     """Catches swapped sides, an edge at the wrong place and costs that are not added."""
     ms = {"AGR": 0.25, "conditioning": 0.75, "blending": 2.0}
     left, right = (Frame(np.full((4, 8, 3), value, np.uint8), (FrameCost(str(value), ms),)) for value in (10, 20))
@@ -199,7 +197,7 @@ def test_two_models_share_an_image() -> None:
 
 
 @needs_kernels
-def test_the_bound_is_that_of_the_stability_command(agr: FrameRenderer) -> None:
+def test_the_bound_is_that_of_the_stability_command(agr):
     """Catches a bound of another view, time or unit, and a summary of other pixels."""
     near = camera_of(0.5, agr)
     camera = replace(near, K=near.K * torch.tensor([0.3, 0.3, 1.0]))  # a wide angle: some pixels show nothing
@@ -218,7 +216,7 @@ def test_the_bound_is_that_of_the_stability_command(agr: FrameRenderer) -> None:
 
 
 @needs_kernels
-def test_both_precisions_have_the_settings_of_the_browser(agr: FrameRenderer) -> None:
+def test_both_precisions_have_the_settings_of_the_browser(agr):
     """Catches a setting that only one of the two slices has, whose difference would count as rounding."""
     camera, there = camera_of(0.5, agr), camera_of(2.0, agr)
     plain = agr.float32_error(camera, NOW)
@@ -229,7 +227,7 @@ def test_both_precisions_have_the_settings_of_the_browser(agr: FrameRenderer) ->
     assert (agr.float32_error(camera, NOW).image == plain.image).all()
 
 
-def test_a_bound_leaves_the_frame_that_is_rendered_its_settings(agr: FrameRenderer) -> None:
+def test_a_bound_leaves_the_frame_that_is_rendered_its_settings(agr):
     """Catches a bound in its own thread that switches effects off in the middle of a frame."""
     with ThreadPoolExecutor(1) as pool:
         with agr._lock:  # a frame is being rendered
@@ -240,7 +238,7 @@ def test_a_bound_leaves_the_frame_that_is_rendered_its_settings(agr: FrameRender
         bound.result()
 
 
-def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_cpu_kernels_there_is_no_bound(agr, monkeypatch):
     """Catches a bound of images that another backend renders."""
     with pytest.raises(InputError, match="CPU kernels"):
         renderer(REFERENCE).float32_error(camera_of(0.5, agr), NOW)
@@ -255,7 +253,7 @@ def test_without_the_cpu_kernels_there_is_no_bound(agr: FrameRenderer, monkeypat
 
 
 @needs_kernels
-def test_a_model_that_does_not_compute_in_float64_has_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_does_not_compute_in_float64_has_no_bound(monkeypatch):
     """Catches a user's model whose error is not an InputError, or that answers in float32 and counts as exact."""
     agr = renderer()
     camera, single = camera_of(0.5, agr), agr.run.model.slice(CameraTime.at(BLACK, 0.4))
