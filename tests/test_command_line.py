@@ -18,8 +18,7 @@ from gsbench.usage import DESCRIBED, first_sentence
 
 
 def test_help_describes_what_there_is_without_torch():
-    """Catches a help text that pays for importing torch or composing a config, does not say what a model or an
-    experiment is, or lists trials."""
+    """Catches a help that imports torch or composes a config, describes no model or experiment, or lists trials."""
     code = (
         "import sys; sys.argv = ['gsbench', '--help']\n"
         "import hydra._internal.hydra as composer; composer.Hydra.create_main_hydra2 = None\n"
@@ -175,8 +174,7 @@ def test_a_sweep_writes_a_record_a_run_and_keeps_what_is_finished(square, tmp_pa
 
 
 def test_a_finished_run_outlives_a_later_attempt_that_fails(tmp_path):
-    """Catches a finished record that a refused attempt overwrites, a table that still shows it as the run's result, and
-    a training that is repeated once its data is back."""
+    """Catches a finished record lost to a refused attempt, shown as its result, or trained again with its data back."""
     data = write_moving_square(tmp_path / "data")
     arguments = overrides(data, tmp_path / "r", "model=3dgs")
     assert gsbench(*arguments).returncode == 0
@@ -221,8 +219,7 @@ def test_what_is_measured_trains_nothing_again(square, tmp_path):
 
 
 def test_one_bad_scene_does_not_stop_the_others(tmp_path):
-    """Catches an experiment that dies with its first broken scene, or hides it behind exit code 0, and a 4DGS fitted to
-    a made-up time, where 6DGS takes the same scene."""
+    """Catches a broken scene that ends or hides behind exit code 0, and a 4DGS fitted to a made-up time."""
     names = ("broken", "square", "static")
     for name in names:
         write_moving_square(tmp_path / "data", name)
@@ -261,8 +258,7 @@ def test_divergence_ends_as_a_record_and_the_rest_goes_on(square, tmp_path):
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError, TooLargeError])
 def test_out_of_memory_ends_as_a_record_and_the_rest_goes_on(error, square, tmp_path, monkeypatch):
-    """Catches a run out of a GPU's memory, or refused by the CPU's, that ends the process, counts as diverged, or has
-    a record that does not say what to lower."""
+    """Catches memory that runs out and ends the process, counts as diverged, or has a record without advice."""
     render = step.render_slices
 
     def full(*_: object) -> None:

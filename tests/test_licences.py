@@ -39,8 +39,7 @@ def test_only_developers_install_the_gpl():
 
 
 def test_no_user_installs_the_gpl():
-    """Catches a library whose licence would bind every program that imports gsbench, and a search that finds none:
-    plyfile, which only tests use, is under the GPL."""
+    """Catches a licence that would bind every program that imports gsbench, and a search blind to plyfile's GPL."""
     texts = {name: licence_of(package) for name, package in licences.of_users().items()}
     assert len(texts) > 20
     assert {name: text for name, text in texts.items() if GPL.search(text)} == {}

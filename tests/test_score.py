@@ -197,8 +197,7 @@ def test_flow_is_that_of_whole_films():
 
 
 def test_colours_are_corrected_by_the_best_affine_map():
-    """Catches a gain without offset or without mixed channels: such a change of the truth is undone; and an infinite
-    PSNR of exact images, which no record can hold."""
+    """Catches a gain without offset or mixed channels, which are undone, and an infinite PSNR of exact images."""
     truth = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.4 + 0.3
     mixed = truth @ torch.tensor([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.1, 0.0, 0.9]], dtype=torch.float64) + 0.05
     assert psnr(_color_corrected(mixed, truth), truth) > 200

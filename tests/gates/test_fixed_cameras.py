@@ -109,8 +109,7 @@ def test_hard_cases(scene, decisions, reason):
 
 @pytest.mark.parametrize("together", [False, True])
 def test_the_level_on_rigs(together, monkeypatch):
-    """Catches permutations that break what cameras see together: a light that flickers for all is no slow wave, and a
-    camera that sees nothing but black, which is 0 / 0."""
+    """Catches permutations that break what cameras see together, as a flicker for all, and a black camera: 0 / 0."""
     monkeypatch.setattr(fixed_camera_test, "PERMUTATIONS", 199)
     random = np.random.default_rng(0)
     times = [np.linspace(0, 1, 8) if together else np.sort(random.random(8)) for _ in range(6)]

@@ -99,8 +99,7 @@ def test_long_lived_gaussians_become_static(model):
 
 
 def test_off_is_off_and_few_gaussians_are_gated_at_the_end_only(monkeypatch):
-    """Catches a gate that acts where none was asked for, one in training of a model that needs all of its Gaussians,
-    and one that is left out in silence."""
+    """Catches a gate that was not asked for, one of a model that needs all Gaussians, and one left out in silence."""
     training = trainer("effects.gate=both")
     monkeypatch.setattr("gsbench.gates.hook.LEAST_IN_TRAINING", len(training.model) * 100)
     end(training)

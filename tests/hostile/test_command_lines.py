@@ -46,8 +46,7 @@ from gsbench.measure import record
     ],
 )
 def test_bad_words_are_one_line_and_a_known_status(words, status, message, square, tmp_path, capsys):
-    """Catches a stack trace of gsbench's or of Hydra's, one exit status for bad input and for failed runs, and a fault
-    that costs a whole training before it is noticed."""
+    """Catches a stack trace, one status for bad input and failed runs, and a fault that is noticed after a training."""
     assert main_here(*overrides(square, tmp_path, "model=3dgs"), *words) == status
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("gsbench: error:")]
     assert len(errors) == 1

@@ -86,8 +86,7 @@ def backward_kernels(place: Place) -> Iterator[AbstractContextManager[None]]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_picture(name, place):
-    """Catches any rule of the picture that differs, a bound or tile that loses a Gaussian, and radii, means or depths
-    that density control would take for others."""
+    """Catches another rule of the picture, a tile that loses a Gaussian, and other radii, means or depths."""
     output = rasterize(**with_background(name, device=place.device), backend=place.device)
     for got, want in ((output.image, brute_force(name).image), (output.alpha, brute_force(name).alpha)):
         known = torch.as_tensor(want)[decided(name)]

@@ -190,8 +190,7 @@ def test_views_together_have_the_bits_of_views_one_by_one(name, agr, read_twice,
 
 
 def test_views_that_cannot_be_rendered_together_are_parts_of_their_own(monkeypatch):
-    """Catches images of two sizes in one launch, results in another order than their views', and a map or a term of the
-    loss that sees one view of several."""
+    """Catches two sizes in one launch, results in another order, and a map or a loss that sees one view of several."""
     monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", ("cpu",))
     fitting, (a, b, c), (small,) = fitted("4dgs"), views(3), views(1, 30)
     step = Step(fitting, BACKGROUND, 0.2, False, StageClock())

@@ -206,8 +206,7 @@ def test_a_bad_step_changes_nothing_until_it_is_looked_at(start, repeats):
 
 
 def test_a_value_that_is_not_finite_is_found_in_a_repetition(start, repeats):
-    """Catches a training that goes on with NaN, because the rasterizer's check was not repeated, and an error that does
-    not name the first bad step and its values."""
+    """Catches a training that goes on with NaN, as no check was repeated, and an error without the first bad step."""
     fitted = start("7dgs")
 
     def goes_on() -> bool:

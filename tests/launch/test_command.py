@@ -109,8 +109,7 @@ def test_a_command_without_runs_is_refused(words, message):
 
 
 def test_a_sweep_of_different_runs_is_allowed():
-    """Catches a sweep over protocols, folders of results or initial PLYs that is refused as one run, and a key that one
-    of its runs does not read."""
+    """Catches a sweep over protocols, results or PLYs refused as one run, and a key that one run does not read."""
     several = ("protocol=gsbench,published", "results=a,b", "+init.ply=a,b", "effects.budget_db=1 effects.gate=end,off")
     for words in several:
         runs = runs_of(parse(["+exp=mini", "-m", "scene=dust", *words.split()]))[0]

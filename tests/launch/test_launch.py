@@ -69,8 +69,7 @@ def test_retry_passes_over_what_cannot_be_launched(tmp_path, capsys, monkeypatch
 
 
 def test_retry_names_the_command_of_a_run_that_is_of_no_sweep(tmp_path, capsys):
-    """Catches a retry that says that no run failed, beside a status that lists one, and a command for a damaged record,
-    whose words are not known."""
+    """Catches `no run failed` beside a status that lists one, and a command for a record whose words are lost."""
     run, folder = ("7dgs", "lego", 0), tmp_path / "mini" / "seed0"
     folder.mkdir(parents=True)
     broken = crowd.record(*run) | {"status": "failed", "reason": "out of memory"}

@@ -114,8 +114,7 @@ def test_a_job_listens_before_it_reads_its_plan(tmp_path, monkeypatch):
 
 
 def test_a_job_ends_with_the_status_of_its_run(tmp_path, monkeypatch):
-    """Catches a run that failed in a job that Slurm shows as completed, another run of the plan, and a user's model in
-    the folder of the command that cannot be imported."""
+    """Catches a failed run that Slurm has as completed, another run of the plan, and a model that is not imported."""
     monkeypatch.setattr(stop, "listen", lambda: None)
     monkeypatch.setattr(sys, "path", [])
     plan.write(Plan("slurm", [["+exp=mini", "scene=suzanne", f"seed={seed}"] for seed in (5, 6)]), tmp_path)

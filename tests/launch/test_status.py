@@ -360,8 +360,7 @@ def test_slurm_that_does_not_answer_is_a_reason():
 
 
 def test_status_is_repeated_until_nothing_goes_on(tmp_path, capsys, monkeypatch):
-    """Catches a watch that ends with the first look, or never, the exit status of a run that failed, and a log that is
-    cleared as if it were a terminal."""
+    """Catches a watch that ends at once or never, the status of a failed run, and a log cleared like a terminal."""
     folder = traced(tmp_path / "crowd", progress_of={})
     ends = iter([{}, DIVERGED])
     for expected, words, cleared in ((0, "1 done", 0), (1, "1 failed", 2)):

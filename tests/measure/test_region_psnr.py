@@ -29,8 +29,7 @@ def view(name: str, square: tuple[int, int] | None, *, turned: float = 0.0, alph
 
 
 def test_what_moves_is_found_at_one_camera():
-    """Catches a region of the median instead of the image, a lost opening or dilation, one by the width of the image,
-    and blue that is ignored."""
+    """Catches a region of the median, a lost opening or dilation, one by the width, and blue that is ignored."""
     views = [view(str(i), (5 + 25 * i, 30)) for i in range(3)]
     measured = moving(views)
     assert measured.source == "images of one camera"
@@ -88,8 +87,7 @@ def test_psnr_is_of_the_region_alone():
 
 
 def test_a_region_is_capped_and_rounded_as_the_image_is():
-    """Catches an infinite mean over regions, as the object of one view is rendered exactly, and a region that is
-    measured on another render than the whole image is."""
+    """Catches an infinite mean, as one region is exact, and a region measured on another render than the image."""
     views = [view("0", (10, 10), alpha=True), view("1", (30, 30), alpha=True)]
     scores = RegionScores(views, quantised=False)
     assert list(scores.measured([("0", views[0].image, views[0].image), ("1", views[1].image + 0.1, views[1].image)]))

@@ -21,8 +21,7 @@ def clock(monkeypatch):
 
 
 def test_render_times_are_percentiles_after_warm_up(clock):
-    """Would catch warm-up calls in the figures or of one view only, percentiles taken wrongly, an FPS that is not
-    1000 / median, and one of a handful of frames."""
+    """Catches warm-up in the figures or of one view, wrong percentiles, an FPS of the mean, and one of a few frames."""
     costs = iter([100.0] * 5 + list(range(1, 32)))  # warm-up is slow, then 1..31 ms
     rendered = []
 

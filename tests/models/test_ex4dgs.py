@@ -79,8 +79,7 @@ def test_opacities_fade_outside_of_the_window(rise, tau, factor, backwards):
 
 
 def test_a_static_gaussian_has_a_velocity_alone():
-    """Catches a static Gaussian that follows its keyframes, turns or fades, or one whose velocity counts key intervals
-    or begins in the middle of the clip."""
+    """Catches a static Gaussian that follows keyframes, turns or fades, and a velocity of another unit or start."""
     static = {"windows": row(-1e6, 1e6), "quats": row(1, 0, 0, 0)}
     sliced, model = gaussian(tau=1.2, **static)  # frame 30 of 300
     torch.testing.assert_close(sliced.means, row(0.33, -0.7, 1.04), **DIGITS)
@@ -91,8 +90,7 @@ def test_a_static_gaussian_has_a_velocity_alone():
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("rise", ["text", "code"])
 def test_both_kinds_have_the_gradients_of_their_values(rise, static):
-    """Catches a derivative that is wrong or lost, such as that of an arc cosine or of the beginning of a window, and
-    parameters of one kind that learn by the other."""
+    """Catches a wrong or lost derivative, as of an arc cosine, and parameters of one kind that learn by the other."""
     windows = {"windows": row(-1e6, 1e6)} if static else {}
     _, model = gaussian(rise=rise, quats=row(0.5, -0.2, 0.1, 0.3), **windows)
     names = [name for name in model.splats if name not in ("sh0", "shN")]
@@ -136,8 +134,7 @@ def test_the_penalty():
 
 
 def test_what_moves_most_becomes_dynamic():
-    """Catches far Gaussians that come first, Gaussians that no view sees, a share of all, a jump of the motion, and one
-    that becomes dynamic twice and loses its path."""
+    """Catches far or unseen Gaussians that come first, a share of all, a jump, and one that becomes dynamic twice."""
     model = fresh("ex4dgs", 12, intervals=4, dynamic_share=0.25).double()
     with torch.no_grad():
         model.splats["means"][:] = torch.arange(1.0, 13)[:, None] * torch.tensor([0.0, 0, 1])

@@ -56,8 +56,7 @@ def test_the_field_waits_for_the_end_of_the_warm_up(name, steps, first):
 
 @pytest.mark.parametrize(("name", "step"), [("deformable", 30), ("hexplane", 30), ("scgs", 5), ("scgs", 20)])
 def test_a_training_goes_on_from_its_checkpoint(name, step):
-    """Catches nodes, weights, moments or a box that a checkpoint lacks, and nodes that are placed twice or never where
-    it is of the last step of the warm-up."""
+    """Catches nodes, weights, moments or a box that a checkpoint lacks, and nodes that are placed twice or never."""
     words = ["train.iterations=40"] if name == "scgs" else []
     whole, _ = assert_resumes(lambda: trainer(name, *words), step)
     loaded = trainer(name, "seed=1", *words)
@@ -70,8 +69,7 @@ def test_a_training_goes_on_from_its_checkpoint(name, step):
 
 @FIELDS
 def test_clones_and_children_are_canonical_and_share_the_field(name):
-    """Catches children drawn from the deformed Gaussian, which the field would deform twice, rows of the field, and new
-    features of a child."""
+    """Catches children of the deformed Gaussian, which move twice, rows of the field, and a child's new features."""
     model, plain = fresh(name, 40), fresh("3dgs", 40)
     features = model.splats["features"].data if name == "scgs" else torch.zeros(40, 0)
     features += torch.rand(features.shape, generator=seeded(0))

@@ -51,8 +51,7 @@ def network_of_the_vectors(*further: int) -> Network:
 
 
 def test_the_features_of_planes():
-    """Catches rows in place of columns, another order of axes, levels or corners of the box, a time mapped to [-1, 1],
-    and a sum in place of the product."""
+    """Catches rows for columns, another order of axes, levels or corners, a time in [-1, 1], and a sum of planes."""
     planes = planes_of_the_vectors()
     torch.testing.assert_close(planes(POSITION, TIME).detach()[0], FEATURES, **DIGITS)
 
@@ -102,8 +101,7 @@ def test_a_changed_gaussian():
 
 
 def test_the_penalty():
-    """Catches differences of the first order or along columns, a plane of space taken for one of time, and a mean over
-    the planes or levels."""
+    """Catches differences of another order or direction, space for time, and a mean over the planes or levels."""
     planes = planes_of_the_vectors(levels=1)
     for plane in planes.levels()[0].values():
         plane.data[1, 1] += 0.1

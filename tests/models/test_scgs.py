@@ -50,8 +50,7 @@ class Motion(nn.Module):
 
 
 def test_the_nearest_nodes_and_their_weights():
-    """Catches a distance without features, a radius of the wrong power, a node that counts without its sigmoid, and
-    weights whose sum is not 1."""
+    """Catches a distance without features, a wrong power of a radius, a lost sigmoid, and weights of another sum."""
     near, weights = nodes_of_the_vectors().nearest(POSITION, FEATURES)
     assert near.tolist() == [[0, 1, 2]]
     torch.testing.assert_close(weights.detach()[0], WEIGHTS, **DIGITS)

@@ -190,8 +190,7 @@ def test_memory_is_asked_for(backend, monkeypatch):
     ],
 )
 def test_auto_warns_once_that_it_is_slow(built, has_kernels, device, message, monkeypatch):
-    """Catches a GPU that is missing, or has no kernels, or an installation without a compiler, passed over in silence,
-    and a warning at every picture."""
+    """Catches a GPU without kernels, or none, or no compiler, passed over silently, and a warning at each picture."""
     backends._warn_once.cache_clear()
     monkeypatch.setattr(cuda, "available", lambda: False)
     monkeypatch.setattr(cuda, "built", lambda: built)

@@ -173,8 +173,7 @@ def people() -> dict[str, list[Record]]:
 
 
 def test_the_command_writes_a_site(tmp_path, capsys):
-    """Catches a page that is missing, a link to nothing, markup or a formula of a contributor's, a script that pages do
-    not share, and a model on a scene without a page."""
+    """Catches a missing page, a link to nothing, a contributor's markup or formula, and a script that is not shared."""
     folders, site = published(tmp_path, **people()), tmp_path / "site"
     assert main([str(site), "--merge", *map(str, folders)]) == 0
     out = capsys.readouterr().out

@@ -367,8 +367,7 @@ def test_the_command_prints_and_writes(folder, capsys):
 
 
 def test_other_forms_are_printed_and_nothing_is_written(folder, tmp_path, capsys):
-    """Catches `> table.tex` with another line in it, a number that JSON lacks or rounds, a lost run, and a selection
-    that shows another model or column or another order."""
+    """Catches another line in table.tex, a number that JSON lacks or rounds, a lost run, and another selection."""
 
     def printed(*words):
         assert main([str(folder), *words]) == 0

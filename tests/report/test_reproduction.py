@@ -134,8 +134,7 @@ def test_runs_of_equal_psnr_and_other_gaussians_are_not_bit_equal(changes):
 
 @pytest.mark.parametrize("quantity", ["gaussians", "model_mb", "train_s", "frame_ms"])
 def test_other_seeds_agree_in_what_is_compared_by_percent(quantity):
-    """Catches a spread of 10 to 20 % over seeds that is called a difference, or whose unit is lost: means of thousands
-    of Gaussians and of thousandths of a second."""
+    """Catches a spread of 10 to 20 % over seeds that is called a difference, or whose unit is lost."""
 
     def spread(*factors):
         def change(r):

@@ -122,8 +122,7 @@ def test_all_comparisons_of_a_report_are_corrected_together():
 
 
 def test_an_effect_is_priced_from_published_models():
-    """Catches an effect that is priced from models nobody ran, or from another model than the published one, and one
-    that is said to be nested and is not."""
+    """Catches an effect priced from models nobody ran or others than published, and one called nested that is not."""
     published = with_effects("3dgs", "4dgs", "6dgs", "7dgs_noagr", "7dgs")
     section = sections(*published, *(but(r, model="3dgs_new") for r in with_effects("3dgs")))["effects"]
     priced = dict(zip(section.table.effect, section.table.dB, strict=True))

@@ -69,8 +69,7 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
     ],
 )
 def test_settings_are_refused_before_the_first_step(model, words, message):
-    """Catches a key that does nothing, a typo that trains by another rule than was asked for, a training of no step,
-    and results on the views by which a choice was made."""
+    """Catches a key that does nothing, a typo that trains otherwise, no step, and results on views that chose."""
     square, config = moving_square(), compose(model, 15, *words.split())
     scene = replace(square, val=[] if config.scene.name == "no_val" else square.train[:2])
 

@@ -304,8 +304,7 @@ def test_a_field_is_chosen_without_gates_and_within_the_budget(
     capsys,
     monkeypatch,
 ):
-    """Catches a field that gates refuse or that is loaded with them, slower frames than are allowed, and prices that
-    are not in the record or not printed."""
+    """Catches a field that gates refuse, slower frames than allowed, and prices that are not recorded or printed."""
     ms = {"7dgs": 2.0, "hexplane": 5.0}
     times = lambda trainer, _: (RenderTimes(0.0, ms.get(trainer.config.model.name, 1.0), 9.0), {})  # noqa: E731
     monkeypatch.setattr(measuring, "time_frames", times)

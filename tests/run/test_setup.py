@@ -145,8 +145,7 @@ def test_a_ply_that_cannot_be_the_start_is_refused(
     tmp_path,
     capsys,
 ):
-    """Catches a refusal without a record, a hash that nothing is compared with, a training of black images, and one of
-    a few Gaussians in sight without a line."""
+    """Catches a refusal without a record, a hash compared with nothing, black images, and few Gaussians in sight."""
     write_trained(tmp_path / "a.ply", count, away)
     record, _ = run_here(*words, *more.split())
     assert record.status == ("failed" if reason else "ok")

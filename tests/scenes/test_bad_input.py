@@ -177,8 +177,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_fault_is_one_line_that_names_file_and_field(fault, tiny, capfd):
-    """Catches a fault let through, a stack trace from the depths, a message that leaves the user searching, and lines
-    of OpenCV or libpng around it."""
+    """Catches a fault let through, a stack trace, a message without its place, and lines of OpenCV or libpng."""
     apply, file, field = FAULTS[fault]
     apply(tiny)
     with pytest.raises(InputError) as caught:
@@ -188,8 +187,7 @@ def test_fault_is_one_line_that_names_file_and_field(fault, tiny, capfd):
 
 
 def test_tiny_is_right_unless_broken(tiny):
-    """Without this, every case above could pass because of one and the same fault; and an error of a rotation just
-    below 1e-4, as single precision has it, is a camera."""
+    """Catches cases above that fail for one and the same fault, and a rotation just below 1e-4 that is refused."""
     matrix(m01=5e-5)(tiny)
     assert len(scenes.load(tiny).train) == 2
 
@@ -207,8 +205,7 @@ ARGUMENTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
 
 @pytest.mark.parametrize(("arguments", "words"), ARGUMENTS)
 def test_a_wrong_argument_is_refused(tiny, arguments, words):
-    """Catches a factor that leaves no pixel, images of another colour or protocol, an error of the file system, and an
-    option of another layout that is ignored."""
+    """Catches a factor without a pixel, another colour or protocol, a system's error, and another layout's option."""
     with pytest.raises(InputError) as caught:
         scenes.load(**{"path": tiny, **arguments})
     check_message(caught.value, *words)

@@ -169,8 +169,7 @@ def test_val_is_held_out_of_train_where_there_is_none(tiny):
 
 
 def test_extent_is_that_of_3dgs():
-    """Against the centres the JSON states: catches a diagonal, test cameras counted in, translations or a rotation the
-    wrong way round for centres."""
+    """Against the stated centres: catches a diagonal, test cameras counted in, and poses the wrong way round."""
     frames = json.loads((folder() / "suzanne" / "transforms_train.json").read_text())["frames"]
     centers = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
     radius = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
@@ -209,8 +208,7 @@ def test_opencv_log_level_is_restored(tiny):
 
 
 def test_real_lego(shared_data):
-    """D-NeRF's own files: 50/11/20 views, the world's origin in the middle of every picture. Catches a tolerance that
-    their matrices of single precision fail."""
+    """D-NeRF's own files: 50/11/20 views, the origin in the middle. Catches a tolerance that their matrices fail."""
     root = shared_data / "dnerf_lego100" / "lego"
     if not root.is_dir():
         pytest.skip(f"needs D-NeRF's lego at 100x100 at {root}")

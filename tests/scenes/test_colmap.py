@@ -73,8 +73,7 @@ def test_an_embedded_scene_comes_back(tmp_path, blender, kind):
 
 
 def test_it_is_trained(tmp_path, blender):
-    """Catches a scene that the loader accepts and a run does not, cameras that do not belong to the images, and a
-    choice that is printed and then forgotten."""
+    """Catches a scene that a run does not accept, cameras of other images, and a choice that is not recorded."""
     write_embedded(tmp_path / "own", blender, "bin")
     words = ["+exp=colmap", "model=4dgs", "scene=custom", "scene.name=own", "scene.downscale=4"]
     words += ["train.iterations=50", "train.curve_points=1"]
@@ -386,8 +385,7 @@ def test_fault_is_one_line_that_says_what_is_wrong(taken, fault):
     ],
 )
 def test_the_largest_model_is_read(taken, models, words):
-    """Catches sparse/0 read in silence where COLMAP could not join the images, and another is larger; a folder alone
-    that is refused, and a line for every capture."""
+    """Catches sparse/0 read silently where another is larger, a lone folder refused, and a line for every capture."""
     shutil.rmtree(taken / "sparse")
     for where, count in models.items():
         small_model(taken, NAMES[:count], where=where)

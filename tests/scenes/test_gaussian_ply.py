@@ -138,8 +138,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("table", "message"), REFUSED)
 def test_what_is_not_trained_gaussians_of_3dgs_is_refused(table, message, path):
-    """Catches a KeyError, values that would be drawn as NaN, and Gaussians that look different from the file's because
-    a column of another method was dropped."""
+    """Catches a KeyError, values drawn as NaN, and other Gaussians because another method's column was dropped."""
     with pytest.raises(InputError, match=message) as caught:
         read_trained(write(path, table))
     assert "a.ply" in str(caught.value)

@@ -97,8 +97,7 @@ def test_films_cameras_times_and_splits(root):
 
 
 def test_frames_and_cameras_can_be_chosen(root):
-    """Catches frames counted from 1, a row of poses that moves to the next film, a choice that is not told, and
-    one name that is read as a list of letters."""
+    """Catches frames counted from 1, poses of the next film, a choice that is not told, and a name read as letters."""
     all_frames = scenes.load(root)
     whole = {view.name: view for view in all_frames.train}
     scene = scenes.load(root, frames=(1, 3), leave_out=["cam01"])

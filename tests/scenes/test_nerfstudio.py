@@ -83,8 +83,7 @@ def test_its_own_split(root):
 
 
 def test_times_of_the_file_or_of_a_table(root):
-    """Catches times of frames that give way to the numbers of names, and the cure of the messages, times.csv, that is
-    not read here or not part of the fingerprint."""
+    """Catches times of frames that give way to numbers of names, and a times.csv not read or not in the fingerprint."""
     plain = content_of(root)["frames"]
     change(root, frames=[frame | {"time": -float(frame["file_path"][-9:-4])} for frame in plain])
     timed = scenes.load(root)

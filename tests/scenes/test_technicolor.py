@@ -128,8 +128,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 
 @pytest.mark.parametrize(("apply", "message"), FAULTS)
 def test_faulty_files_are_told(root, apply, message):
-    """Catches distorted originals taken for undistorted ones, tables that are read askew, a missing view, one of
-    another size, and two scenes in one folder."""
+    """Catches distorted originals, tables read askew, a missing view, one of another size, and two scenes in one."""
     assert_refused(root, apply, message)
 
 
@@ -176,8 +175,7 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root, capsys):
     ],
 )
 def test_what_cannot_be_replaced_is_refused(root, damaged, repair, message):
-    """Catches a whole image that is thrown away, a test on another frame's image, an image made of nothing, and one
-    name that is read as a list of letters."""
+    """Catches a whole image thrown away, a test by another frame, an image of nothing, and a name read as letters."""
     for single in damaged.split():
         damage(root, f"Tiny_undist_{single}")
     with pytest.raises(InputError, match=message):

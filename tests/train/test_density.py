@@ -83,8 +83,7 @@ def test_no_more_gaussians_than_the_cap_and_the_largest_gradients_first():
 
 
 def test_what_no_view_of_an_epoch_drew_is_pruned():
-    """Catches dead weight that stays, Gaussians dropped before every view has looked, and counts or gradients that stay
-    where they were while the Gaussians move."""
+    """Catches dead weight that stays, Gaussians dropped too early, and counts or gradients that do not move along."""
     _, _, control = control_of(4)
     for drawn, times, left in (
         ([1, 0, 0, 1], 4, [0, 1, 2, 3]),  # four views in a row may miss one of three

@@ -51,8 +51,7 @@ def flat(name: str) -> tuple[GaussianModel, Tensor, list[int]]:
     ],
 )
 def test_the_floor_is_a_part_of_a_pixel_where_it_is_finest(cameras, pixel):
-    """Catches the farthest camera, a mean over cameras, one on the other side, and a focal length that is left out, or
-    the smaller of two."""
+    """Catches the farthest camera, a mean, one on the other side, and a focal length left out, or the smaller one."""
     model = flat("3dgs")[0]
     model.splats["means"].data[:] = torch.tensor([0.0, 0.0, 1.0])  # behind what the cameras are `distance` away from
     least = MinimumScale(training_of(model, camera=cameras)).least
@@ -98,8 +97,7 @@ def test_it_is_half_the_gap_between_the_times_of_training(times, least):
 
 
 def test_every_step_of_a_training_holds_them():
-    """Catches a training that never holds a minimum, computes the gap from views of val or test, or has the minimum
-    scale of other Gaussians once rows were moved."""
+    """Catches a training that holds no minimum, a gap from val or test, and the scale of Gaussians before a move."""
     square = moving_square()
     scene = replace(square, train=[replace(v, time=t) for v, t in zip(square.train, (0.0, 1.0) * 50, strict=False)])
     fitted = trainer("freetime", "effects.gate=off", "train.densify.every=1", scene=scene)

@@ -27,8 +27,7 @@ def trained(fitted: Trainer) -> object:
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize(("model", "overrides"), [*((name, ()) for name in MODELS), ("7dgs", ("effects.gate=both",))])
 def test_a_training_has_the_same_bits(model, overrides, repeats, monkeypatch):
-    """Catches work of a step that depends on something that neither the signature has nor a repetition reads again, or
-    on the number of threads."""
+    """Catches a step that depends on what neither signature nor repetition reads, or on the number of threads."""
     replayed = []
     for threads in (1, 2):
         torch.set_num_threads(threads)

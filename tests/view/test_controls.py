@@ -81,8 +81,7 @@ def test_effects_are_switched_off_and_on(page):
 
 
 def test_gaussians_have_the_colours_of_their_classes_or_costs(page, viewer):
-    """Catches colours that nothing explains, a legend that stays when the colours are gone, and a wipe that is cut at
-    another place, of other colours or of another model."""
+    """Catches colours without a legend, a legend that stays, and a wipe elsewhere, of other colours or model."""
     image, legend = page.look(image_height=66), page.controls.legend
     assert legend.content == ""
     classes = page.set("colours", "class")
@@ -195,8 +194,7 @@ def test_everything_is_brought_back(page):
 
 
 def test_the_image_is_saved_as_it_is_shown(viewer, monkeypatch):
-    """Catches a file of another size or of other colours, one without a name, two for a double click, and one that
-    nobody asked for, as the page opens."""
+    """Catches a file of another size or colours, without a name, two for a double click, and one nobody asked for."""
     files: list[tuple[str, bytes]] = []
     monkeypatch.setattr(ClientHandle, "send_file_download", lambda _, name, data, **__: files.append((name, data)))
     with visit(viewer) as page:

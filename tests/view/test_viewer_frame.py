@@ -119,8 +119,7 @@ def test_settings_are_those_of_one_frame(agr):
     ids=["without effect sets", "with effect sets", "decoded"],
 )
 def test_colours_are_those_of_the_picture_of_effect_sets(variant, effect_sets):
-    """Catches a viewer whose colours mean something else than in effect_sets.png, or stand on another background, and
-    an image that is not decoded, or a legend that is."""
+    """Catches colours that mean something else than in effect_sets.png, another background, and a missing decode."""
     gated = renderer(effect_sets=effect_sets, variant=variant)
     camera = camera_of(0.5, gated)
     panels = picture.draw(gated.run.model, camera, 0.4, BLACK)[picture.LINE :]
