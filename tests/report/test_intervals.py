@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from simulate_coverage import SHAPES, SPREADS, coverage, ours
+from simulate_coverage import SHAPES, SPREADS, coverage
 
 from gsbench.report.intervals import Estimate, estimate, holm
 
@@ -107,7 +107,7 @@ def test_holm_by_hand():
 @pytest.mark.parametrize("shape", [(1, 3, 20), (3, 3, 10)])
 def test_the_interval_holds_its_coverage_on_few_simulations(shape):
     """Catches a quantile or a variance that is wrong by a third, quickly; the slow test is narrower."""
-    assert 0.92 <= coverage(ours, shape, SPREADS["as measured"], 400) <= 0.98
+    assert 0.92 <= coverage(shape, SPREADS["as measured"], 400) <= 0.98
 
 
 @pytest.mark.slow
@@ -115,6 +115,6 @@ def test_the_interval_holds_its_coverage_on_few_simulations(shape):
 @pytest.mark.parametrize("spread", SPREADS)
 def test_the_interval_holds_its_coverage(shape, spread):
     """Catches an interval that is not one of 95 %, of zero too: 2,000 draws; of two seeds up to 99 %."""
-    held = coverage(ours, shape, SPREADS[spread], 2000)
+    held = coverage(shape, SPREADS[spread], 2000)
     assert 0.93 <= held <= (0.97 if spread == "as measured" and shape[1] > 2 else 1)
-    assert coverage(ours, shape, SPREADS["as measured"], 2000, truth=0.0, seed=1) >= 0.94
+    assert coverage(shape, SPREADS["as measured"], 2000, truth=0.0, seed=1) >= 0.94
