@@ -117,10 +117,8 @@ def _ask(asked: dict[str, Any]) -> int | None:
 
 
 def serve() -> None:
-    """Answer each line of the input: with the number of a new fork, or with the exit status of one, None if it runs.
-
-    A fork returns, as a new process would begin.
-    """
+    """Answer each line of the input: with the number of a new fork, or with the exit status of one, None if it runs. A
+    fork returns, as a new process would begin."""
     answers = os.fdopen(os.dup(1), "w")
     for line in sys.stdin:
         asked = json.loads(line)

@@ -62,10 +62,8 @@ def test_it_touches_fewer_than_eight_files():
 
 @pytest.mark.skipif(not all(map(shutil.which, ("cmake", "ninja", "c++"))), reason="needs cmake, ninja and a compiler")
 def test_the_worked_example_builds_and_differentiates(tmp_path):
-    """Catches documentation that no longer builds, on the CPU and by the shim for CUDA, or a wrong gradient of it.
-
-    The copy's other kernels are empty.
-    """
+    """Catches documentation that no longer builds, on the CPU and by the shim for CUDA, or a wrong gradient of it. The
+    copy's other kernels are empty."""
     project, build = tmp_path / "project", tmp_path / "build"
     left_out = shutil.ignore_patterns("__pycache__", "sample", "*.so")
     shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=left_out)

@@ -102,10 +102,8 @@ def test_a_model_that_cannot_be_gated_is_refused_before_step_0(gated):
 
 
 def test_export_start_from_a_ply_and_a_nan(project, data, gated, tmp_path):
-    """Catches what asks a model for parameters that only ours have: the PLY, what starts from it, a NaN's report.
-
-    The second PLY is so bright that the loss of its first image is not finite.
-    """
+    """Catches what asks a model for parameters that only ours have: the PLY, what starts from it, a NaN's report. The
+    second PLY is so bright that the loss of its first image is not finite."""
     (folder,) = gated.glob("*/*/gated_balls,*/seed0")
     done = run(project, "gsbench.export", str(folder), "--ply", str(tmp_path / "balls.ply"))
     assert done.returncode == 0, done.stderr

@@ -73,10 +73,8 @@ def test_their_model_is_the_one_of_the_page():
 
 
 def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
-    """Run a notebook in a folder; return what it prints, and its number of figures.
-
-    Decibels are those that are committed, but for the last digits of another processor.
-    """
+    """Run a notebook in a folder; return what it prints, and its number of figures. Decibels are those that are
+    committed, but for the last digits of another processor."""
     import nbformat
     from nbclient import NotebookClient
 

@@ -37,10 +37,8 @@ def modules(root: Path) -> dict[str, ast.Module]:
 
 
 def imports(parsed: dict[str, ast.Module]) -> dict[str, set[str]]:
-    """For each module those of the same package that it imports, in functions and for type checkers too.
-
-    `from package import name` counts as an import of the module `package.name` where there is one.
-    """
+    """For each module those of the same package that it imports, in functions and for type checkers too. `from package
+    import name` counts as an import of the module `package.name` where there is one."""
     graph: dict[str, set[str]] = {}
     for name, tree in parsed.items():
         imported: set[str] = set()

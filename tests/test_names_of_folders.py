@@ -14,9 +14,7 @@ NAMES = ("my data (1)", "KÃ¼che", "100%%#x", "a=1,b=2", '$HOME `x` "it\'s"', "æ—
 @pytest.mark.parametrize("name", NAMES)
 def test_a_folder_of_any_name_is_given_as_the_error_says(name, square, tmp_path, capsys):
     """Catches an error of Hydra's grammar that does not name the argument, and a cure that a shell reads otherwise.
-
-    gsbench's run folders themselves have = and commas in their names.
-    """
+    gsbench's run folders themselves have = and commas in their names."""
     (tmp_path / name).symlink_to(square)
     words = overrides(square, tmp_path / "r", "model=3dgs", "train.iterations=1")
     words = [word for word in words if not word.startswith("data.root")]

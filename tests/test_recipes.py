@@ -1,5 +1,7 @@
 """The recipes in conf/: rates that mean the same for a run of any length, and the published ones as published."""
 
+import functools
+
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -13,6 +15,7 @@ from gsbench.schedule import Schedule
 from gsbench.train.optim import Optimizer, rate_at
 
 
+@functools.cache  # of trials, most compare with one recipe
 def composed(*overrides: str) -> Config:
     register_schema()
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -153,10 +156,8 @@ def test_7dgs_without_direction_learns_as_7dgs_does():
 
 
 def test_every_model_goes_as_far_in_a_short_run():
-    """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not.
-
-    The harmonics of 3DGS and 6DGS are, which was chosen on static scenes.
-    """
+    """Catches a model whose geometry keeps the rates of 30,000 steps at 300: all are ten times faster, colours not. The
+    harmonics of 3DGS and 6DGS are, which was chosen on static scenes."""
     for model in ("3dgs", "4dgs", "6dgs", "7dgs", "7dgs_nodir"):
         short, long = (rates(composed(f"model={model}", f"train.iterations={n}"), 0.0) for n in (300, 30_000))
         for name in long.keys() - {"lambda"}:

@@ -151,10 +151,8 @@ def fetched(address: str, to: Path, monkeypatch: pytest.MonkeyPatch, *words: str
 
 @pytest.mark.parametrize("mode", [0o100644, 0])
 def test_an_archive_is_unpacked_and_its_scenes_named(mode, address, tmp_path, monkeypatch, capsys):
-    """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again.
-
-    Also files without a kind, as Windows zips them, that count as devices, and data that are there and are missed.
-    """
+    """Catches data that lie where nobody is told, an archive that stays, and data that are fetched again. Also files
+    without a kind, as Windows zips them, that count as devices, and data that are there and are missed."""
     Handler.files["dnerf.zip"] = zipped(SCENES, mode)
     for message, bar in (("unpacked into", "100%"), ("nothing fetched", "")):
         assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0

@@ -131,9 +131,8 @@ def test_the_level_on_rigs(together, monkeypatch):
 @pytest.mark.parametrize(("width", "height"), [(24, 48), (48, 24)])
 def test_a_shift_is_one_of_the_longer_side(width, height):
     """Catches shifts in units of the width alone: in a portrait image they would be twice as large, and no camera held.
-
-    A camera that turns around the scene by a moves by sqrt(2) a f / side in these units, here by 0.045 of at most 0.05.
-    """
+    A camera that turns around the scene by a moves by sqrt(2) a f / side in these units, here by 0.045 of at most
+    0.05."""
     scene, K = rigged(still, 4, 3), torch.tensor([[57.6, 0.0, width / 2], [0.0, 57.6, height / 2], [0.0, 0.0, 1.0]])
     angle = 0.045 * 48 / 57.6 / math.sqrt(2)
     turned = [

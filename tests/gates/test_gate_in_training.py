@@ -235,9 +235,7 @@ def test_what_a_gate_costs_is_what_the_images_lost():
 
 def test_auto_and_a_gate_after_the_fact(square, tmp_path, capsys):
     """Catches model=auto that says nothing of what it chose, a loaded run of another model, a gate that spoils the old.
-
-    The scene has six views, which are too few to tell: it is simulated, and that is said.
-    """
+    The scene has six views, which are too few to tell: it is simulated, and that is said."""
     done = gsbench(*overrides(square, tmp_path, "model=auto", "train.iterations=60"))
     assert done.returncode == 0, done.stderr
     assert "too few; 12 are needed" in done.stderr + done.stdout

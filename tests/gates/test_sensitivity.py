@@ -94,11 +94,9 @@ def test_an_opaque_gaussian_is_no_harder_to_predict():
 
 
 def test_a_removal_is_priced_by_what_it_does_to_the_residual():
-    """Catches the sign of <r, x>: half of what a removal changes is missing in the image, or is too much in it.
-
-    The image is linear in an opacity: with r = x / 2 the removal adds <x, x> to what it adds without a residual, and
-    with r = -x / 2, where it would be an improvement, nothing.
-    """
+    """Catches the sign of <r, x>: half of what a removal changes is missing in the image, or is too much in it. The
+    image is linear in an opacity: with r = x / 2 the removal adds <x, x> to what it adds without a residual, and with r
+    = -x / 2, where it would be an improvement, nothing."""
     model, N = trained_a_little("3dgs", 0), 4
     at = camera(0.3, 0.2, MODEL_SIZE)
     live = model.slice(CameraTime.of(at, None))

@@ -63,10 +63,8 @@ def place(request: pytest.FixtureRequest) -> Iterator[Place]:
 @pytest.fixture(scope="session")
 def shim() -> ModuleType:
     """The CUDA kernels built to run on the CPU (cuda_shim.h): once for all processes, and again where a source changed.
-
     They are kept in build/shim or the folder GSBENCH_SHIM_BUILD, and have the sanitizers GSBENCH_SANITIZE names. Skips
-    without the tools to build them.
-    """
+    without the tools to build them."""
     if not all(map(shutil.which, ("cmake", "ninja", "c++"))):
         pytest.skip("needs a GPU and the built extension, or cmake, ninja and a C++ compiler for the shim")
     folder = Path(os.environ.get("GSBENCH_SHIM_BUILD") or ROOT / "build/shim" / str(sys.implementation.cache_tag))

@@ -66,10 +66,8 @@ def test_several_images_have_the_bits_of_each(height, width, place):
 @pytest.mark.usefixtures("threads", "instruction_set")
 @pytest.mark.parametrize("height", [1, 2, 5, 11, 13, 14, 15, 23, 90])
 def test_same_bits_for_any_number_of_threads(height):
-    """Catches strips of the picture that see other neighbours, or sums in another order.
-
-    Strips begin and end anywhere in a group of rows: a row that is gone when the next group wants it differs here too.
-    """
+    """Catches strips of the picture that see other neighbours, or sums in another order. Strips begin and end anywhere
+    in a group of rows: a row that is gone when the next group wants it differs here too."""
     results = []
     for number in (1, 2, 3, 7):
         torch.set_num_threads(number)

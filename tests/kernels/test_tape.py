@@ -157,12 +157,10 @@ def test_a_training_step_s_gradients_are_the_reference_s(name, agr, classed, pla
     ],
 )
 def test_views_together_have_the_bits_of_views_one_by_one(name, agr, read_twice, shared, place, monkeypatch):
-    """Catches a view that reads another's slice, camera or target, and gradients that are lost or added twice.
-
-    On a CPU, gradients are added from the last view to the first. On a GPU, a thread adds those of its Gaussian from
-    the first view to the last. What two operations of a view read has no sum for each view; on a GPU, neither have what
-    all views share and sums over Gaussians.
-    """
+    """Catches a view that reads another's slice, camera or target, and gradients that are lost or added twice. On a
+    CPU, gradients are added from the last view to the first. On a GPU, a thread adds those of its Gaussian from the
+    first view to the last. What two operations of a view read has no sum for each view; on a GPU, neither have what all
+    views share and sums over Gaussians."""
     torch.set_num_threads(1)
     monkeypatch.setattr("gsbench.train.step.TOGETHER_ON", (place.device,))
     fitting, batch = fitted(name, agr=agr).to(place.device), [view.to(place.device) for view in views(4)]
@@ -318,10 +316,8 @@ def test_two_views_may_share_a_gradient():
 
 
 def test_what_is_added_does_not_depend_on_what_is_there():
-    """Catches coefficients that two operations read, each of which adds its own part to other views' gradient.
-
-    Which views share a sum depends on the number of threads, and its rounding would too.
-    """
+    """Catches coefficients that two operations read, each of which adds its own part to other views' gradient. Which
+    views share a sum depends on the number of threads, and its rounding would too."""
     g = torch.Generator().manual_seed(4)
     sh0, shN = torch.randn(50, 1, 3, generator=g).requires_grad_(), torch.randn(50, 15, 3, generator=g).requires_grad_()
     means, faded, other = torch.randn(50, 3, generator=g), torch.ones(50), torch.randn(50, 1, 3, generator=g)

@@ -207,10 +207,8 @@ def test_the_time_left_is_that_of_the_runs_that_have_not_ended(tmp_path):
 def test_a_sweep_has_the_bits_of_one_process_and_a_retry_does_what_is_missing(square, tmp_path):
     """Catches runs that depend on the process they share, a sweep that says nothing until its end, one that is repeated
     and expects its kept runs to train, an outcome that a run of a process of its own writes without its record, and a
-    retry that loses a run's overrides, trains a finished run again, or hides that nothing is left.
-
-    In a process of its own: `+launch=parallel` forks, and a fork of a process with threads can wait for them forever.
-    """
+    retry that loses a run's overrides, trains a finished run again, or hides that nothing is left. In a process of its
+    own: `+launch=parallel` forks, and a fork of a process with threads can wait for them forever."""
     for launch in ("local", "parallel"):
         experiment = tmp_path / launch / "dnerf"
         more = ("model=3dgs", "train.iterations=2", "seed=0,1", f"+launch={launch}", "launch.at_once=1")

@@ -72,9 +72,7 @@ def test_psnr_properties(seed, noise, height, width):
 
 def test_ssim_against_its_formula():
     """Would catch scikit-image called with other settings: Wang et al. 2004, eq. 13, written out with OpenCV's filter.
-
-    On this pair data_range=2 is 8e-3 off, a uniform window 6e-3, a sample covariance 2e-5.
-    """
+    On this pair data_range=2 is 8e-3 off, a uniform window 6e-3, a sample covariance 2e-5."""
     a, b = image(0, 40, 50), image(1, 40, 50) * 0.5 + image(0, 40, 50) * 0.5
     x, y = a.double().numpy(), b.double().numpy()
 

@@ -101,9 +101,7 @@ def freeze(model: GaussianModel) -> None:
 @pytest.mark.parametrize("variant", OBSERVING)
 def test_a_static_row_is_a_frozen_one(variant, dtype):
     """Catches a static row that would look otherwise to whoever does not know of effect sets, by kernels or by torch.
-
-    An exponent of f_dir or f_temp is (q - mu)^2 / (2 e^32) = 1e-14 (q - mu)^2 there.
-    """
+    An exponent of f_dir or f_temp is (q - mu)^2 / (2 e^32) = 1e-14 (q - mu)^2 there."""
     model = lively(variant).to(dtype)
     freeze(model)
     query, raw = CameraTime.at(CAMERA.to(dtype), 0.45), dict(model.splats.items())

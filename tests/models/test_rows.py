@@ -139,11 +139,9 @@ def test_children_lie_where_the_parent_is_dense(variant):
 
 @pytest.mark.parametrize("variant", [v for v in CHOLESKY if v.startswith("7dgs")])
 def test_children_of_a_split_in_time(variant):
-    """Catches children off the parent's path or with another slope.
-
-    S_t shrinks by 1.6^2, K and the slice's covariance stay, and at any time and from anywhere each child's slice lies
-    where the parent's does: it moves along mu_cond(t) as its parent did.
-    """
+    """Catches children off the parent's path or with another slope. S_t shrinks by 1.6^2, K and the slice's covariance
+    stay, and at any time and from anywhere each child's slice lies where the parent's does: it moves along mu_cond(t)
+    as its parent did."""
     model = quiet(variant)
     model.extent = 1e-9  # everything that moves and is long is split in time
     model.splats["log_diagonal"].data[:, model.rows["t"]] += 2

@@ -108,10 +108,8 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
 
 
 def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -> list[tuple[str, Step]]:
-    """Return the names and functions of all tests and timings in a full audit.
-
-    The drift of trainings is measured in the process `other`; timings begin when it is done.
-    """
+    """Return the names and functions of all tests and timings in a full audit. The drift of trainings is measured in
+    the process `other`; timings begin when it is done."""
     fastest, backends = audit.backends[0], audit.backends
     steps = [_judged(audit, case, judge, backends) for area, judge in FIXED.items() for case in of_area(area)]
     for case in of_area("training"):

@@ -20,11 +20,8 @@ DIFFERENTIABLE = {"means": 2, "factors": 3, "opacities": 1, "colors": 2, "beta_e
 
 @dataclass(frozen=True)
 class Picture:
-    """An exact image, and how close each pixel is to a threshold of alpha or transmittance.
-
-    A pixel that is close to a threshold may change by a visible amount in float32, because a Gaussian may be skipped
-    there.
-    """
+    """An exact image, and how close each pixel is to a threshold of alpha or transmittance. A pixel that is close to a
+    threshold may change by a visible amount in float32, because a Gaussian may be skipped there."""
 
     image: Tensor  # [C, H, W, D]
     alpha: Tensor  # [C, H, W, 1]
@@ -57,10 +54,8 @@ def render(
     background: Tensor | None = None,
     **options: Any,
 ) -> Picture:
-    """Render exact images from the arguments of `gsbench.raster.rasterize` in float64.
-
-    `offsets2d` [C, N, 2] is added to the projected means, in pixels.
-    """
+    """Render exact images from the arguments of `gsbench.raster.rasterize` in float64. `offsets2d` [C, N, 2] is added
+    to the projected means, in pixels."""
     C, N, D = len(viewmats), means.shape[-2], colors.shape[-1]
     gaussians = {"means": means, "factors": factors, "opacities": opacities, "colors": colors}
     if (exponents := options.pop("beta_exponents", None)) is not None:
@@ -153,11 +148,8 @@ def _project(
 
 
 def _blend(splats: _Splats, pixels: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Blend all Gaussians front to back at P pixels.
-
-    Return the image [P, D], the alpha [P, 1], which Gaussians contribute [M, P], and each pixel's relative distance [P]
-    to the nearest threshold of alpha or transmittance.
-    """
+    """Blend all Gaussians front to back at P pixels. Return the image [P, D], the alpha [P, 1], which Gaussians
+    contribute [M, P], and each pixel's relative distance [P] to the nearest threshold of alpha or transmittance."""
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, yy = (splats.covs[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     power = 0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)

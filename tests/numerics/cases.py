@@ -133,10 +133,8 @@ def worst(errors: Tensor) -> float:
 
 
 def fastest(call: Callable[[], object], repeats: int = 3) -> float:
-    """Return the milliseconds of the fastest of some calls, because other processes may slow some of them.
-
-    A call that takes more than half a second is not repeated.
-    """
+    """Return the milliseconds of the fastest of some calls, because other processes may slow some of them. A call that
+    takes more than half a second is not repeated."""
     times: list[float] = []
     while len(times) < repeats and (not times or times[0] < SLOW_MS):
         start = time.perf_counter()

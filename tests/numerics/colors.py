@@ -61,10 +61,8 @@ def loud_harmonics(g: Generator, severity: float, model: str) -> ColorInputs:
 
 @case("colour", "4dgs", forward=1e-3, gradient=1e-2)
 def far_in_time(g: Generator, severity: float, model: str) -> ColorInputs:
-    """Test Fourier colours 1000 periods from a Gaussian's mean time mu_t.
-
-    Float32 stores such a mu_t to 6e-5, which is an error of 8e-4 in the phase of the second frequency.
-    """
+    """Test Fourier colours 1000 periods from a Gaussian's mean time mu_t. Float32 stores such a mu_t to 6e-5, which is
+    an error of 8e-4 in the phase of the second frequency."""
     inputs = ordinary(g, model)
     inputs.times += 1000 * severity
     return inputs
@@ -98,11 +96,8 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
 
 
 def truth(inputs: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute exact colours [COUNT, 3] and gradients [COUNT, 5] in mpmath.
-
-    The five derivatives are with respect to the mean (3), to mu_t, and to a step along the direction `along` in the
-    space of coefficients.
-    """
+    """Compute exact colours [COUNT, 3] and gradients [COUNT, 5] in mpmath. The five derivatives are with respect to the
+    mean (3), to mu_t, and to a step along the direction `along` in the space of coefficients."""
     layout = {"means": 3, "times": 1, "sh": len(along)}
     time = float(torch.tensor(inputs.time))
     colors, slopes = [], []
@@ -120,10 +115,8 @@ def truth(inputs: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, T
 
 
 def differentiate(inputs: ColorInputs, backend: str, weight: Tensor, copies: int) -> tuple[Tensor, Tensor]:
-    """Compute colours [N, 3] in float32, and their gradients [N, 4 + coefficients].
-
-    The gradients are with respect to the mean (3), to the mean time mu_t (1) and to the colour coefficients.
-    """
+    """Compute colours [N, 3] in float32, and their gradients [N, 4 + coefficients]. The gradients are with respect to
+    the mean (3), to the mean time mu_t (1) and to the colour coefficients."""
     model, device = build(inputs.model, backend=BACKENDS[backend]), device_of(backend)
     rows = torch.arange(COUNT).repeat(copies)
     leaves = [value[rows].requires_grad_() for value in (inputs.means, inputs.times, inputs.sh)]

@@ -49,11 +49,9 @@ class SliceTime:
 
 
 def by_condition() -> Iterator[ConditionCurve]:
-    """Yield the float32 errors of each scheme in torch over the condition number of the factor.
-
-    The rows of the factors are in the paper's order, with position first. In the default order the conditional Gaussian
-    is a block of the factor, so that the default scheme would have nothing to compute.
-    """
+    """Yield the float32 errors of each scheme in torch over the condition number of the factor. The rows of the factors
+    are in the paper's order, with position first. In the default order the conditional Gaussian is a block of the
+    factor, so that the default scheme would have nothing to compute."""
     order, generator = "paper", Generator().manual_seed(2)
     decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
     hard = population.draw(generator, SPREAD, order, decades)

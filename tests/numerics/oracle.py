@@ -27,10 +27,8 @@ Layout = dict[str, int]  # the name and the length of each parameter in a vector
 
 
 def gradient(function: Function, at: Sequence[float], weights: Sequence[float], first: int | None = None) -> Vector:
-    """Compute the gradient of the dot product `weights . function(x)` at the point x = `at` by central differences.
-
-    If `first` is given, return only the derivatives with respect to the first `first` entries of x.
-    """
+    """Compute the gradient of the dot product `weights . function(x)` at the point x = `at` by central differences. If
+    `first` is given, return only the derivatives with respect to the first `first` entries of x."""
     with mp.workdps(DIGITS):
         x, w, slopes = [mpf(v) for v in at], [mpf(v) for v in weights], []
         for i, value in enumerate(x[:first]):
@@ -99,11 +97,9 @@ def slice_triangular(
 def slice_rotated(
     x: Vector, layout: Layout, center: Sequence[float], time: float, log_lambda: dict[str, float]
 ) -> Vector:
-    """Compute the conditional 3D Gaussian of a 4DGS Gaussian, which does not depend on `center` (4DGS eq. 5 to 9).
-
-    The 4D covariance is (R s)(R s)^T with the diagonal matrix s of the four sizes. Two quaternions l and r give the
-    rotation R = M_left(l) M_right(r).
-    """
+    """Compute the conditional 3D Gaussian of a 4DGS Gaussian, which does not depend on `center` (4DGS eq. 5 to 9). The
+    4D covariance is (R s)(R s)^T with the diagonal matrix s of the four sizes. Two quaternions l and r give the
+    rotation R = M_left(l) M_right(r)."""
     raw = unpack(x, layout)
     a, b, c, d = _normalised(raw["left_quats"])
     p, q, r, s = _normalised(raw["right_quats"])
@@ -159,11 +155,9 @@ def slice_free_time(x: Vector, layout: Layout, center: Sequence[float], time: fl
 
 
 def slice_universal(x: Vector, layout: Layout, center: Sequence[float], time: float) -> Vector:
-    """Compute the conditional 3D Gaussian of a UBS Gaussian, of direction alone if it has no mean time.
-
-    With S_qq = T T^T, P = S_pq T^-T, y = T^-1 delta and B = diag(min(b / 4, 1)), the mean is mu_p + P B y and the
-    covariance S_pp - P B P^T, for position p and q = (direction, time).
-    """
+    """Compute the conditional 3D Gaussian of a UBS Gaussian, of direction alone if it has no mean time. With S_qq = T
+    T^T, P = S_pq T^-T, y = T^-1 delta and B = diag(min(b / 4, 1)), the mean is mu_p + P B y and the covariance S_pp - P
+    B P^T, for position p and q = (direction, time)."""
     raw = unpack(x, layout)
     delta = _delta(raw, _direction(raw["means"], center), time)
     sizes = [_softplus_size(value) for value in raw["scales"]]
@@ -193,9 +187,7 @@ SLICES = {
 
 def _condition(S: Matrix, p: list[int], q: list[int], mean: Vector, delta: Vector) -> tuple[Vector, Vector]:
     """Return the conditional mean mu_p + K delta and the conditional covariance S_pp - K S_qp, with K = S_pq S_qq^-1.
-
-    Here p are the rows of position, q those of time and direction, and delta is q minus mu_q.
-    """
+    Here p are the rows of position, q those of time and direction, and delta is q minus mu_q."""
     S_pq = _block(S, p, q)
     K = solve(_block(S, q, q), S_pq)
     moved = [m + mp.fdot(k, delta) for m, k in zip(mean, K, strict=True)]
@@ -263,11 +255,9 @@ def alphas(
     pixels: Sequence[tuple[float, float]],
     eps2d: float,
 ) -> Vector:
-    """Compute the alpha of one Gaussian at pixel centres, without the cut-offs of 3DGS at 0.999 and 1/255.
-
-    Alpha is opacity exp(-r^2 / 2), with the r^2 and the arguments of `distances`; x goes on with the opacity. If x has
-    an exponent b too, alpha is opacity (1 - r^2)^b where r < 1, and zero elsewhere (Universal Beta Splatting).
-    """
+    """Compute the alpha of one Gaussian at pixel centres, without the cut-offs of 3DGS at 0.999 and 1/255. Alpha is
+    opacity exp(-r^2 / 2), with the r^2 and the arguments of `distances`; x goes on with the opacity. If x has an
+    exponent b too, alpha is opacity (1 - r^2)^b where r < 1, and zero elsewhere (Universal Beta Splatting)."""
     squares = distances(x, viewmat, K, size, pixels, eps2d)
     if len(x) == 13:
         return [x[12] * mp.exp(-r2 / 2) for r2 in squares]
@@ -317,12 +307,10 @@ def distances(
 
 
 def colors(x: Vector, layout: Layout, center: Sequence[float], waves: int, time: float) -> Vector:
-    """Compute the RGB colour of one Gaussian from SH and Fourier coefficients (3DGS; 4DGS eq. 12).
-
-    The colour is max(0, 1/2 + sum of beta Y_lm(d) cos(2 pi n (t - mu_t))) with coefficients beta, SH up to degree 3 in
-    the signs of 3DGS, and frequencies n < `waves`. If the camera is on the mean, the direction d is undefined, and only
-    the constant Y_00 is used.
-    """
+    """Compute the RGB colour of one Gaussian from SH and Fourier coefficients (3DGS; 4DGS eq. 12). The colour is max(0,
+    1/2 + sum of beta Y_lm(d) cos(2 pi n (t - mu_t))) with coefficients beta, SH up to degree 3 in the signs of 3DGS,
+    and frequencies n < `waves`. If the camera is on the mean, the direction d is undefined, and only the constant Y_00
+    is used."""
     raw = unpack(x, layout)
     direction = _direction(raw["means"], center)
     basis = [
@@ -339,11 +327,9 @@ LEGENDRE = ((1,), (0, 1), (-0.5, 0, 1.5), (0, -1.5, 0, 2.5))  # coefficients of 
 
 
 def harmonic(degree: int, order: int, x: Any, y: Any, z: Any) -> Any:
-    """Evaluate one real spherical harmonic of degree l and order m at the unit vector (x, y, z).
-
-    The value is N_lm (d^m P_l / dz^m) times the real or imaginary part of (x + i y)^m, with Legendre polynomial P_l,
-    normalisation N_lm and the Condon-Shortley phase (-1)^m, as in 3DGS.
-    """
+    """Evaluate one real spherical harmonic of degree l and order m at the unit vector (x, y, z). The value is N_lm (d^m
+    P_l / dz^m) times the real or imaginary part of (x + i y)^m, with Legendre polynomial P_l, normalisation N_lm and
+    the Condon-Shortley phase (-1)^m, as in 3DGS."""
     m = abs(order)
     scale = mp.sqrt((2 * degree + 1) / (4 * mp.pi) * mp.factorial(degree - m) / mp.factorial(degree + m))
     legendre = [mpf(c) for c in LEGENDRE[degree]]
@@ -412,10 +398,8 @@ def _gram(F: Matrix) -> Matrix:
 
 
 def solve(A: Matrix, B: Matrix) -> Matrix:
-    """Solve A x = b by Gaussian elimination for each row b of B; return the rows x.
-
-    No pivoting is needed for a positive definite or triangular matrix A, because the arithmetic has many digits.
-    """
+    """Solve A x = b by Gaussian elimination for each row b of B; return the rows x. No pivoting is needed for a
+    positive definite or triangular matrix A, because the arithmetic has many digits."""
     n = len(A)
     rows = [[*row, *(b[i] for b in B)] for i, row in enumerate(A)]
     for i in range(n):

@@ -91,20 +91,16 @@ def at_the_near_plane(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def far_off_axis(g: Generator, severity: float) -> list[Arguments]:
-    """Put means outside the image (x/z up to 100) of Gaussians that reach into it; EWA's Jacobian is large there.
-
-    Met in practice: diff-gaussian-rasterization issue 75.
-    """
+    """Put means outside the image (x/z up to 100) of Gaussians that reach into it; EWA's Jacobian is large there. Met
+    in practice: diff-gaussian-rasterization issue 75."""
     away = [DEPTH * tangent**severity for tangent in (1.0, 10.0, 100.0)]
     return [single(torch.tensor([x, 0.3 * x, DEPTH]), 0.4 * x * torch.randn(3, 3, generator=g)) for x in away]
 
 
 @case("projection")
 def needle(g: Generator, severity: float) -> list[Arguments]:
-    """Use axis ratios 10^5 : 1 : 1 and 10^5 : 10^5 : 1, for which the 2D determinant ab - c^2 cancels.
-
-    Training makes such Gaussians at edges. Met in practice: UnityGaussianSplatting issue 14.
-    """
+    """Use axis ratios 10^5 : 1 : 1 and 10^5 : 10^5 : 1, for which the 2D determinant ab - c^2 cancels. Training makes
+    such Gaussians at edges. Met in practice: UnityGaussianSplatting issue 14."""
     thin = 10 ** (-5 * severity)
     return [
         ordinary(g) | {"factors": (torch.linalg.qr(torch.randn(3, 3, generator=g))[0] * torch.tensor(sizes))[None]}
@@ -121,10 +117,8 @@ def pointlike(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def larger_than_the_scene(g: Generator, severity: float) -> list[Arguments]:
-    """Use Gaussians of size 10^3 to 10^7 (models allow no larger one), for which the 2D determinant overflows.
-
-    Met in practice: UnityGaussianSplatting issue 196.
-    """
+    """Use Gaussians of size 10^3 to 10^7 (models allow no larger one), for which the 2D determinant overflows. Met in
+    practice: UnityGaussianSplatting issue 196."""
     sizes = [10 ** (power * severity) for power in (3, 5, 7)]
     return [ordinary(g) | {"factors": size * torch.randn(1, 3, 3, generator=g)} for size in sizes]
 
@@ -148,10 +142,8 @@ def oblong_pixels(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection")
 def principal_point_outside(g: Generator, severity: float) -> list[Arguments]:
-    """Put the principal point ten image widths outside the image, as in crops.
-
-    A renderer that clamps x/z around the image centre is wrong here. Met in practice: gsplat issue 305.
-    """
+    """Put the principal point ten image widths outside the image, as in crops. A renderer that clamps x/z around the
+    image centre is wrong here. Met in practice: gsplat issue 305."""
     away, inputs = 10 * WIDTH * severity, ordinary(g)
     shift = away / FOCAL * DEPTH
     inputs["means"] = inputs["means"] - torch.tensor([shift, -shift, 0.0])
@@ -175,10 +167,8 @@ def beta_of_large_exponents(g: Generator, severity: float) -> list[Arguments]:
 
 @case("projection", **AT_A_LIMIT)
 def beta_at_the_rim(g: Generator, severity: float) -> list[Arguments]:
-    """Put pixel centres within rounding error of the rim r = 1 of Beta profiles, where log(1 - r^2) is infinite.
-
-    With these exponents alpha is below 1/255 at the rim, or within rounding error of it.
-    """
+    """Put pixel centres within rounding error of the rim r = 1 of Beta profiles, where log(1 - r^2) is infinite. With
+    these exponents alpha is below 1/255 at the rim, or within rounding error of it."""
     variance = 9 / (0.5 + 0.5 * severity)  # pixels^2; at severity 1 the rim is three pixels away
     inputs = on_a_pixel((variance - EPS2D) ** 0.5)
     return [inputs | {"beta_exponents": torch.tensor([shape])} for shape in (0.45, 1.0, 1e3)]
@@ -235,10 +225,8 @@ def equal_depths(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", **AT_A_LIMIT)
 def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
-    """Use alphas within rounding error of the cut-offs at 1/255 and 0.999.
-
-    In float32 a Gaussian at 1/255 may be skipped or not, which changes a pixel by at most 1/255.
-    """
+    """Use alphas within rounding error of the cut-offs at 1/255 and 0.999. In float32 a Gaussian at 1/255 may be
+    skipped or not, which changes a pixel by at most 1/255."""
     inputs = crowd(g, 3, 1.0)
     inputs["factors"] = 1e4 * torch.eye(3).repeat(3, 1, 1)  # constant over the image
     faint = torch.tensor([1 / 255]) * torch.tensor([1 - 2**-23, 1.0, 1 + 2**-22]) ** severity
@@ -252,10 +240,8 @@ def alpha_at_its_limits(g: Generator, severity: float) -> list[Arguments]:
 
 @case("blending", forward=1e-3, gradient=math.nan)
 def transmittance_at_the_stop(g: Generator, severity: float) -> list[Arguments]:
-    """Blend four Gaussians of alpha 0.9, so that the transmittance ends within rounding error of the limit 1e-4.
-
-    In float32 the fourth Gaussian may be skipped or not, which changes a pixel by at most 9e-4.
-    """
+    """Blend four Gaussians of alpha 0.9, so that the transmittance ends within rounding error of the limit 1e-4. In
+    float32 the fourth Gaussian may be skipped or not, which changes a pixel by at most 9e-4."""
     inputs = crowd(g, 6, 1.0)
     inputs["factors"] = 1e4 * torch.eye(3).repeat(6, 1, 1)
     return [inputs | {"opacities": torch.full((6,), 0.9 * severity + 0.5 * (1 - severity))}]
@@ -341,10 +327,8 @@ def together(arguments: Arguments) -> ImageTruth:
 
 
 def alone(arguments: Arguments) -> ImageTruth:
-    """Compute the exact image of one Gaussian and the exact gradients of the loss in mpmath.
-
-    The Gaussian has one colour channel with value 1, so that the image equals alpha.
-    """
+    """Compute the exact image of one Gaussian and the exact gradients of the loss in mpmath. The Gaussian has one
+    colour channel with value 1, so that the image equals alpha."""
     width, height = arguments["width"], arguments["height"]
     pixels = [(i + 0.5, j + 0.5) for j in range(height) for i in range(width)]
     names = [name for name in inputs_of(arguments) if name != "colors"]
@@ -393,10 +377,8 @@ def differentiate(
 
 def compare(arguments: Arguments, exact: ImageTruth, backend: str) -> tuple[float, float, float]:
     """Return the largest error of image and alpha, the largest error of gradients, and 1 if a value is not finite.
-
     Image errors are relative to the largest colour value, or to 1 if that is larger. Pixels within rounding error of a
-    threshold do not count.
-    """
+    threshold do not count."""
     image, alpha, decided, exact_gradients = exact
     weight, weight_alpha = (w * decided[..., None] for w in weights(arguments))
     try:

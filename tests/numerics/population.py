@@ -35,11 +35,8 @@ VERIFIED, VERIFIED_MOVING = 8, 2  # Gaussians that are computed in mpmath too
 
 @dataclass(frozen=True)
 class Hard:
-    """Raw parameters of 7D Gaussians with ill-conditioned covariance factors and means at the origin.
-
-    They are conditioned on time 0 and on a camera at the origin, so that direction and time are exactly 0, without
-    rounding.
-    """
+    """Raw parameters of 7D Gaussians with ill-conditioned covariance factors and means at the origin. They are
+    conditioned on time 0 and on a camera at the origin, so that direction and time are exactly 0, without rounding."""
 
     log_diagonal: Tensor  # [N, 7] float32
     off_diagonal: Tensor  # [N, 21] entries of the factor, row by row
@@ -80,10 +77,8 @@ def percentile(errors: Floats) -> float:
 
 
 def hard_slices(order: str, N: int, backends: list[str]) -> tuple[list[Cell], float]:
-    """Measure the errors of N slices of 7DGS whose factors have diagonal entries down to 1e-5.
-
-    Return a result for each scheme and backend, and the largest error of the truth against mpmath.
-    """
+    """Measure the errors of N slices of 7DGS whose factors have diagonal entries down to 1e-5. Return a result for each
+    scheme and backend, and the largest error of the truth against mpmath."""
     hard = draw(Generator().manual_seed(SEED), N, order)
     exact, cells = truth(hard, order), []
     for scheme in SCHEMES:
@@ -111,11 +106,9 @@ def hard_slices(order: str, N: int, backends: list[str]) -> tuple[list[Cell], fl
 
 
 def draw(generator: Generator, N: int, order: str, decades: Tensor | float = 5.0) -> Hard:
-    """Draw N random 7D Gaussians with ill-conditioned triangular factors.
-
-    Diagonal entries are 10^-u with u uniform in [0, decades], and entries below are standard normal. The direction and
-    time of the view are about one standard deviation from the means of the Gaussians.
-    """
+    """Draw N random 7D Gaussians with ill-conditioned triangular factors. Diagonal entries are 10^-u with u uniform in
+    [0, decades], and entries below are standard normal. The direction and time of the view are about one standard
+    deviation from the means of the Gaussians."""
     u = torch.rand(N, 7, generator=generator, dtype=torch.float64)
     log_diagonal = -(decades * u) * np.log(10.0)
     off_diagonal = torch.randn(N, 21, generator=generator, dtype=torch.float64)
@@ -146,10 +139,8 @@ def weights(N: int) -> tuple[Tensor, Tensor]:
 
 
 def truth(hard: Hard, order: str) -> PopulationTruth:
-    """Compute the exact conditional means and covariances, and the gradient of a loss, in float64.
-
-    The loss is w . mean / |mean| + <W, cov> / |cov| with the random `weights` w and W, and exact |mean| and |cov|.
-    """
+    """Compute the exact conditional means and covariances, and the gradient of a loss, in float64. The loss is w . mean
+    / |mean| + <W, cov> / |cov| with the random `weights` w and W, and exact |mean| and |cov|."""
     model, (w, W) = all_seen(order, "square_root", "reference").double(), weights(len(hard))
     double = Hard(*(x.double() for x in (hard.log_diagonal, hard.off_diagonal, hard.offset)))
     parts = [_differentiated(model, double, w, W, slice(i, i + CHUNK))[0] for i in range(0, len(hard), CHUNK)]
@@ -159,11 +150,8 @@ def truth(hard: Hard, order: str) -> PopulationTruth:
 def _differentiated(
     model: CholeskyModel, hard: Hard, w: Tensor, W: Tensor, rows: slice, exact: PopulationTruth | None = None
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Slice Gaussians `rows` in their type, relative to `exact`; None: to themselves.
-
-    Return means, covariances and gradients of the loss in float64, and which covariances are indefinite or whose
-    factors are not finite.
-    """
+    """Slice Gaussians `rows` in their type, relative to `exact`; None: to themselves. Return means, covariances and
+    gradients of the loss in float64, and which covariances are indefinite or whose factors are not finite."""
     some = hard.rows(rows)
     leaves = some.log_diagonal.clone().requires_grad_(), some.off_diagonal.clone().requires_grad_()
     raw = raw_parameters(Hard(*leaves, some.offset), model)
@@ -269,10 +257,8 @@ def raw_parameters(hard: Hard, model: CholeskyModel) -> dict[str, Tensor]:
 
 
 def moving_slices(name: str, N: int, backends: list[str]) -> tuple[list[Cell], float]:
-    """Measure the errors of N random slices of a model in float32.
-
-    Return a result for each backend, and the largest error of the truth against mpmath.
-    """
+    """Measure the errors of N random slices of a model in float32. Return a result for each backend, and the largest
+    error of the truth against mpmath."""
     observed, cells = draw_moving(Generator().manual_seed(SEED), name, N), []
     exact = moving_truth(observed)
     for backend in backends:
@@ -321,9 +307,7 @@ def verify_moving(observed: Observed) -> float:
 
 def draw_moving(g: Generator, model: str, N: int) -> Observed:
     """Draw N random Gaussians with sizes 10^-u, u uniform in [0, 5], about one size away from the time and direction.
-
-    In dGS, dBS and FreeTimeGS the lives and widths of view are 10^-v, v uniform in [-1, 2].
-    """
+    In dGS, dBS and FreeTimeGS the lives and widths of view are 10^-v, v uniform in [-1, 2]."""
     observed = ordinary(g, model, N)
     raw = observed.raw
 

@@ -222,10 +222,8 @@ def ordinary_gaussians(observed: Observed, severity: float, g: Generator) -> Non
 
 @hard(*JOINT)
 def diagonals_over_eight_decades(observed: Observed, severity: float, g: Generator) -> None:
-    """Use factors with diagonal entries from 1 to 1e-8: forming the covariance S squares the condition number.
-
-    The camera is on the means, so that the view direction is exactly 0 and only the factor is tested.
-    """
+    """Use factors with diagonal entries from 1 to 1e-8: forming the covariance S squares the condition number. The
+    camera is on the means, so that the view direction is exactly 0 and only the factor is tested."""
     raw, logs = observed.raw, all_sizes(observed)
     logs[:] = -8 * LN_10 * severity * torch.rand(logs.shape, generator=g)
     if observed.model == "4dgs":
@@ -242,10 +240,8 @@ def diagonals_over_eight_decades(observed: Observed, severity: float, g: Generat
 
 @hard(*TRIANGULAR)
 def narrow_in_direction(observed: Observed, severity: float, g: Generator) -> None:
-    """Use Gaussians that are visible from a range of directions 10^-3 wide, such as highlights.
-
-    Float32 stores a unit direction to 6e-8, which is 6e-5 of this width; no algorithm can be more exact.
-    """
+    """Use Gaussians that are visible from a range of directions 10^-3 wide, such as highlights. Float32 stores a unit
+    direction to 6e-8, which is 6e-5 of this width; no algorithm can be more exact."""
     width = 10 ** (-3 * severity)
     sizes(observed, "d")[:] = -3 * LN_10 * severity
     set_below(observed, "d", times=width)
@@ -254,10 +250,8 @@ def narrow_in_direction(observed: Observed, severity: float, g: Generator) -> No
 
 @hard(*JOINT)
 def nearly_certain(observed: Observed, severity: float, g: Generator) -> None:
-    """Correlate position with time or direction to 1 - 1e-12, so that the subtraction S_pp - K S_qp cancels.
-
-    The difference of these nearly equal matrices is the conditional covariance.
-    """
+    """Correlate position with time or direction to 1 - 1e-12, so that the subtraction S_pp - K S_qp cancels. The
+    difference of these nearly equal matrices is the conditional covariance."""
     thin = -severity * 0.5 * math.log(5e11)  # sqrt(1 - rho^2) = sqrt(2e-12)
     if observed.model == "4dgs":
         half = math.pi / 8  # left and right rotations of 22.5 degrees turn z into t by 45
@@ -272,9 +266,7 @@ def nearly_certain(observed: Observed, severity: float, g: Generator) -> None:
 @hard(*TIME_LIKE)
 def instant(observed: Observed, severity: float, g: Generator) -> None:
     """Use Gaussians with nearly no extent in time (log sigma_t = -80), as 4DGS learns for single frames of a video.
-
-    Half of the Gaussians have their mean exactly at the rendered time.
-    """
+    Half of the Gaussians have their mean exactly at the rendered time."""
     upright(observed)
     sizes(observed, "t")[:] = -80 * severity
     observed.raw["times"][::2] = single(observed.time)
@@ -290,10 +282,8 @@ def static(observed: Observed, severity: float, g: Generator) -> None:
 
 @hard(*JOINT)
 def far_from_the_query(observed: Observed, severity: float, g: Generator) -> None:
-    """Use Gaussians whose mean time and direction are 10^3 standard deviations away from those of the view.
-
-    The opacity must underflow to 0 with gradient 0, not to 0 x inf = NaN. Met in practice: 4DGaussians issue 35.
-    """
+    """Use Gaussians whose mean time and direction are 10^3 standard deviations away from those of the view. The opacity
+    must underflow to 0 with gradient 0, not to 0 x inf = NaN. Met in practice: 4DGaussians issue 35."""
     if observed.model == "4dgs":
         upright(observed)
     for name, variable in (("times", "t"), ("directions", "d")):
@@ -304,19 +294,15 @@ def far_from_the_query(observed: Observed, severity: float, g: Generator) -> Non
 
 @hard(*JOINT)
 def insensitive(observed: Observed, severity: float, g: Generator) -> None:
-    """Let lambda go to 0: opacity no longer depends on time and direction, and only the mean does.
-
-    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
-    """
+    """Let lambda go to 0: opacity no longer depends on time and direction, and only the mean does. Lambda is the
+    coefficient in the exponent by which opacity decreases with the distance in time or direction."""
     observed.log_lambda = dict.fromkeys(observed.log_lambda, -110.0 * severity)  # exp(-110) is 0 in float32
 
 
 @hard(*JOINT)
 def oversensitive(observed: Observed, severity: float, g: Generator) -> None:
     """Set lambda to 10^4, as when training increases lambda without bound: opacity is 0 except near mu_t and mu_d.
-
-    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
-    """
+    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction."""
     observed.log_lambda = dict.fromkeys(observed.log_lambda, 4 * LN_10 * severity)
     near = 0.3 * 10 ** (-2 * severity)
     if observed.has_sphere:
@@ -336,10 +322,8 @@ def on_a_mean(observed: Observed, severity: float, g: Generator) -> None:
 
 @hard(*JOINT)
 def camera_on_a_mean(observed: Observed, severity: float, g: Generator) -> None:
-    """Put the camera on a mean or up to 1e-3 away: a view direction of 0/0 must become 0.
-
-    This happens in walk-throughs and in SLAM.
-    """
+    """Put the camera on a mean or up to 1e-3 away: a view direction of 0/0 must become 0. This happens in walk-throughs
+    and in SLAM."""
     on_a_mean(observed, severity, g)
 
 
@@ -395,11 +379,8 @@ def far_from_time_and_direction(observed: Observed, severity: float, g: Generato
 
 @hard("freetime", "dgs", "dbs", "ubs")
 def short_life(observed: Observed, severity: float, g: Generator) -> None:
-    """Use lives of 1e-7, the shortest, at 0 to 10^3 lives from the mean time.
-
-    In dGS the mean time is a sigmoid, which float32 rounds to 3e-8, and the mean moves by this over the square of the
-    life. So lives are 10^-2 there.
-    """
+    """Use lives of 1e-7, the shortest, at 0 to 10^3 lives from the mean time. In dGS the mean time is a sigmoid, which
+    float32 rounds to 3e-8, and the mean moves by this over the square of the life. So lives are 10^-2 there."""
     decades = (2 if observed.model == "dgs" else 7) * severity
     set_life(observed, -decades * LN_10)
     set_times(observed, observed.time + 10**-decades * torch.tensor([0.0, 0.5, -1.0, 1e3 * severity]))
@@ -421,9 +402,7 @@ def flat_and_huge(observed: Observed, severity: float, g: Generator) -> None:
 @hard("dgs", "ubs", "dbs", "dgs_interpolated")
 def strong_coupling(observed: Observed, severity: float, g: Generator) -> None:
     """Let means move by 10^2 of their size with time and direction; in UBS these then nearly determine the position.
-
-    With that the conditional covariance of UBS is a small remainder of the covariance.
-    """
+    With that the conditional covariance of UBS is a small remainder of the covariance."""
     raw, times, near = observed.raw, 10 ** (2 * severity), observed.towards()
     raw["directions"] = near + (raw["directions"] - near) / (3 * times if observed.model != "ubs" else 1)
     if "betas" in raw:
@@ -460,9 +439,7 @@ def opacity_at_its_limit(observed: Observed, severity: float, g: Generator) -> N
 @hard("dbs", "ubs")
 def exponents_at_their_limits(observed: Observed, severity: float, g: Generator) -> None:
     """Use the largest exponents b = 4 e^16 at distances of 1e-4, the least, and b just below 4, where motion is full.
-
-    Large exponents multiply ln(1 - tanh y^2) of small y, which must not lose digits.
-    """
+    Large exponents multiply ln(1 - tanh y^2) of small y, which must not lose digits."""
     logs = severity * torch.tensor([80.0, -80.0, -1e-4, 5.0])
     observed.raw["betas"] = logs[:, None] + (1 - severity) * observed.raw["betas"]
     observed.raw["betas"][:, 0] *= torch.tensor([1.0, 1.0, -1.0, -1.0])
@@ -541,11 +518,9 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES, cop
 
 
 def truth(observed: Observed) -> SliceTruth:
-    """Compute exact conditional Gaussians in mpmath, and the exact gradient of a loss.
-
-    The loss is a random weighted sum of mean, covariance and opacity; mean and covariance are divided by their size. If
-    a Gaussian is too faint to be rendered, only its opacity counts.
-    """
+    """Compute exact conditional Gaussians in mpmath, and the exact gradient of a loss. The loss is a random weighted
+    sum of mean, covariance and opacity; mean and covariance are divided by their size. If a Gaussian is too faint to be
+    rendered, only its opacity counts."""
     function = exact_slice(observed)
     rows = torch.cat([value.reshape(len(value), -1) for value in observed.raw.values()], 1).tolist()
     points = [[*x, *mean] for x, mean in zip(rows, observed.raw["means"].tolist(), strict=True)]
@@ -571,11 +546,8 @@ def weights_of(outputs: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def exact_slice(observed: Observed) -> oracle.Function:
-    """Return the mpmath function from the raw parameters of a Gaussian to its conditional 3D Gaussian.
-
-    The time and the learned coefficients lambda_t and lambda_d are rounded to float32, because the models get them in
-    float32.
-    """
+    """Return the mpmath function from the raw parameters of a Gaussian to its conditional 3D Gaussian. The time and the
+    learned coefficients lambda_t and lambda_d are rounded to float32, because the models get them in float32."""
     layout = {name: value[0].numel() for name, value in observed.raw.items()}
     time: float | None = single(observed.time)
     options: dict[str, Any] = OPTIONS.get(observed.model, {})
@@ -604,10 +576,8 @@ def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tupl
 def differentiate(
     model: GaussianModel, raw: dict[str, Tensor], observed: Observed, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Compute conditional 3D Gaussians in the type of `raw`, and the gradients of raw parameters; both as float64.
-
-    The outputs are those of `SliceTruth`. The gradients are [N, parameters].
-    """
+    """Compute conditional 3D Gaussians in the type of `raw`, and the gradients of raw parameters; both as float64. The
+    outputs are those of `SliceTruth`. The gradients are [N, parameters]."""
     device = device_of(model.backend.name)
     there = {name: value.to(device) for name, value in raw.items()}
     moment = torch.tensor(observed.time).to(there["means"]) if "time" in model.observes else None
@@ -633,11 +603,8 @@ def compare(outputs: Tensor, gradient: Tensor, exact: SliceTruth) -> SliceErrors
 
 @torch.no_grad()
 def indefinite(model: GaussianModel, raw: dict[str, Tensor]) -> Tensor:
-    """Return which conditional covariances [N] have a negative eigenvalue or are not finite.
-
-    The scheme `square_root` returns a factor F of the covariance F F^T, which has no negative eigenvalue, as models
-    without schemes do.
-    """
+    """Return which conditional covariances [N] have a negative eigenvalue or are not finite. The scheme `square_root`
+    returns a factor F of the covariance F F^T, which has no negative eigenvalue, as models without schemes do."""
     scheme = str(getattr(model, "scheme", "square_root"))
     if scheme == "square_root":
         return torch.zeros(len(raw["means"]), dtype=torch.bool)

@@ -19,11 +19,9 @@ LONG |= {"faint_crowd"}
 
 @pytest.mark.timeout(900)
 def test_the_short_audit_passes(tmp_path, monkeypatch, capsys):
-    """Catches a default that loses digits, is not finite or leaks a gradient in a hard case, in any backend.
-
-    Det of a splat of 10^9 pixels overflowed, a gradient of a static 4DGS was off by 95 %, a NaN in a photograph was
-    trained on. The cells that are over their bound are printed. The drift of one training is in it.
-    """
+    """Catches a default that loses digits, is not finite or leaks a gradient in a hard case, in any backend. Det of a
+    splat of 10^9 pixels overflowed, a gradient of a static 4DGS was off by 95 %, a NaN in a photograph was trained on.
+    The cells that are over their bound are printed. The drift of one training is in it."""
     results, run = [], audit.run
     monkeypatch.setattr(audit, "run", lambda **words: results.append(run(**words)) or results[0])
     assert command.main(["--short", "--out", str(tmp_path / "none")]) == 0, capsys.readouterr().out
@@ -77,10 +75,8 @@ def test_page_and_exit_code(
     monkeypatch,
     capsys,
 ):
-    """Catches a default over its bound, NaN included, that is not marked or ends in 0; others may break theirs.
-
-    Also a short audit that does not say where to look, and a page without its table, figures or machine.
-    """
+    """Catches a default over its bound, NaN included, that is not marked or ends in 0; others may break theirs. Also a
+    short audit that does not say where to look, and a page without its table, figures or machine."""
     monkeypatch.setattr(audit, "run", lambda **_: audit.Audit(["cpu"], [cell(scheme, forward)]))
     assert command.main(["--out", str(tmp_path)]) == code
     text = (tmp_path / "page.md").read_text()
@@ -124,10 +120,8 @@ def test_every_case_has_a_reason_and_a_judge():
 
 @pytest.mark.parametrize(("spread", "holds"), [(0.0, False), (0.1, False), (1.0, True)])
 def test_drift_is_that_of_the_worst_seed(spread, holds, monkeypatch):
-    """Catches a drift on training views, of one seed, or averaged over seeds until it is small.
-
-    It is excused if small changes of the start values move both kinds of trainings as far, and only then.
-    """
+    """Catches a drift on training views, of one seed, or averaged over seeds until it is small. It is excused if small
+    changes of the start values move both kinds of trainings as far, and only then."""
     gaps, shaken = {0: 0.001, 1: -0.5, 2: 0.002}, []
 
     class Fitted:

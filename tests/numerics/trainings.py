@@ -105,10 +105,8 @@ def reset_into_refinement(g: Generator, severity: float, model: str) -> Training
 
 @case("training", "6dgs", "7dgs", **ENDS)
 def lambda_switched_on(g: Generator, severity: float, model: str) -> Training:
-    """Start to train lambda halfway at 1000 times the usual rate, so that lambda goes to 0 or infinity.
-
-    Lambda is the coefficient in the exponent by which opacity decreases with the distance in time or direction.
-    """
+    """Start to train lambda halfway at 1000 times the usual rate, so that lambda goes to 0 or infinity. Lambda is the
+    coefficient in the exponent by which opacity decreases with the distance in time or direction."""
     config = compose(model, STEPS, "train.lambda_from=15000")
     config.model.lr["lambda"].start = 1e-3 * 1000**severity
     return Training(model, config, moving_square())
@@ -140,9 +138,7 @@ def single_against_double(
     g: Generator, severity: float, model: str, run_seed: int = 0, steps: int = DRIFT_STEPS
 ) -> Training:
     """Train 150 steps of the embedded scene suzanne at 40 x 40 pixels in float32 and in float64, and compare PSNR.
-
-    Rounding may decide which Gaussians are split. The error is the difference in dB. `--long` trains 300 steps.
-    """
+    Rounding may decide which Gaussians are split. The error is the difference in dB. `--long` trains 300 steps."""
     config = compose(
         model,
         steps,
@@ -176,13 +172,11 @@ def judge(case: Case, backend: str, **more: Any) -> Iterator[Cell]:
 
 def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -> Iterator[Cell]:
     """Yield, for each model, the difference in test PSNR of float32 and float64 training that is nearest to its bound.
-
     There is one difference for each seed. The float64 training uses the torch implementation. Some trainings amplify
     every rounding, for example if it decides which Gaussians are split. So where the difference exceeds the bound, both
     are trained again from start values that are changed by at most SHAKE, and the difference is that of the means. Its
     bound is then the largest difference of the means that chance explains (Student's t, 1 % for all seeds of a model
-    together).
-    """
+    together)."""
     for name in case.subjects:
         drifts, notes, bad, ms = [(0.0, case.bound.forward)], [], 0.0, 0.0
         for seed in seeds:

@@ -26,10 +26,8 @@ pytestmark = pytest.mark.skipif(not kernels.available(), reason="the kernels are
 
 
 def images(arguments: dict[str, Any], noise: float = 0.0, seed: int = 0) -> tuple[Tensor, ExactImage, Tensor]:
-    """The image in float32, the exact one, and that of the reference in float64.
-
-    With noise, float32 has other Gaussians than float64, as after slicing: numbers differ by this part of them.
-    """
+    """The image in float32, the exact one, and that of the reference in float64. With noise, float32 has other
+    Gaussians than float64, as after slicing: numbers differ by this part of them."""
     rest = {name: value for name, value in arguments.items() if name not in NAMES}
     viewmats, Ks, width, height = (rest.pop(name) for name in ("viewmats", "Ks", "width", "height"))
     single = tuple(arguments.get(name) for name in NAMES)

@@ -200,10 +200,8 @@ def test_gradients_at_the_rim_are_held(shape):
 
 @pytest.mark.usefixtures("threads")
 def test_same_bits_twice():
-    """Catches sums whose order depends on the threads, in the picture and in every gradient.
-
-    Large enough that torch runs its scatters in parallel: with 2 threads `table[index]` failed this.
-    """
+    """Catches sums whose order depends on the threads, in the picture and in every gradient. Large enough that torch
+    runs its scatters in parallel: with 2 threads `table[index]` failed this."""
     a = gaussians(torch.Generator().manual_seed(0), 1500, size=0.05) | camera(64, 64)
     a, runs = {k: v.float() if isinstance(v, Tensor) else v for k, v in a.items()}, []
     torch.set_num_threads(2)

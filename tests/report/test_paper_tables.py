@@ -48,10 +48,8 @@ def all_scenes(model: str) -> list[Record]:
 
 
 def test_the_difference_is_of_like_with_like():
-    """Would catch a delta of the wrong sign, of another row, or one of seconds on two machines.
-
-    Seeds of 30 and 31 dB have mean 30.5 and, by t with one degree of freedom, half an interval of 12.706 x 0.5.
-    """
+    """Would catch a delta of the wrong sign, of another row, or one of seconds on two machines. Seeds of 30 and 31 dB
+    have mean 30.5 and, by t with one degree of freedom, half an interval of 12.706 x 0.5."""
     runs = [at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0)]
     line = first_table(*runs).iloc[0]
     expected = {
@@ -272,9 +270,7 @@ def test_the_mean_without_lego_is_beside_the_rows_that_lack_lego():
 
 def test_a_row_of_a_successor_has_one_protocol_and_names_it():
     """Would catch runs of two protocols averaged as seeds, one without its protocol, and a trial on val as a result.
-
-    Also images of one size kept apart, because one folder has them at twice that size.
-    """
+    Also images of one size kept apart, because one folder has them at twice that size."""
     rows = successors(
         results(
             at_paper("dgs", seed=0, psnr=30.0),

@@ -98,10 +98,8 @@ def test_models_that_share_no_scene_are_no_pair_and_a_tie_has_no_winner():
 
 
 def test_all_comparisons_of_a_report_are_corrected_together():
-    """Catches sections that correct for their own comparisons: the best model in a budget is ahead, the pair is not.
-
-    A difference that two sections ask for, with either sign, counts once.
-    """
+    """Catches sections that correct for their own comparisons: the best model in a budget is ahead, the pair is not. A
+    difference that two sections ask for, with either sign, counts once."""
     random = np.random.default_rng(3)
     runs = []
     for of in frontier(("7dgs",), ("suzanne",), 3, (1000,)):

@@ -219,10 +219,8 @@ def test_a_run_is_trained_anywhere_and_exported_in_the_users_coordinates(tmp_pat
 
 @pytest.mark.parametrize("near", [None, 1.0, 300.0, 500.0, 600.0])
 def test_a_near_plane_is_in_the_users_units(near, tmp_path):
-    """Catches a near plane in units of the training, and a training, a measurement or a loaded run without it.
-
-    The cameras are at 400 from the square, whose half size is 150. Few of the initial points are farther than 500.
-    """
+    """Catches a near plane in units of the training, and a training, a measurement or a loaded run without it. The
+    cameras are at 400 from the square, whose half size is 150. Few of the initial points are farther than 500."""
     data = moved_square(tmp_path / "data", 100.0, (0.0, 0.0, 0.0))
     words = overrides(data, tmp_path / "r", "model=3dgs", "train.iterations=5", f"data.near={near or 'null'}")
     record, folder = run_here(*words)

@@ -97,9 +97,7 @@ def write_ply(path: Path, spread: float = 1.0, count: int = 10) -> Path:
 
 def test_a_run_is_measured_in_its_test_views(run, capsys):
     """Catches other views than those of the record, another PSNR than it, and an error that its bound does not hold.
-
-    Also a picture that --json writes into the run's folder, which may be read-only, and one that is missing.
-    """
+    Also a picture that --json writes into the run's folder, which may be read-only, and one that is missing."""
     (run / "exactness.png").unlink(missing_ok=True)
     content = set(run.iterdir())
     assert main([str(run), "--json"]) == 0
@@ -142,9 +140,7 @@ def centers(subject: Subject) -> torch.Tensor:
 
 def test_an_orbit_is_a_full_circle_at_a_moment_each(run, monkeypatch):
     """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out.
-
-    Also an orbit of another size or middle, one of a PLY without extent, and a PLY seen otherwise than by itself.
-    """
+    Also an orbit of another size or middle, one of a PLY without extent, and a PLY seen otherwise than by itself."""
     ply = stability.load(write_ply(run / "a.ply"), run)
     assert {(shot.camera.width, shot.camera.height, shot.time) for shot in ply.shots} == {(400, 400, None)}
     assert (ply.model.active.sh_degree, ply.background, ply.antialias) == (3, BLACK, False)
@@ -346,10 +342,8 @@ def with_factors(log_diagonal: Sequence[float], motion: float = 0.0, shape: floa
 
 
 def test_condition_numbers():
-    """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too.
-
-    Also a share of indefinite covariances by the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3.
-    """
+    """Catches condition numbers of something else than the factor: a diagonal one has max / min, in space too. Also a
+    share of indefinite covariances by the largest eigenvalue: in float32 a slice of 1e-5 is lost beside 1e3."""
     plain = float32_error.conditioning(with_factors([0.0, 0.0, 0.0, 3.0, -1.0, -2.0, -3.0]))
     for numbers, decades in zip(plain.condition_numbers.values(), (6, 2), strict=True):
         assert numbers == pytest.approx([math.exp(decades)] * len(float32_error.PERCENTILES))

@@ -43,11 +43,9 @@ def comparable_state(results: Path) -> object:
 
 
 def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square, tmp_path):
-    """Catches anything that the next step depends on and the checkpoint lacks: SIGKILL twice, at no chosen moment.
-
-    The model has everything there is to lose: AGR, moments of cloned and split Gaussians, statistics of density
-    control, the order of views, trained lambdas.
-    """
+    """Catches anything that the next step depends on and the checkpoint lacks: SIGKILL twice, at no chosen moment. The
+    model has everything there is to lose: AGR, moments of cloned and split Gaussians, statistics of density control,
+    the order of views, trained lambdas."""
     whole, _ = run_here(*overrides(square, tmp_path / "whole", *RUN))
     broken, words, step = tmp_path / "broken", overrides(square, tmp_path / "broken", *RUN), 0
     for _ in range(2):
@@ -100,9 +98,7 @@ def test_a_training_continues_from_its_state(start, step):
 
 def test_every_key_of_a_state_is_reproduced_or_a_time(square, tmp_path):
     """Catches a new key of the state that nobody sorted: seconds among what must be equal failed every comparison once.
-
-    Gates are in the state too, and measure times of their own.
-    """
+    Gates are in the state too, and measure times of their own."""
     words = (*RUN, "effects.gate=end", "effects.budget_db=10")
     for name in ("one", "two"):
         run_here(*overrides(square, tmp_path / name, *words))

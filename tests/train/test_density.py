@@ -46,10 +46,8 @@ def densified(control: GradientDensification, most: int = 100, has_reset: bool =
 
 
 def test_density_control_clones_small_splits_large_prunes_faint():
-    """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures.
-
-    Also a clone or a child that goes on with its parent's momentum.
-    """
+    """Catches a wrong criterion or count of any of the three, and a gradient in pixels instead of half pictures. Also a
+    clone or a child that goes on with its parent's momentum."""
     model, optimizer, control = control_of(6)
     with torch.no_grad():
         model.splats["scales"][3:5] = math.log(0.1)  # large

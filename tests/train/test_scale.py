@@ -27,10 +27,8 @@ def larger(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_larger_scene_trains_alike(name):
-    """Catches a rate in world units without the extent, a rate of time with it, and networks that read metres.
-
-    AGR acts and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte.
-    """
+    """Catches a rate in world units without the extent, a rate of time with it, and networks that read metres. AGR acts
+    and Gaussians are cloned and split in these 40 steps; docs/protocol.md has 1,000 on moving-matte."""
     # What turns a sphere is a rounding, of which Adam makes a step: 3DGS starts from spheres, and is not turned here.
     still = ["model.lr.quats={start: 0, end: null}"] if name == "3dgs" else []
     scene = moving_square()

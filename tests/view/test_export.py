@@ -167,9 +167,7 @@ def test_a_clip_that_fails_leaves_nothing(
     capsys,
 ):
     """Catches a short clip that looks like a whole one, a folder of the user's that is removed, and a time not named.
-
-    Without a failure of the disk the model fades out at the end.
-    """
+    Without a failure of the disk the model fades out at the end."""
     calls = []
 
     def failing(trained: TrainedGaussians) -> bytes:

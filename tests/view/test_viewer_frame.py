@@ -88,9 +88,7 @@ def test_a_frame_is_the_models_image(agr):
 
 def test_settings_are_those_of_one_frame(agr):
     """Catches AGR, a degree or a viewpoint without effect, or that the next frame still has, or that training had not.
-
-    A frozen viewpoint slices from there and draws from here.
-    """
+    A frozen viewpoint slices from there and draws from here."""
     here, there = camera_of(0.5, agr), camera_of(2.0, agr)
     plain = agr.render(here, NOW).image
     gaussians = agr.run.model.slice(CameraTime.at(there.center, 0.4))
