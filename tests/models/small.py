@@ -147,6 +147,18 @@ def with_effect_sets(model: GaussianModel, refined: int, conditioned: int) -> Ga
     return model
 
 
+class Moments:
+    """Moments of an optimizer that note the rows to follow, and which of them are fresh."""
+
+    rows = fresh = torch.empty(0)
+
+    def reindex(self, rows: Tensor, fresh: Tensor) -> None:
+        self.rows, self.fresh = rows, fresh
+
+    def forget(self, parameter: Tensor) -> None:
+        raise AssertionError(parameter)
+
+
 class Balls(GaussianModel):
     """Balls, as docs/adding_a_model.md has them, without gates."""
 

@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from small import CAMERA, NAMES, fresh, joint, lively
+from small import CAMERA, NAMES, Moments, fresh, joint, lively
 from test_equations import conditioned
-from torch import nn
 
 from gsbench.kernels.headers import ALPHA_MIN
 from gsbench.models import CameraTime, registry
@@ -93,20 +92,6 @@ def test_lifetimes_are_held(name):
         assert not changed[1::2].any()
 
 
-class Moments:
-    """Moments that note which rows they were told to follow."""
-
-    def __init__(self) -> None:
-        self.rows = torch.empty(0)
-
-    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
-        assert not fresh.any()
-        self.rows = rows
-
-    def forget(self, parameter: nn.Parameter) -> None:
-        raise AssertionError(parameter)
-
-
 def test_rows_are_sorted_by_when_they_can_be_visible():
     """Catches rows in another order, moments that stay where they were, rows of equal intervals that swap, and a sort
     that mixes static Gaussians among those that change with time."""
@@ -122,6 +107,7 @@ def test_rows_are_sorted_by_when_they_can_be_visible():
     model.effect_sets = None
     Rows(model, moments).sort_by_time()
     assert torch.equal(model.splats["means"], before[moments.rows])
+    assert not moments.fresh.any()
     intervals = model.visible_intervals()
     bins = (intervals[:, 0] * START_BINS).floor()
     assert torch.equal(bins, bins.sort().values)

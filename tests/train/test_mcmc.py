@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from models.small import CAMERA, moved, started
+from models.small import CAMERA, Moments, moved, started
 
 from gsbench.config import DensifyConfig
 from gsbench.models import CameraTime, GaussianModel, build
@@ -23,16 +23,6 @@ OPTIONS = {
     "dgs": {},
     "freetime": {},
 }
-
-
-class Moments:
-    """Moments that note which rows are fresh."""
-
-    def reindex(self, rows: torch.Tensor, fresh: torch.Tensor) -> None:
-        self.rows, self.fresh = rows, fresh
-
-    def forget(self, parameter: torch.Tensor) -> None:
-        raise AssertionError(parameter)
 
 
 def rule(model: GaussianModel, noise: float = 0.0) -> tuple[MCMCDensification, Moments]:

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 from interrupted import assert_same_bits
-from models.small import started
-from test_mcmc import OPTIONS, Moments
+from models.small import Moments, started
+from test_mcmc import OPTIONS
 from tiny_training import moving_square, train, trainer
 
 from gsbench.config import DensifyConfig

@@ -3,8 +3,8 @@
 import pytest
 import torch
 from interrupted import assert_resumes
-from models.small import moved, started
-from test_mcmc import OPTIONS, Moments
+from models.small import Moments, moved, started
+from test_mcmc import OPTIONS
 from tiny_training import train, trainer
 
 from gsbench.config import DensifyConfig
