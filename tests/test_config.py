@@ -124,7 +124,7 @@ def test_where_a_run_lies_and_how_it_is_launched_changes_nothing():
     }
     assert by_role["launching"] == {"results", "resume", "log", *(name for name in KEYS if name.startswith("launch."))}
     assert by_role["measuring"] - {name for name in KEYS if name.startswith("protocol.")} == {
-        *("experiment", "data.dataset", "data.paper_dataset"),
+        *("experiment", "data.dataset", "data.paper_dataset")
     }
 
 

@@ -88,11 +88,7 @@ AUTHORS_RATES = {
         },
         (10_000, 500, 50_000, 100),
     ),
-    "stg": (
-        {"path": 1.75 * 8e-4, "times": 1e-4, "turns": 1e-4, "durations": 3e-2, "scales": 1.5e-3},
-        {},
-        None,
-    ),
+    "stg": ({"path": 1.75 * 8e-4, "times": 1e-4, "turns": 1e-4, "durations": 3e-2, "scales": 1.5e-3}, {}, None),
     "ex4dgs": (
         {"velocities": 1e-4, "key_quats": 1e-3, "windows": 1e-3, "fades": 1e-4, "quats": 1e-5, "scales": 5e-3}
         | {"key_means": 8e-4},

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from html import unescape
@@ -33,9 +34,12 @@ def test_a_page_is_what_code_and_records_say(page):
 DEARER = {"train_cpu_s": 1000.0, "render_ms": RenderTimes(0.0, 100.0, 200.0)}
 
 
-def copied(to: Path, name: str, change: Callable[[Record], Record] = lambda record: record) -> None:
+PUBLISHED = ROOT / "results" / "published"
+
+
+def changed(to: Path, name: str, change: Callable[[Record], Record]) -> None:
     """Write a published study elsewhere, with changed records."""
-    records, faults = study.read(ROOT / "results" / "published" / name)
+    records, faults = study.read(PUBLISHED / name)
     assert not faults
     study.write(map(change, records), to / name)
     blocks.study.cache_clear()
@@ -62,13 +66,13 @@ def prices_of_a_field(published: Path) -> list[float]:
 def test_the_tables_follow_from_the_records(tmp_path):
     """Catches a best model, a price or a loss of choosing another one that stays when the records change."""
     for name in ("frontier", "suite", "dnerf100", "compare100"):
-        copied(tmp_path, name)
+        shutil.copytree(PUBLISHED / name, tmp_path / name)
     before, prices = blocks.choices(tmp_path), prices_of_a_field(tmp_path)
     assert row_of(blocks.cost(tmp_path), "4,000")[5].startswith("**28.32**")
-    copied(tmp_path, "frontier", lambda r: better(r, 20 * ((r.model, r.variant) == ("3dgs", "iterations=4000"))))
+    changed(tmp_path, "frontier", lambda r: better(r, 20 * ((r.model, r.variant) == ("3dgs", "iterations=4000"))))
     assert row_of(blocks.cost(tmp_path), "4,000")[1].startswith("**37.27**")
-    copied(tmp_path, "dnerf100", lambda r: but(better(r, 2.0), cost=DEARER) if r.model == "hexplane" else r)
-    copied(tmp_path, "suite", lambda r: better(r, 20 * ((r.scene, r.model, r.variant) == ("suzanne", "3dgs", ""))))
+    changed(tmp_path, "dnerf100", lambda r: but(better(r, 2.0), cost=DEARER) if r.model == "hexplane" else r)
+    changed(tmp_path, "suite", lambda r: better(r, 20 * ((r.scene, r.model, r.variant) == ("suzanne", "3dgs", ""))))
     assert row_of(blocks.suite_kinds(tmp_path), "direction: `6dgs` - `3dgs`")[2].startswith("-3.48 ±")  # -0.14 - 20 / 6
     of_7dgs = [row_of(text, "7DGS") for text in (before, blocks.choices(tmp_path))]
     lost, of_dnerf = ([float(row[i].split(",")[0]) for row in of_7dgs] for i in (1, 3))

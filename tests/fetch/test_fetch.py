@@ -189,14 +189,7 @@ def test_an_archive_is_unpacked_and_its_scenes_named(mode, address, tmp_path, mo
         (zipped({"a": bytes(100)}, method=zipfile.ZIP_LZMA).replace(b"\5\0]", b"\5\0\xff"), "expected a zip"),
     ],
 )
-def test_a_hostile_or_damaged_archive_is_refused(
-    archive,
-    message,
-    address,
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
+def test_a_hostile_or_damaged_archive_is_refused(archive, message, address, tmp_path, monkeypatch, capsys):
     """Catches a file that is written beside the folder, and half a data set in it."""
     Handler.files["dnerf.zip"] = archive
     assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
@@ -261,8 +254,7 @@ def test_what_a_mirror_lacks_is_fetched_by_hand(address, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    ("words", "error"),
-    [([], "expected a NAME, or --list"), (["dnerf", "--json"], "--json: expected --list beside it")],
+    ("words", "error"), [([], "expected a NAME, or --list"), (["dnerf", "--json"], "--json: expected --list beside it")]
 )
 def test_a_command_without_sense_is_refused(words, error, capsys):
     """Catches a command that does nothing and ends as a success, and a usage that names no module."""

@@ -3,6 +3,7 @@
 This module alone knows which function of gsbench gives a golden: whoever moves a function changes a line here.
 """
 
+import functools
 import hashlib
 import math
 import re
@@ -20,6 +21,7 @@ from gsbench.report.sections import built
 from gsbench.train import checkpoint
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "results" / "published"
+load = functools.cache(lambda study: frame.load(PUBLISHED / study))
 Numbers = dict[str, float]  # by "table/row/column"
 WORDS = {"yes": 1.0, "no": 0.0, "unknown": math.nan, "agrees": 1.0, "undecided": 0.0, "differs": -1.0}
 # The columns that name a row of a table; other texts than WORDS are free.
@@ -47,7 +49,7 @@ def numbers(name: str, table: pd.DataFrame) -> Numbers:
 
 def page(study: str) -> Numbers:
     """The tables of all sections of a report."""
-    results = frame.load(PUBLISHED / study)
+    results = load(study)
     assert not results.faults
     return {
         f"{chapter.runs.dataset.iloc[0]}/{key}": value
@@ -60,13 +62,13 @@ def page(study: str) -> Numbers:
 
 def paper(study: str) -> Numbers:
     """The lines of the CSV files of Table 1, Table 2 and the successors."""
-    tables = paper_tables.numbers(frame.load(PUBLISHED / study))
+    tables = paper_tables.numbers(load(study))
     return {key: value for name, table in tables.items() for key, value in numbers(name, table).items()}
 
 
 def against(study: str, seeds: Sequence[int], others: Sequence[int]) -> Numbers:
     """The comparison (`--against`) of some seeds of a study with others."""
-    results = frame.load(PUBLISHED / study)
+    results = load(study)
     compared = reproduction.compare(*(results.of(results.runs.seed.isin(which)) for which in (seeds, others)))
     return {"verdict": WORDS[compared.verdict]} | numbers("rows", compared.table)
 

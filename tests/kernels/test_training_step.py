@@ -99,15 +99,7 @@ def launched(fitted: Training) -> Training:
         ("7dgs", (), 13, 38, 17),
     ],
 )
-def test_calls_of_a_step(
-    model,
-    options,
-    kernels,
-    operations,
-    repeated,
-    start,
-    monkeypatch,
-):
+def test_calls_of_a_step(model, options, kernels, operations, repeated, start, monkeypatch):
     """Catches a change after which a step of four views launches more, or a repeated one more outside of its graphs:
     each call takes a GPU at least two microseconds, and Python five; and a value that the CPU waits for."""
     called, call = Counter[str](), CudaLibrary.call

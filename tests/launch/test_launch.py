@@ -135,15 +135,7 @@ def test_plans_are_read_oldest_first(tmp_path):
         (InputError("no scene"), "no scene", True, False),
     ],
 )
-def test_a_run_that_raises_ends_with_a_reason(
-    error,
-    reason,
-    is_refused,
-    traces,
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
+def test_a_run_that_raises_ends_with_a_reason(error, reason, is_refused, traces, tmp_path, monkeypatch, capsys):
     """Catches an error that ends the sweep, one told as another, and a stack trace for what users can mend."""
     monkeypatch.setattr(execution, "execute", lambda _: (_ for _ in ()).throw(error))
     with hydra_with(None):

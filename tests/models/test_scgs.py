@@ -58,10 +58,7 @@ def test_the_nearest_nodes_and_their_weights():
 
 @pytest.mark.parametrize(
     ("turns", "expected"),
-    [
-        (False, doubles(0.43580222, 0.38063858, 0.27163548)),
-        (True, doubles(0.45079391, 0.34920235, 0.37797328)),
-    ],
+    [(False, doubles(0.43580222, 0.38063858, 0.27163548)), (True, doubles(0.45079391, 0.34920235, 0.37797328))],
 )
 def test_a_gaussian_follows_its_nodes(turns, expected):
     """Catches nodes that only shift, turns around the origin in place of the node, a turn that is not beside the unit

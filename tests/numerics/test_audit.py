@@ -67,14 +67,7 @@ def cell(scheme: str, forward: float) -> Cell:
     ("scheme", "forward", "code"),
     [("square_root", 1e-6, 0), ("square_root", 1.0, 1), ("square_root", math.nan, 1), ("schur", 1.0, 0)],
 )
-def test_page_and_exit_code(
-    scheme,
-    forward,
-    code,
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
+def test_page_and_exit_code(scheme, forward, code, tmp_path, monkeypatch, capsys):
     """Catches a default over its bound, NaN included, that is not marked or ends in 0; others may break theirs. Also a
     short audit that does not say where to look, and a page without its table, figures or machine."""
     monkeypatch.setattr(audit, "run", lambda **_: audit.Audit(["cpu"], [cell(scheme, forward)]))

@@ -118,14 +118,7 @@ QUANTISED = "what is measured is another (protocol.quantise True instead of Fals
     indirect=["trains"],
 )
 @pytest.mark.usefixtures("trains")
-def test_what_differs_is_named_and_nothing_else_is_done(
-    words,
-    change,
-    reason,
-    run,
-    tmp_path,
-    capfd,
-):
+def test_what_differs_is_named_and_nothing_else_is_done(words, change, reason, run, tmp_path, capfd):
     """Catches a training of hours that is announced as a measurement, repeated because data were moved, or done for no
     reason that is said, and a stranger who takes a kept record's seconds for his own machine's."""
     (tmp_path / "moved").symlink_to(run.data)

@@ -149,23 +149,13 @@ def test_a_resumed_run_has_the_same_id(name, packages, tmp_path):
         ids.append((tmp_path / ID_FILE).read_text())
     (tmp_path / ID_FILE).write_text("../../other")
     RunLog(run_in(tmp_path, name), trainer(step=10)).end(None)
-    assert [*ids, (tmp_path / ID_FILE).read_text()] == [
-        "made_anew_0",
-        "made_anew_0",
-        "made_anew_1",
-        "made_anew_2",
-    ]
+    assert [*ids, (tmp_path / ID_FILE).read_text()] == ["made_anew_0", "made_anew_0", "made_anew_1", "made_anew_2"]
     client = packages["mlflow"].MlflowClient()
     if name == "mlflow":
         assert client.update_run.call_args_list == [call("made_anew_0", status="RUNNING")]
         assert client.set_terminated.call_args == call("made_anew_2", "KILLED")
     else:
-        assert [words["id"] for _, words in packages[name].init.call_args_list] == [
-            None,
-            "made_anew_0",
-            None,
-            None,
-        ]
+        assert [words["id"] for _, words in packages[name].init.call_args_list] == [None, "made_anew_0", None, None]
         assert packages[name].finish.call_args == call(exit_code=1)
 
 

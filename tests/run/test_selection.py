@@ -296,14 +296,7 @@ def test_candidates_are_those_of_the_settings():
 
 
 @pytest.mark.parametrize(("most", "best"), [(5.0, "hexplane"), (4.9, "4dgs")])
-def test_a_field_is_chosen_without_gates_and_within_the_budget(
-    most,
-    best,
-    square,
-    tmp_path,
-    capsys,
-    monkeypatch,
-):
+def test_a_field_is_chosen_without_gates_and_within_the_budget(most, best, square, tmp_path, capsys, monkeypatch):
     """Catches a field that gates refuse, slower frames than allowed, and prices that are not recorded or printed."""
     ms = {"7dgs": 2.0, "hexplane": 5.0}
     times = lambda trainer, _: (RenderTimes(0.0, ms.get(trainer.config.model.name, 1.0), 9.0), {})  # noqa: E731

@@ -136,15 +136,7 @@ def test_a_run_starts_from_a_ply(model, words, tmp_path):
         (8, 3, "", None),
     ],
 )
-def test_a_ply_that_cannot_be_the_start_is_refused(
-    count,
-    away,
-    more,
-    reason,
-    words,
-    tmp_path,
-    capsys,
-):
+def test_a_ply_that_cannot_be_the_start_is_refused(count, away, more, reason, words, tmp_path, capsys):
     """Catches a refusal without a record, a hash compared with nothing, black images, and few Gaussians in sight."""
     write_trained(tmp_path / "a.ply", count, away)
     record, _ = run_here(*words, *more.split())

@@ -73,13 +73,7 @@ def test_axes(tiny):
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.25, 0.5, 0.7)])
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_large_scene_stays_in_8_bits_and_looks_the_same(
-    background,
-    channels,
-    dtype,
-    tiny,
-    monkeypatch,
-):
+def test_a_large_scene_stays_in_8_bits_and_looks_the_same(background, channels, dtype, tiny, monkeypatch):
     """Catches 500 views of 800 x 800 that take 4 GB, and 8 bits whose images differ by as much as one bit."""
     random = np.random.default_rng(1)
     rgba = random.integers(0, np.iinfo(dtype).max + 1, (240, 320, channels)).astype(dtype)

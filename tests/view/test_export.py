@@ -158,14 +158,7 @@ def test_a_frame_appears_when_it_is_whole(folder, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("is_there", [True, False])
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt(), None])
-def test_a_clip_that_fails_leaves_nothing(
-    failure,
-    is_there,
-    folder,
-    tmp_path,
-    monkeypatch,
-    capsys,
-):
+def test_a_clip_that_fails_leaves_nothing(failure, is_there, folder, tmp_path, monkeypatch, capsys):
     """Catches a short clip that looks like a whole one, a folder of the user's that is removed, and a time not named.
     Without a failure of the disk the model fades out at the end."""
     calls = []
@@ -435,13 +428,7 @@ def test_a_disk_that_refuses_a_video_is_named(folder, tmp_path, monkeypatch, cap
 
 
 @pytest.mark.parametrize("words", [("--ply", "a.ply"), ("--video", "a.mp4", *FOUR), ("--images", "a", *FOUR)])
-def test_memory_that_runs_out_ends_in_one_line(
-    words,
-    folder,
-    tmp_path,
-    monkeypatch,
-    capfd,
-):
+def test_memory_that_runs_out_ends_in_one_line(words, folder, tmp_path, monkeypatch, capfd):
     """Catches a traceback for an allocation that fails, a file that it leaves, and a mistake of gsbench called so."""
     errors = [
         RuntimeError("expected a tensor of another shape"),
