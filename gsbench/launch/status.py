@@ -8,15 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import msgspec
-
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError
 from gsbench.launch import plan
 from gsbench.launch.plan import Ended, Identity, Plan, identity
 from gsbench.launch.slurm import Queue, endings, queue
-from gsbench.measure.record import CHECKPOINT, MAX_FILE, PUBLISHED
+from gsbench.measure.record import CHECKPOINT, PUBLISHED
 from gsbench.measure.record import FILE_NAME as RECORD
-from gsbench.reading import read_file
+from gsbench.report import plausible
 from gsbench.run import progress
 from gsbench.run.progress import SILENT, Progress, born, is_alive
 
@@ -276,27 +274,12 @@ def _files(folder: Path) -> Iterator[Path]:
                 yield path
 
 
-class _Cost(msgspec.Struct):
-    train_s: float | None
-
-
-class _Outcome(msgspec.Struct):
-    """The keys of a record that say how its run ended; others are not looked at."""
-
-    status: str
-    reason: str | None
-    overrides: list[str]
-    metrics: dict[str, float | None] | None
-    cost: _Cost | None
-
-
 def record_status(path: Path) -> tuple[list[str], RecordStatus]:
-    """Read the overrides and the outcome of a run from its record, much faster than by validating it all."""
+    """Read the overrides and the outcome of a run from its record, which is `failed` if it is damaged or was edited."""
     written = path.stat().st_mtime
     try:
-        outcome = msgspec.json.decode(read_file(path, str(path), MAX_FILE), type=_Outcome)
-    except (InputError, msgspec.MsgspecError, RecursionError) as error:
-        reason = f"{path} is damaged ({one_line(error)}): delete it"
-        return [], RecordStatus(path, "failed", reason, None, written)
-    psnr, train_s = (outcome.metrics or {}).get("psnr"), outcome.cost.train_s if outcome.cost else None
-    return outcome.overrides, RecordStatus(path, outcome.status, outcome.reason, psnr, written, train_s)
+        record = plausible.read(path)
+    except InputError as error:
+        return [], RecordStatus(path, "failed", f"delete its record, which is damaged: {error}", None, written)
+    psnr, train_s = (record.metrics or {}).get("psnr"), record.cost.train_s if record.cost else None
+    return record.overrides, RecordStatus(path, record.status, record.reason, psnr, written, train_s)

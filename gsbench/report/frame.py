@@ -16,9 +16,8 @@ from gsbench.config_roles import facts
 from gsbench.errors import InputError, printable
 from gsbench.measure import record as record_files
 from gsbench.measure.record import Record
-from gsbench.report import study
+from gsbench.report import plausible, study
 from gsbench.report.columns import CURVES, RUNS, VIEWS
-from gsbench.report.plausible import implausible
 
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
@@ -93,10 +92,11 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
         raise InputError(f"{root}: expected results, found no {names} in it or below")
     records = []
     for path, record in read:
-        if why := implausible(record):
-            faults.append(printable(f"{path}: {record.path}: {why}: was it edited? delete it, and run again"))
-        else:
+        try:
+            plausible.check(record, f"{path}: {record.path}")
             records.append((path, record))
+        except InputError as error:
+            faults.append(printable(error))
     return records, faults
 
 

@@ -4,11 +4,15 @@ import math
 import re
 from collections.abc import Iterator
 from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import msgspec
-import numpy as np
 
+from gsbench.errors import InputError
+from gsbench.measure import record as files
 from gsbench.measure.exact_views import MOST_PSNR
 from gsbench.measure.record import Record
 from gsbench.report.columns import VIEWS
@@ -25,10 +29,23 @@ RANGES = (  # of a number by its name; the first pattern that fits counts
     (".*", 0.0, 1e15),  # seconds, counts, bytes, shares
 )
 OF_PIXELS = ("psnr_moving", "psnr_object")  # views without such pixels have none
-ROUNDING = 1e-6  # by which a mean may differ from that of its views
+ROUNDING = 1e-6  # by which a mean may differ from that of its views, and a sum from its parts, relative to it
 
 
-def implausible(record: Record) -> str:
+def read(path: Path) -> Record:
+    """Read the record at `path`; an InputError names the field that is not valid or cannot be."""
+    record = files.read(path)
+    check(record, str(path))
+    return record
+
+
+def check(record: Record, where: str) -> None:
+    """Raise InputError if something of a record cannot be; the message begins with `where`."""
+    if why := _implausible(record):
+        raise InputError(f"{where}: {why}: was it edited? delete it, and run again")
+
+
+def _implausible(record: Record) -> str:
     """Return what of a record cannot be, with its place in record.json; "" if nothing is wrong."""
     measured = {name: msgspec.to_builtins(getattr(record, name)) for name in MEASURED}
     measured |= {"curve": [point._asdict() for point in record.curve], "parts.score": record.parts.get("score")}
@@ -36,7 +53,7 @@ def implausible(record: Record) -> str:
         low, high = _range(place.rpartition(".")[2])
         if not low <= number <= high:
             return f"{place}: expected {low:g} to {high:g}, got {number:g}"
-    return _of_views(record)
+    return _of_views(record) or _of_seconds(record)
 
 
 def _of_views(record: Record) -> str:
@@ -53,8 +70,25 @@ def _of_views(record: Record) -> str:
             continue
         if len(values) < len(names) and score not in OF_PIXELS:
             return f"per_view: expected {score} of all {len(names)} views, as metrics has it, got it of {len(values)}"
-        if not abs(mean - np.mean(values)) <= ROUNDING:
-            return f"metrics.{score}: expected {np.mean(values):g}, the mean of its views, got {mean:g}"
+        if not abs(mean - fmean(values)) <= ROUNDING:
+            return f"metrics.{score}: expected {fmean(values):g}, the mean of its views, got {mean:g}"
+    return ""
+
+
+def _of_seconds(record: Record) -> str:
+    """Return what is wrong with seconds that follow from others; "" if nothing is."""
+    cost, ends = record.cost, [point.seconds for point in record.curve]
+    if any(later < earlier for earlier, later in pairwise(ends)):
+        return "curve: expected rising seconds"
+    if cost is None:
+        return ""
+    follow = {  # by place: the number, and what it follows from
+        "cost.train_s": (cost.train_s, math.fsum(cost.stage_s.values()) if cost.stage_s else None, "sum of stage_s"),
+        "cost.fps": (cost.fps, cost.render_ms.fps if cost.render_ms else None, "1000 / render_ms.p50"),
+    }
+    for place, (number, expected, rule) in follow.items():
+        if number is not None and expected is not None and not abs(number - expected) <= ROUNDING * expected:
+            return f"{place}: expected {expected:g}, the {rule}, got {number:g}"
     return ""
 
 

@@ -28,6 +28,7 @@ from gsbench.measure.record import Effects, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
 from gsbench.process.memory import is_out_of_memory
+from gsbench.report import plausible
 from gsbench.run import fitting, measuring, progress
 from gsbench.run.identity import RunSpec
 from gsbench.run.log import RunLog, check_tracker
@@ -368,7 +369,7 @@ def finished(spec: RunSpec, scene: Scene) -> Record | None:
         if not path.exists():
             continue
         try:
-            record = records.read(path)
+            record = plausible.read(path)
         except InputError as error:
             _say(spec, str(error))
             continue

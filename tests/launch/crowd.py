@@ -44,10 +44,11 @@ def record(model: str, scene: str, seed: int) -> dict[str, Any]:
             dataset="crowd",
             seed=seed,
             overrides=overrides(model, scene, seed),
-            metrics=dict.fromkeys(METRICS, 0.5) | {"psnr": psnr},
+            metrics=dict.fromkeys(METRICS, 0.5)
+            | {"psnr": psnr, "psnr_channel_mean": 28.0, "ssim": 0.9, "lpips_alex": 0.1},
             missing={},
             provenance=replace(golden.provenance, config={"seed": seed, "all": asdict(Config())}),
-            per_view=[ViewScore(f"r_{i}", psnr + i / 10, 28.0, 0.9, 0.1) for i in range(20)],
+            per_view=[ViewScore(f"r_{i}", psnr + i / 10 - 0.95, 28.0, 0.9, 0.1) for i in range(20)],
             curve=[Point(1500 * (i + 1), 30.0 * i, 20 + i / 3) for i in range(20)],
         )
     )

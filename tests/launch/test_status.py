@@ -117,6 +117,8 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
             "done",
             None,
         ),
+        (None, {"record_of": {"metrics": {"psnr": 60.0}}}, "failed", "record.json: metrics.psnr: expected 28"),
+        (None, {"record_of": {"seed": "0"}}, "failed", "record.json: seed: expected int, got str"),
         *(
             (None, {"record_of": text}, "failed", "seed0/record.json")
             for text in ("", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0")
@@ -243,7 +245,9 @@ def test_of_two_traces_of_a_run_the_newer_counts(tmp_path, newer):
     for name in ("a", "b"):
         path = tmp_path / name / "record.json"
         path.parent.mkdir()
-        path.write_text(json.dumps(crowd.record(*RUN) | {"metrics": {"psnr": 20.0 + (name == newer)}}, default=str))
+        psnr = 20.0 + (name == newer)
+        of = {"metrics": {"psnr": psnr}, "per_view": [{"name": "r_0", "psnr": psnr}]}
+        path.write_text(json.dumps(crowd.record(*RUN) | of, default=str))
         os.utime(path, (now, now - 60 * (name != newer)))
     assert only(tmp_path).psnr == 21.0
     for name in ("a", "b"):
@@ -400,7 +404,7 @@ def test_the_help_says_what_each_command_does(capsys, monkeypatch):
 
 
 def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path):
-    """Catches a status that composes configs, validates records, or imports what it does not need."""
+    """Catches a status that composes configs, or imports what it does not need."""
     experiment = crowd.write(500, tmp_path)
     code = (
         "import sys, time\n"

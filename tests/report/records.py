@@ -68,7 +68,15 @@ BASE = Record(
 
 
 def but(record: Record, **changes: Any) -> Record:
-    """The same record with other fields; a dict changes parts of a field, such as cost={"load": 1.0}."""
+    """The same record with other fields; a dict changes parts of a field, such as cost={"load": 1.0}.
+
+    Numbers that follow from changed ones follow: the stages from seconds, FPS from frame times.
+    """
+    if "train_s" in (cost := changes.get("cost") or {}):
+        cost = {"stage_s": {"raster": cost["train_s"]}} | cost
+    if "render_ms" in cost:
+        cost = {"fps": cost["render_ms"].fps} | cost
+    changes |= {"cost": cost} if cost else {}
 
     def part(before: Any, after: Any) -> Any:
         if not isinstance(after, dict):

@@ -45,6 +45,15 @@ GATED = on_demand([make(seed=9)])[0]
         (but(RUN, cost={"train_s": -1.0}), "cost.train_s: expected 0 to 1e+15, got -1"),
         (but(RUN, cost={"stage_s": {"loss": -1.0}}), "cost.stage_s.loss: expected 0 to 1e+15, got -1"),
         (but(RUN, cost={"num_gaussians": -5}), "cost.num_gaussians: expected 0 to 1e+15, got -5"),
+        (
+            replace(RUN, cost=replace(RUN.cost, train_s=9.0)),
+            "cost.train_s: expected 90, the sum of stage_s, got 9",
+        ),
+        (
+            replace(RUN, cost=replace(RUN.cost, fps=200.0)),
+            "cost.fps: expected 20, the 1000 / render_ms.p50, got 200",
+        ),
+        (replace(RUN, curve=[CURVE[0], CURVE[1]._replace(seconds=4.0)]), "curve: expected rising seconds"),
         (replace(RUN, stop=Stop(-5, 1)), "stop.iteration: expected 0 to 1e+15, got -5"),
         (replace(RUN, length_choice=LengthChoice(-5, [])), "length_choice.kept: expected 0 to 1e+15, got -5"),
         (replace(RUN, regions={"moving": Region("masks", -5, 0.1, "")}), "regions.moving.views: expected 0 to"),

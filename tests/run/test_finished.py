@@ -44,6 +44,11 @@ class Finished:
         other = replace(self.first, provenance=replace(self.first.provenance, **changed))
         files.write(other, self.folder / files.FILE_NAME)
 
+    def edit(self) -> None:
+        """Raise PSNR in its record by hand."""
+        edited = replace(self.first, metrics=(self.first.metrics or {}) | {"psnr": 60.0})
+        files.write(edited, self.folder / files.FILE_NAME)
+
     def of_older_config(self) -> None:
         """Let its record be that of a longer training, and lose its checkpoint."""
         config = self.first.provenance.config
@@ -113,8 +118,9 @@ QUANTISED = "what is measured is another (protocol.quantise True instead of Fals
             True,
         ),
         ((), lambda run: run.change(data_hash="0" * 64), "the scene's data has changed: running again", False),
+        ((), Finished.edit, "metrics.psnr: expected .*, the mean of its views, got 60: was it edited", False),
     ],
-    ids=["kept", "elsewhere", "moved", "measured", "no checkpoint", "training", "data"],
+    ids=["kept", "elsewhere", "moved", "measured", "no checkpoint", "training", "data", "edited"],
     indirect=["trains"],
 )
 @pytest.mark.usefixtures("trains")
