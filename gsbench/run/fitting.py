@@ -17,7 +17,7 @@ from gsbench.run.load import plain_description
 from gsbench.run.setup import evaluated_views
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
-from gsbench.scenes.points import frustum_points, is_seen, random_points, share_of_points_seen
+from gsbench.scenes.points import frustum_points, random_points, share_of_points_seen
 from gsbench.scenes.scene import STANDARD
 from gsbench.train import checkpoint
 from gsbench.train.batches import generator
@@ -133,19 +133,20 @@ def _check_fitted(trainer: Trainer) -> None:
 def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
     """Return the points of a data set, or sample some in a cube or in the frustum that all cameras share.
 
-    The share of sampled points that at least one training camera sees is printed.
+    The share of sampled points that at least one training camera sees is printed, and that of others if `data.near`
+    hides most of them.
 
     Raises:
         InputError: cameras see none of the points beyond `data.near`, or too few of sampled ones.
     """
     cameras = [view.camera.to("cpu") for view in scene.train]
     if scene.points is not None:
-        means = scene.points.means.cpu()
-        if data.near is not None and not any(is_seen(means, camera, camera.near).any() for camera in cameras):
-            raise InputError(
-                f"{scene.name}: expected initial points beyond data.near={data.near:g}, the training cameras see none "
-                f"of {len(means)} there: lower data.near"
-            )
+        share = 1.0 if data.near is None else share_of_points_seen(scene.points, cameras, LEAST_SEEN)
+        where = f"of {len(scene.points.means)} initial points, training cameras see {share:.1%} beyond"
+        if share == 0:
+            raise InputError(f"{scene.name}: data.near: {where} {data.near:g}: lower it")
+        if share < LEAST_SEEN:
+            print(f"{scene.name}: {where} data.near={data.near:g}", file=sys.stderr)
         return scene.points
     if data.initial_half_width is None:
         return frustum_points(data.initial_points, cameras, scene.extent, random)

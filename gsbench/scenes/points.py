@@ -82,12 +82,18 @@ def is_seen(
     return (x[:, 2] > near) & (pixel >= 0).all(1) & (pixel <= pixel.new_tensor([camera.width, camera.height])).all(1)
 
 
-def share_of_points_seen(points: Points, cameras: Sequence[Camera]) -> float:
-    """Return the share of points that are inside the image of at least one camera, and beyond its near plane."""
-    visible = torch.zeros(len(points.means), dtype=torch.bool)
+def share_of_points_seen(points: Points, cameras: Sequence[Camera], enough: float = 1.0) -> float:
+    """Return the share of points that are inside the image of at least one camera, and beyond its near plane.
+
+    It is at least `enough` once this share is reached, where the search ends.
+    """
+    means = points.means.cpu()
+    unseen = means
     for camera in cameras:
-        visible |= is_seen(points.means, camera, camera.near)
-    return float(visible.float().mean())
+        unseen = unseen[~is_seen(unseen, camera, camera.near)]
+        if len(means) - len(unseen) >= enough * len(means):
+            break
+    return 1 - len(unseen) / len(means)
 
 
 def read_ply(path: Path) -> Points:

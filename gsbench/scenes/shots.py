@@ -22,6 +22,7 @@ from gsbench.scenes.scene import Camera, View
 _HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres are at +0.5 here, and at integers in OpenCV
 _LEAST_RATIO = 1.1  # below it, an image whose sides are not exactly in one ratio to the camera's may have been cropped
 _OUTSIDE = 2.0  # pixels that OpenCV's rectangle without blank pixels may exceed the image, as it samples the border
+_WIDEST = 0.1  # focal length by the image's side, a field of view of 157 degrees, which no lens without distortion has
 SMALLEST = 1e-6  # pixels; smaller focal lengths become zero in single precision
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
 MASKS = "masks"  # the folder with the object number of each pixel, in PNG files
@@ -40,6 +41,13 @@ class Lens:
     def key(self) -> tuple[object, ...]:
         """What is equal for equal lenses."""
         return (self.width, self.height, *self.K.ravel().tolist(), *self.distortion)
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether K is rare for images of this size, as if it were in other units, such as parts of the width or mm."""
+        size = np.array([self.width, self.height])
+        middle, focal = self.K[:2, 2], self.K.diagonal()[:2]
+        return bool((middle < 1).any() or (middle > size - 1).any() or (focal < _WIDEST * size).any())
 
     def resized(self, width: int, height: int) -> "Lens | None":
         """Return the lens of an image of width x height pixels, which was resized from the camera's by one ratio.
@@ -225,6 +233,15 @@ def _notes(shots: Sequence[Shot], size: Size, reduced: Size, downscale: int) -> 
         notes.append(
             f"images of {size[0]}x{size[1]} are resized from those of their camera, {stated}, "
             "whose intrinsics are scaled with them"
+        )
+    odd = [shot for shot in shots if shot.lens.is_odd]
+    if odd:
+        lens = odd[0].lens
+        notes.append(
+            f"{len(odd)} of {len(shots)} images are of a camera whose principal point is outside of the image or whose "
+            f"field of view is near 180 degrees, such as {odd[0].name}: focal lengths {lens.K[0, 0]:.6g} and "
+            f"{lens.K[1, 1]:.6g}, principal point {lens.K[0, 2]:.6g} and {lens.K[1, 2]:.6g} for "
+            f"{lens.width}x{lens.height}: are they in pixels of this image?"
         )
     if (reduced[0] * downscale, reduced[1] * downscale) != size:
         notes.append(

@@ -53,6 +53,24 @@ def test_a_frame_comes_before_its_file(tiny, file, frame, first, second):
     assert numbers(views[1]) == pytest.approx(second)
 
 
+@pytest.mark.parametrize(
+    ("file", "count", "words"),
+    [
+        ({"fl_x": 10.0, "cx": 0.5, "cy": 0.5}, 2, "focal lengths 10 and 10, principal point 0.5 and 0.5 for 8x6"),
+        ({"fl_x": 10.0, "cx": 9.0}, 2, "principal point 9 and 3 for 8x6: are they in pixels"),
+        ({"fl_x": 0.7}, 2, "focal lengths 0.7 and 0.7"),
+        ({"fl_x": 10.0, "cx": 1.0, "cy": 5.0}, 0, ""),
+        ({"fl_x": 0.8}, 0, ""),
+    ],
+)
+def test_intrinsics_in_other_units_are_told(tiny: Path, file: dict[str, Any], count: int, words: str) -> None:
+    """Catches parts of the width or millimetres that are read as pixels, which shows every camera a wrong picture."""
+    write(tiny, WITHOUT | file, {})
+    notes = " ".join(scenes.load(tiny).notes)
+    assert (f"{count} of 4 images are of a camera" in notes) == (count > 0)
+    assert words in notes
+
+
 REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "fl_x and the angle": ({"fl_x": 10.0}, {}, "fl_x: expected 9.46089 as camera_angle_x says for 8 pixels, got 10"),
     "fl_y and the angle": ({"fl_x": ANGLE, "fl_y": 15.0, "camera_angle_y": 1.0}, {}, "fl_y: expected 5.49"),

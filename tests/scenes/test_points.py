@@ -219,15 +219,22 @@ def test_cameras_that_look_away_are_told():
 
 @pytest.mark.parametrize("half_width", [1.3, None])
 @pytest.mark.parametrize("points", [None, Points(torch.zeros(9, 3), torch.ones(9, 3))])
-def test_a_near_plane_beyond_all_points_is_refused(points, half_width):
+def test_a_near_plane_beyond_all_points_is_refused(points, half_width, capsys):
     """Catches a training of an empty picture, as no camera draws a Gaussian nearer than data.near."""
     config, g = DataConfig(initial_points=200, initial_half_width=half_width), torch.Generator().manual_seed(0)
     scene = scene_of(opposed(8.0), points)
     for near in (None, 3.0):
         shown = scene if near is None else scene.with_near(near)
         assert len(initial_points(replace(config, near=near), shown, g).means) == (200 if points is None else 9)
-    with pytest.raises(InputError, match=r"(expected|in common).* lower data.near"):
+    with pytest.raises(
+        InputError, match=r"(see 0.0% beyond 1000: lower|lower data.near=1000|in common.* lower data.near)"
+    ):
         initial_points(replace(config, near=1000.0), scene.with_near(1000.0), g)
+    if points is not None:
+        few = torch.tensor([[0.0, 0.0, z] for z in (*[0.0] * 7, 2.0)])  # at depths 4 and 6 of the first camera
+        scene = replace(scene, points=Points(few, points.colors[:8])).with_near(5.0)
+        assert len(initial_points(replace(config, near=5.0), scene, g).means) == 8
+        assert "near: of 8 initial points, training cameras see 12.5% beyond data.near=5" in capsys.readouterr().err
 
 
 def test_points_between_cameras_that_face_each_other():
