@@ -82,9 +82,10 @@ def _of_seconds(record: Record) -> str:
         return "curve: expected rising seconds"
     if cost is None:
         return ""
+    p50 = cost.render_ms.p50 if cost.render_ms else 0.0
     follow = {  # by place: the number, and what it follows from
         "cost.train_s": (cost.train_s, math.fsum(cost.stage_s.values()) if cost.stage_s else None, "sum of stage_s"),
-        "cost.fps": (cost.fps, cost.render_ms.fps if cost.render_ms else None, "1000 / render_ms.p50"),
+        "cost.fps": (cost.fps, 1000 / p50 if p50 else None, "1000 / render_ms.p50"),
     }
     for place, (number, expected, rule) in follow.items():
         if number is not None and expected is not None and not abs(number - expected) <= ROUNDING * expected:

@@ -92,6 +92,10 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
     """
     folder, notes = largest_model(root / "sparse")
     model = cameras, posed, points = [read_part(folder, part) for part in ("cameras", "images", "points3D")]
+    texts = [text.name for part in model if (text := part.path.with_suffix(".txt")) != part.path and text.exists()]
+    notes += (
+        [f"{', '.join(texts)} in {folder.relative_to(root)} are not read, as there are .bin files"] if texts else []
+    )
     listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
     loaded = shots.read(listed, rendition)

@@ -204,7 +204,7 @@ def _seen_points(
         raise InputError(
             f"{name}: expected initial points that a training camera sees, they see none of the "
             f"{len(points.means)}: are points and poses of one capture, and in the same coordinates and "
-            f"units?",
+            f"units, and focal lengths and principal points in pixels of the images?",
             docs="data.md#where-a-scene-lies",
         )
     return (np.concatenate(visible), np.concatenate(depths)), float(is_any.double().mean())
