@@ -30,6 +30,7 @@ HOW_TO = "report.md#renders-of-other-programs"
 VIDEO_STARTS = (b"....ftyp", b"\x1aE\xdf\xa3", b"RIFF")
 PNG_DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel
 MOST_MEAN = 1.0  # of an image of floats; in [0, 255] it is larger. Single values may be above 1
+LEAST = -0.5  # of an image of floats; in [-1, 1] dark pixels are below it. Sharpened edges may be a little below 0
 NAMED = 3  # files that a message names
 
 Image = Pixels | NDArray[np.float32]  # [H, W, 3|4] RGB or RGBA, straight alpha
@@ -165,12 +166,15 @@ def _checked(path: Path) -> tuple[str, tuple[int, int], str]:
 
 
 def _read(path: Path) -> Image:
-    """Read an image; raise InputError if floats are not in [0, 1]."""
+    """Read an image; raise InputError if floats are not finite, or clearly not in [0, 1]."""
     if path.suffix.lower() != ".npy":
         return decode_photo(read_image(path, str(path)), str(path))
     image: NDArray[np.float32] = np.array(_array(path), np.float32)
-    if image[..., :3].mean() > MOST_MEAN:
-        raise InputError(f"{path}: expected values in [0, 1], their mean is {image[..., :3].mean():.3g}: divide them")
+    mean, least = image[..., :3].mean(), image[..., :3].min()
+    if not (np.isfinite(image).all() and mean <= MOST_MEAN and least >= LEAST):
+        raise InputError(
+            f"{path}: expected values in [0, 1], their mean is {mean:.3g}, their least {least:.3g}: scale them"
+        )
     return image
 
 

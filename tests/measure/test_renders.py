@@ -77,13 +77,15 @@ def test_wrong_images_are_refused_in_a_line(spoil, words, views, tmp_path):
     ("array", "words"),
     [
         (np.float32(255) * FLOATS, "expected values in [0, 1], their mean is 128"),
+        (FLOATS - np.linspace(0, 1.5, 3, dtype=np.float32), "their least -1: scale them"),
+        (FLOATS * np.float32([1, 1, np.nan]), "their mean is nan"),
         (BYTES, "expected floats [H, W, 3] or [H, W, 4], got uint8"),
         (FLOATS[..., 0], "expected floats [H, W, 3]"),
         (np.array([{}]), "expected an array of numpy"),
     ],
 )
 def test_wrong_arrays_are_refused_in_a_line(array, words, views, tmp_path):
-    """Catches a pickle that is loaded, and values in [0, 255] that are clamped to white."""
+    """Catches a pickle that is loaded, values in [0, 255] or [-1, 1] that are clamped, and the trace of a metric."""
     for name in NAMES:
         put(f"{name}.npy", npy(array))(tmp_path)
     refused(tmp_path, words, views)
