@@ -22,8 +22,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--dry-run", action="store_true", help="print what would be fetched, from where and to where")
     parser.add_argument("--to", type=Path, default=Path("data"), metavar="FOLDER", help="of data sets (data)")
     options = parser.parse_args(arguments)
-    if not options.names and not options.list:
-        parser.error("expected a NAME, or --list")
+    if bool(options.names) == options.list or (options.list and options.dry_run):
+        parser.error("expected a NAME, or --list, without NAME and --dry-run beside it")
     if options.json and not options.list:
         parser.error("--json: expected --list beside it")
     try:
@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name in list(known) if options.list else options.names:
         try:
             source = find(name, known)
-            print(line_of(source) if options.list else plan_of(source) if options.dry_run else fetch(source))
+            line = line_of(source) if options.list else plan_of(source) if options.dry_run else fetch(source)
+            print(printable(line))
         except (InputError, OSError) as error:
             print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
             status = 2

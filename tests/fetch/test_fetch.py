@@ -254,7 +254,14 @@ def test_what_a_mirror_lacks_is_fetched_by_hand(address, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    ("words", "error"), [([], "expected a NAME, or --list"), (["dnerf", "--json"], "--json: expected --list beside it")]
+    ("words", "error"),
+    [
+        *(
+            (words, "expected a NAME, or --list, without NAME and --dry-run beside it")
+            for words in ([], ["--list", "dnerf"], ["--list", "--dry-run"])
+        ),
+        (["dnerf", "--json"], "--json: expected --list beside it"),
+    ],
 )
 def test_a_command_without_sense_is_refused(words, error, capsys):
     """Catches a command that does nothing and ends as a success, and a usage that names no module."""
@@ -292,3 +299,6 @@ def test_what_cannot_be_fetched_is_told(tmp_path, monkeypatch, capsys):
             assert main([*words, "--to", to]) == 2
             (line,) = capsys.readouterr().err.splitlines()
             assert "--to" in line
+    monkeypatch.delenv("GSBENCH_MIRROR")
+    assert main(["dnerf", "--dry-run", "--to", "a\nb"]) == 0
+    assert "a\\nb/dnerf" in capsys.readouterr().out

@@ -72,9 +72,10 @@ def but(record: Record, **changes: Any) -> Record:
 
     Numbers that follow from changed ones follow: the stages from seconds, FPS from frame times.
     """
-    if "train_s" in (cost := changes.get("cost") or {}):
+    cost = changes.get("cost") or {}
+    if "train_s" in cost and "stage_s" not in cost:
         cost = {"stage_s": {"raster": cost["train_s"]}} | cost
-    if "render_ms" in cost:
+    if "render_ms" in cost and "fps" not in cost:
         cost = {"fps": cost["render_ms"].fps} | cost
     changes |= {"cost": cost} if cost else {}
 
