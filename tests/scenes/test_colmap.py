@@ -395,14 +395,14 @@ def test_the_largest_model_is_read(taken, models, words):
     assert words in scene.notes[-1]
 
 
-def test_a_text_file_beside_a_binary_one_is_told(taken: Path) -> None:
+def test_a_text_file_beside_a_binary_one_is_told(taken):
     """Catches an edited images.txt that images.bin hides."""
     Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES, circle(COUNT)).write(taken, "bin")
     (taken / "sparse/0/cameras.txt").unlink()
     assert "images.txt, points3D.txt in sparse/0 are not read, as there are .bin files" in scenes.load(taken).notes
 
 
-def test_a_principal_point_that_hides_all_points_is_asked_for(taken: Path) -> None:
+def test_a_principal_point_that_hides_all_points_is_asked_for(taken):
     """Catches a message that asks for other points where the principal point is in the wrong place."""
     (taken / "sparse/0/cameras.txt").write_text(f"7 PINHOLE {WIDTH} {HEIGHT} 20 20 8000 6\n")
     with pytest.raises(InputError, match=r"they see none .* principal points in pixels of the images"):

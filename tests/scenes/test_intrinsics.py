@@ -63,7 +63,7 @@ def test_a_frame_comes_before_its_file(tiny, file, frame, first, second):
         ({"fl_x": 0.8}, 0, ""),
     ],
 )
-def test_intrinsics_in_other_units_are_told(tiny: Path, file: dict[str, Any], count: int, words: str) -> None:
+def test_intrinsics_in_other_units_are_told(tiny, file, count, words):
     """Catches parts of the width or millimetres that are read as pixels, which shows every camera a wrong picture."""
     write(tiny, WITHOUT | file, {})
     notes = " ".join(scenes.load(tiny).notes)
