@@ -86,7 +86,7 @@ def only(published: Path, name: str) -> Results:
 
 def means(results: Results, *quantities: str) -> pd.DataFrame:
     """Return means and intervals over seeds by model and variant; times of all machines count."""
-    runs = results.runs.assign(timed_on=results.runs.machine)  # `stats.means` drops times of other machines
+    runs = results.runs.assign(is_timed=True)  # `stats.means` drops times of other machines
     return stats.means(runs, ["model", "variant"], quantities).set_index(["model", "variant"])
 
 

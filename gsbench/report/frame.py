@@ -198,11 +198,14 @@ def _number(value: float | None) -> float:
 
 
 def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
-    """Set times to NaN unless they are of the machine with the most finished runs; `timed_on` is its name."""
+    """Set times to NaN unless they are of the machine with the most finished runs.
+
+    `timed_on` is its name, and `is_timed` tells whether a run was on it.
+    """
     counted = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
     machine = str(counted.machine.value_counts(sort=False).idxmax())  # of equals the first
-    times = {name: runs[name].where(runs.machine == machine) for name in TIMES}
-    return runs.assign(**times, timed_on=machine)
+    is_timed = runs.machine == machine
+    return runs.assign(**{name: runs[name].where(is_timed) for name in TIMES}, timed_on=machine, is_timed=is_timed)
 
 
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:

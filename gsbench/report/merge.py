@@ -10,7 +10,6 @@ the experiment keep its name; the others' are a variant, such as "7dgs from=bob"
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pandas as pd
@@ -49,9 +48,8 @@ def read(folders: Sequence[Path]) -> Results:
             if reason := unpublishable(record):
                 faults.append(printable(f"{path}: {record.path}: {reason}"))
                 continue
-            numbers = [record.metrics, record.per_view, record.cost, record.curve]
-            key = _identity(record, numbers)
             # A run with other numbers, or on another machine, is its contributor's; an equal one is the first's.
+            key = _identity(record)
             kept.setdefault(key, (path, record))
             people.setdefault(key, []).append(name)
     keys = sorted(kept, key=lambda key: (run_name(kept[key][1]), people[key]))
@@ -98,8 +96,9 @@ def unpublishable(record: Record) -> str:
     return ""
 
 
-def _identity(record: Record, numbers: Any) -> bytes:
+def _identity(record: Record) -> bytes:
     """Return bytes that are equal for two records of one run: settings, data, commit, machine and numbers."""
+    numbers = [record.metrics, record.per_view, record.cost, record.curve]
     provenance = record.provenance
     named = [run_name(record), provenance.git_commit, provenance.data_hash, provenance.machine, protocol_of(record)]
     return msgspec.json.encode([named, training_hash(provenance.config), numbers], order="sorted")

@@ -50,10 +50,11 @@ def write(
     write_atomically(folder / "table.md", text.markdown(shown).encode())
     write_atomically(folder / "table.csv", text.csv(results.runs.drop(columns=NOT_IN_FILE)).encode())
     if merge.is_merged(results):
-        pages = site.write(results, folder)[:1]  # index.html
+        shown_page = site.write(results, folder)[0]  # index.html
     else:
-        pages = [page.write(results, folder, reload=reload, more=more)]
-    return [folder / "table.md", folder / "table.csv", *pages]
+        shown_page = folder / "report.html"
+        write_atomically(shown_page, page.page(folder.resolve().name, results, reload=reload, more=more).encode())
+    return [folder / "table.md", folder / "table.csv", shown_page]
 
 
 def watch(folder: Path, columns: Sequence[str] = (), *, every: float = EVERY) -> int:

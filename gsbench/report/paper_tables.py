@@ -113,15 +113,14 @@ def of_the_paper(results: Results, models: Sequence[str] = MODELS) -> pd.DataFra
         )
         for r in runs.record
     ]
-    recipes = runs.variant.map(lambda variant: without(variant, *MEASURING))
-    sizes = [printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record]
+    recipes = [without(variant, *MEASURING).split(",") for variant in runs.variant]
     # protocol=published belongs to no recipe: it only measures the best PSNR on test too.
     return runs.assign(
         order=runs.model.map(models.index),
         departs=runs.record.map(departure),
-        recipe=[",".join(word for word in recipe.split(",") if word != "protocol=published") for recipe in recipes],
+        recipe=[",".join(word for word in recipe if word != "protocol=published") for recipe in recipes],
         pool=pd.Series(pools, runs.index, dtype=object),
-        size=sizes,
+        size=[printable(r.protocol.get("resolution", "a size not recorded")) for r in runs.record],
     )
 
 
@@ -145,7 +144,7 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     "other data" those on data that stand in for the paper's.
     """
     for dataset in paper.PROTOCOLS:
-        yield "paper", dataset, _at_paper(runs, dataset)
+        yield "paper", dataset, runs[(runs.departs == "") & (runs.dataset == dataset)]
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
     pools = [pool for _, pool in runs[runs.departs != ""].groupby("pool")]
     for pool in sorted(pools, key=lambda pool: -_effort(pool)):  # equal ones stay in order of their names
@@ -155,11 +154,6 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
         for (paper_dataset, dataset), pool in nearest.items():
             if (kind == "other protocol") == (paper_dataset == dataset):
                 yield kind, dataset, pool
-
-
-def _at_paper(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
-    """Return the runs on a data set at the paper's protocol."""
-    return runs[(runs.departs == "") & (runs.dataset == dataset)]
 
 
 def _effort(runs: pd.DataFrame) -> int:
@@ -218,8 +212,8 @@ def table2(results: Results) -> pd.DataFrame:
 
 def _measured(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
     """Return the measured rows of Table 2 for a data set, those of `OWED` also without numbers."""
-    scenes, runs = paper.PROTOCOLS[dataset].scenes, _at_paper(runs, dataset)
-    finished = runs[runs.status == "ok"]
+    scenes = paper.PROTOCOLS[dataset].scenes
+    finished = runs[(runs.departs == "") & (runs.dataset == dataset) & (runs.status == "ok")]
     rows = pd.DataFrame({"model": [], "experiment": []}, dtype=object)
     if len(finished):
         rows = stats.means(_once(of_one_machine(finished)), RECIPE, TABLE_2)
@@ -262,8 +256,10 @@ def successors(results: Results) -> pd.DataFrame:
     """
     runs = _successor_runs(results.finished.runs)
     rows: list[dict[str, Any]] = []
-    for dataset in SUCCESSOR_SCENES:
-        for scenes in _scene_sets(dataset):
+    for dataset, every in SUCCESSOR_SCENES.items():
+        # One scene, all scenes, and all but lego, which some published means leave out.
+        but_lego = [[scene for scene in every if scene != "lego"]] if "lego" in every else []
+        for scenes in [*([scene] for scene in every), every, *but_lego]:
             name = scenes[0] if len(scenes) == 1 else paper.AVERAGE
             place = {"dataset": dataset, "scene": name}
             rows += [row | place for row in _published(dataset, name, scenes)]
@@ -292,13 +288,6 @@ def _successor_runs(runs: pd.DataFrame) -> pd.DataFrame:
         recipe=[without(variant, *IN_THE_PROTOCOL) for variant in runs.variant],
     )
     return of_one_machine(_once(runs, SUCCESSOR_RECIPE)) if len(runs) else runs
-
-
-def _scene_sets(dataset: str) -> list[list[str]]:
-    """Return the scenes of each row: one scene, all scenes, and all but lego, which some published means leave out."""
-    scenes = SUCCESSOR_SCENES[dataset]
-    without_lego = [[scene for scene in scenes if scene != "lego"]] if "lego" in scenes else []
-    return [*([scene] for scene in scenes), scenes, *without_lego]
 
 
 def published(dataset: str) -> pd.DataFrame:

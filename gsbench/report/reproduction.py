@@ -43,21 +43,15 @@ SAME_LOAD = 0.5  # if the mean loads of two machines differ more, times are not 
 # `widest`. If `relative`, both are fractions of the mean of the reference.
 LIMITS = pd.DataFrame(
     {
-        "psnr_db": (0.01, 1.0, False),
-        "train_s": (0.25, 0.5, True),
-        "frame_ms": (0.25, 0.5, True),
-        "gaussians": (0.1, 0.25, True),
-        "model_mb": (0.1, 0.25, True),
+        "psnr_db": ("PSNR, dB", 0.01, 1.0, False),
+        "train_s": ("seconds, %", 0.25, 0.5, True),
+        "frame_ms": ("ms a frame, %", 0.25, 0.5, True),
+        "gaussians": ("Gaussians, %", 0.1, 0.25, True),
+        "model_mb": ("MB, %", 0.1, 0.25, True),
     },
-    index=["equal", "widest", "relative"],
-).T
-TITLES = {
-    "psnr_db": "PSNR, dB",
-    "train_s": "seconds, %",
-    "frame_ms": "ms a frame, %",
-    "gaussians": "Gaussians, %",
-    "model_mb": "MB, %",
-}
+    index=["title", "equal", "widest", "relative"],
+).T.astype({"equal": float, "widest": float, "relative": bool})
+TITLES: dict[str, str] = LIMITS.pop("title").to_dict()
 RULE = (
     "Rule: runs of a model on a scene are compared where training, data and measuring are equal; seconds and ms only "
     "of one machine with one load (within 0.5). PSNR, Gaussians and MB agree where every run is bit-equal with the "
@@ -223,7 +217,7 @@ def _differences(table: pd.DataFrame) -> pd.DataFrame:
     The variance over seeds is the mean of that of the row and of that pooled over the rows of its experiment, weighted
     by degrees of freedom; the pooled one has at most `POOLED_RUNS`, as models and scenes differ in spread.
     """
-    table = table.join(LIMITS.astype({"equal": float, "widest": float, "relative": bool}), on="quantity")
+    table = table.join(LIMITS, on="quantity")
     table["unit"] = table.reference.abs().where(table.relative & (table.reference != 0), 1.0)  # of LIMITS
     is_compared = table.reason == ""
     squares = (table.squares / table.unit**2).where(is_compared, 0.0)

@@ -105,15 +105,12 @@ class Section:
         """Return how a column is shown."""
         return self.columns.get(name) or COLUMNS.get(name) or Column(name)
 
-    def titles(self) -> list[str]:
-        """Return the titles of the shown columns."""
-        return [self.column(name).title for name in self.shown_columns]
-
     def shown(self, mark: Callable[[str, int], str] = lambda text, _: text) -> pd.DataFrame:
         """Return the table as texts on one line each, by title; `mark` gets the text of a number and its rank."""
+        titles = [self.column(name).title for name in self.shown_columns]
+        assert len(set(titles)) == len(titles), f"{self.key}: two columns have one title: {titles}"
         texts = [self._texts(name, mark) for name in self.shown_columns]
-        assert len(set(self.titles())) == len(texts), f"{self.key}: two columns have one title: {self.titles()}"
-        return pd.DataFrame(dict(zip(self.titles(), texts, strict=True)), dtype=object)
+        return pd.DataFrame(dict(zip(titles, texts, strict=True)), dtype=object)
 
     def is_number(self, name: str) -> bool:
         """Tell whether a column is of numbers, which are aligned at the right."""
@@ -149,9 +146,9 @@ def number(value: float, digits: int, *, signed: bool = False) -> str:
     return zero if shown.lstrip("+-") == zero else shown
 
 
-def span(values: pd.Series, digits: int, *, signed: bool = False) -> str:
+def span(values: pd.Series, digits: int) -> str:
     """Return the least and the largest number, such as "0.8 to 1.2", or one of them if they look alike."""
-    ends = (number(float(value), digits, signed=signed) for value in (values.min(), values.max()))
+    ends = (number(float(value), digits) for value in (values.min(), values.max()))
     return " to ".join(dict.fromkeys(ends))
 
 

@@ -1,7 +1,7 @@
 """Select the models, scenes and columns of a report (`--select model=7dgs,4dgs scene=trex column=psnr_db,fps`)."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from gsbench.errors import InputError, did_you_mean, printable
 from gsbench.report.frame import NUMBERS, Results
@@ -9,8 +9,7 @@ from gsbench.report.frame import NUMBERS, Results
 KEYS = ("model", "scene", "column")
 
 
-@dataclass(frozen=True)
-class Selection:
+class Selection(NamedTuple):
     """The models, scenes and columns that a report shows; an empty list stands for all of them."""
 
     models: list[str]

@@ -32,7 +32,7 @@ def means(runs: pd.DataFrame, by: list[str], quantities: Sequence[str]) -> pd.Da
     names = list(quantities)
     groups = runs.groupby([*by, "scene"])
     mean, variance, n = groups[names].mean(), groups[names].var(), groups[names].count()
-    is_elsewhere = np.outer(runs.machine != runs.timed_on, [name in TIMES for name in names])
+    is_elsewhere = np.outer(~runs.is_timed, [name in TIMES for name in names])
     lacks = (runs[names].isna() & ~is_elsewhere).groupby([runs[key] for key in [*by, "scene"]]).any()
     mean = mean.mask(lacks | (n == 0))
     variance = (variance / n).mask(mean.isna() | (n < 2))  # of the mean of a scene
@@ -133,16 +133,16 @@ def improvement(arrays: Grids, a: Key, b: Key) -> float:
     return float(np.mean(shares)) if shares else np.nan
 
 
-def is_on_frontier(points: pd.DataFrame, cost: str, quality: str = "psnr_db") -> pd.Series:
-    """Tell of each point whether its quality is higher than that of all cheaper points."""
-    ordered = points.dropna(subset=[cost]).sort_values([cost, quality], ascending=[True, False])
-    before = ordered[quality].cummax().shift(fill_value=-np.inf)
-    return (ordered[quality] > before).reindex(points.index, fill_value=False)
+def is_on_frontier(points: pd.DataFrame, cost: str) -> pd.Series:
+    """Tell of each point whether its PSNR is higher than that of all cheaper points."""
+    ordered = points.dropna(subset=[cost]).sort_values([cost, "psnr_db"], ascending=[True, False])
+    before = ordered.psnr_db.cummax().shift(fill_value=-np.inf)
+    return (ordered.psnr_db > before).reindex(points.index, fill_value=False)
 
 
-def is_dominated(points: pd.DataFrame, cost: str, quality: str = "psnr_db") -> pd.Series:
-    """Tell of each point whether another one is no worse in quality and in cost, and better in one of them."""
-    q, c = points[quality].to_numpy(), points[cost].to_numpy()
+def is_dominated(points: pd.DataFrame, cost: str) -> pd.Series:
+    """Tell of each point whether another one is no worse in PSNR and in cost, and better in one of them."""
+    q, c = points.psnr_db.to_numpy(), points[cost].to_numpy()
     as_good = (q[None] >= q[:, None]) & (c[None] <= c[:, None])  # [points, others]
     better = (q[None] > q[:, None]) | (c[None] < c[:, None])
     return pd.Series((as_good & better).any(axis=1), points.index)

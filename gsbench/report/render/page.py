@@ -13,7 +13,6 @@ import jinja2
 from markupsafe import Markup
 
 from gsbench.errors import printable
-from gsbench.measure.atomic import write_atomically
 from gsbench.report.frame import Results, title_of
 from gsbench.report.render import charts, text
 from gsbench.report.render.palette import MARKERS, THEMES, styles
@@ -21,7 +20,6 @@ from gsbench.report.section import Figure, Section
 from gsbench.report.section import text as short
 from gsbench.report.sections import built
 
-FILE_NAME = "report.html"
 MOST_ROWS = 250  # of a table that the page shows; its CSV file has all
 MOST_SORTABLE = 5000  # of a table whose rows the reader filters
 MOST_FAULTS = 20  # damaged records that are listed
@@ -44,22 +42,8 @@ class Article:
     links: Links = ()  # to other pages about these runs
 
 
-def write(results: Results, folder: Path, *, reload: int = 0, more: Sequence[Section] = ()) -> Path:
-    """Write the page of some runs to ``report.html`` in a folder, and return its path.
-
-    Args:
-        results: the tables of the runs, with at least one run.
-        folder: the folder of the page.
-        reload: seconds after which an open page reloads itself; 0 for never.
-        more: sections that are not of one experiment, such as a comparison with another folder.
-    """
-    path = folder / FILE_NAME
-    write_atomically(path, page(folder.resolve().name, results, reload=reload, more=more).encode())
-    return path
-
-
 def page(title: str, results: Results, *, reload: int = 0, more: Sequence[Section] = ()) -> str:
-    """Return the page as text; no script but its own can run in it, and none may evaluate text."""
+    """Return the page of at least one run as text; no script but its own can run in it, and none may evaluate text."""
     articles = [article(f"g{i}", chapter) for i, chapter in enumerate(results.chapters())]
     return rendered(title, articles, results.faults, more, reload=reload)
 
@@ -80,7 +64,7 @@ def rendered(
         title: the heading of the page.
         articles: its articles.
         faults: why records were left out.
-        more: sections that are not of one experiment.
+        more: sections that are not of one experiment, such as a comparison with another folder.
         reload: seconds after which an open page reloads itself; 0 for never.
         links: other pages, named above all articles.
         scripts_at: the address of `library` as a file, which many pages share; "" if the page has it in itself.

@@ -10,7 +10,6 @@ from gsbench.report.section import COLUMNS, Column, Section, section
 def candidates(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table: a row for each candidate on a scene."""
     runs = chapter.finished.runs
-    runs = runs.assign(is_timed=runs.machine == runs.timed_on)[runs.on_demand]  # on the machine of most runs
     rows = [
         {
             "scene": run.scene,
@@ -22,7 +21,7 @@ def candidates(chapter: Results, tests: pd.DataFrame) -> Section | None:
             "chosen": candidate.name == comparison.chosen,
             "why": candidate.reason,
         }
-        for run in runs.itertuples()
+        for run in runs[runs.on_demand].itertuples()
         if (comparison := run.record.on_demand.comparison)
         for candidate in comparison.candidates
     ]

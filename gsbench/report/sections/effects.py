@@ -47,19 +47,14 @@ def models(chapter: Results) -> tuple[dict[tuple[bool, ...], stats.Key], dict[tu
     return cells, cells | {cell: key for cell, key in zip(has, keys, strict=True) if key[0] in NESTED}
 
 
-def _is_single(name: str) -> bool:
-    """Tell whether a gain is that of one effect, not an interaction or a mean over models."""
-    return " × " not in name and "mean over" not in name
-
-
 @section(asked)
 def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table of prices, with their intervals in dB, seconds, milliseconds and MB."""
     by_unit = {quantity: tests[tests.quantity == quantity].set_index("name") for quantity in UNITS}
     assert all(table.index.is_unique for table in by_unit.values())
     gains = by_unit["psnr_db"]
-    is_shown = gains.index.map(lambda name: _is_single(name) or not name.endswith("nested"))
-    gains = gains[(gains.scenes > 0) & is_shown.to_numpy(bool)]
+    is_of_several = gains.index.str.contains(" × |mean over")  # an interaction, or a mean over models
+    gains = gains[(gains.scenes > 0) & ~(is_of_several & gains.index.str.endswith("nested"))]
     if gains.empty:
         return None
     table = pd.DataFrame({"effect": gains.index, "computed from": gains.weights.map(_words)})

@@ -26,15 +26,8 @@ SHOWN = (
     "psnr_best_on_test_db",
 )
 WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
-IF_MEASURED = (
-    "psnr_moving_db",
-    "psnr_object_db",
-    "lpips_vgg",
-    "flicker",
-    "static_drift",
-    "flicker_truth",
-    "psnr_best_on_test_db",
-)
+# Columns that are shown even if no run has them.
+ALWAYS = ("psnr_db", "psnr_train_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians")
 ORIGIN = ["contributor", "machine", "git_commit"]  # in a merged set, all runs of a row have the same
 TEXT = (
     "Mean over seeds ± half the width of the 95 % interval over seeds. Bold (in a terminal *): the best mean of a "
@@ -64,7 +57,7 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
     runs, ok = _by_row(chapter.runs), _by_row(chapter.finished.runs)
     origin = [name for name in ORIGIN if "contributor" in runs]
     is_all = set(asked) in (set(), set(WITH_TRAIN))  # no --select column=..
-    names = [n for n in asked or SHOWN if not (is_all and n in IF_MEASURED and ok[n].isna().all())]
+    names = [n for n in asked or SHOWN if not (is_all and n not in ALWAYS and ok[n].isna().all())]
     by_scene = [_means(ok[ok.scene == scene], names).assign(scene=scene) for scene in sorted(ok.scene.unique())]
     failed = runs[runs.status != "ok"]
     labels = failed.label + " seed " + failed.seed.astype(str) + ": " + failed.status
@@ -92,7 +85,7 @@ def _by_row(runs: pd.DataFrame) -> pd.DataFrame:
     times = pd.DataFrame([row(record) for record in runs.record], runs.index, TIMES, dtype=float)
     variant = runs.variant.map(lambda text: without(text, "from"))
     label = names_of(runs.assign(variant=variant)) if variant.nunique() > 1 else runs.model
-    runs = runs.assign(**times, timed_on=runs.machine, label=label, git_commit=runs.git_commit.str[:12])
+    runs = runs.assign(**times, is_timed=True, label=label, git_commit=runs.git_commit.str[:12])
     return runs.assign(row=runs[["label", *ORIGIN]].agg("\n".join, axis=1))
 
 

@@ -76,7 +76,7 @@ def _means(runs: pd.DataFrame) -> pd.DataFrame:
 
     The change of PSNR is that on the evaluated views, or on the views of the gate's check if a run lacks the first.
     """
-    rows = [_numbers(run.record, is_timed=run.machine == run.timed_on) for run in runs.itertuples()]
+    rows = [_numbers(run.record, is_timed=run.is_timed) for run in runs.itertuples()]
     names = [*SHOWN, "evaluated", "checked"]
     numbers = pd.DataFrame(rows, runs.index).reindex(columns=["gated_at_end", *TEXTS, *names])
     numbers = numbers.astype(dict.fromkeys(names, float) | dict.fromkeys(TEXTS, object))

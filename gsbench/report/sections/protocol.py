@@ -96,7 +96,7 @@ def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
     early = [r.stop.kept if r.stop and r.stop.kept < r.stop.iteration else None for r in runs.record]
     chosen = [r.length_choice.kept if r.length_choice else None for r in runs.record]
     facts = (
-        ("load of the machine, with the run itself", runs.load.where(runs.machine == runs.timed_on), 1),
+        ("load of the machine, with the run itself", runs.load.where(runs.is_timed), 1),
         ("most that float32 changes PSNR of a view, dB", runs.psnr_float32_db, 6),
         ("measured at the best iteration on val (train.patience)", early, 0),
         ("iterations of averaged parameters (train.average_from)", runs.averaged.where(runs.averaged > 0), 0),
@@ -134,7 +134,7 @@ def runs(chapter: Results, tests: pd.DataFrame) -> Section:
     all_runs = chapter.runs
     table = all_runs[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
     table = table.assign(
-        load=all_runs.load.where(all_runs.machine == all_runs.timed_on),
+        load=all_runs.load.where(all_runs.is_timed),
         commit=[_short("commit", value or "not recorded") for value in all_runs.git_commit],
         command=all_runs.record.map(command),
         reason=all_runs.reason,
