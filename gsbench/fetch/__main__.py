@@ -4,8 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from gsbench.errors import InputError, one_line, printable
-from gsbench.fetch.sources import Source, find, sources
+from gsbench.errors import InputError, did_you_mean, one_line, printable
+from gsbench.fetch.sources import Source, sources
 from gsbench.process.ending import end_with
 from gsbench.reading import as_json
 
@@ -38,12 +38,17 @@ def main(arguments: list[str] | None = None) -> int:
         ]
         print(as_json(listed))
         return 0
+    if options.list:
+        for source in known.values():
+            where = "is in" if source.target.exists() else "goes to"
+            print(printable(f"{source.name:<11} {source.what}; {where} {source.target}"))
+        return 0
     status = 0
-    for name in list(known) if options.list else options.names:
+    for name in options.names:
         try:
-            source = find(name, known)
-            line = line_of(source) if options.list else plan_of(source) if options.dry_run else fetch(source)
-            print(printable(line))
+            if name not in known:
+                raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
+            print(printable(plan_of(known[name]) if options.dry_run else fetch(known[name])))
         except (InputError, OSError) as error:
             print(f"gsbench.fetch: {one_line(error)}", file=sys.stderr)
             status = 2
@@ -64,11 +69,6 @@ def folder_of(path: Path) -> Path:
     raise InputError(f"--to: expected a folder, got {str(path)!a:.200}")
 
 
-def line_of(source: Source) -> str:
-    """Return the line of `--list` for one download: name, content and folder."""
-    return f"{source.name:<11} {source.what}; {'is in' if source.target.exists() else 'goes to'} {source.target}"
-
-
 def plan_of(source: Source) -> str:
     """Return what `--dry-run` prints for one download: the URL, the folder and the expected SHA-256."""
     if source.target.exists():
@@ -86,12 +86,12 @@ def fetch(source: Source) -> str:
     from gsbench.fetch.download import download, sha256_of
     from gsbench.fetch.unpack import scenes_in, unpack
 
-    if source.target.exists() and source.is_archive:
-        return f"{source.name}: {source.target} is there: nothing fetched; {scenes(scenes_in(source.target))}"
+    there = source.target.exists()
     if not source.is_archive:
-        there = source.target.exists()
         path = download(source, source.folder)
         return f"{source.name}: {path} {'is there: nothing fetched' if there else 'fetched'}"
+    if there:
+        return f"{source.name}: {source.target} is there: nothing fetched; {scenes(scenes_in(source.target))}"
     archive = download(source, source.folder.parent)
     digest = sha256_of(archive)
     try:

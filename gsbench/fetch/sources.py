@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 from omegaconf import OmegaConf
 
 from gsbench.config import CONF
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError
 
 MIRROR = "GSBENCH_MIRROR"  # an address; every file is then fetched from it, by the name in `Source.file`
 
@@ -79,17 +79,6 @@ def sources(data: Path) -> dict[str, Source]:
         _trunk("vgg"),
     ]
     return {source.name: source for source in known}
-
-
-def find(name: str, known: dict[str, Source]) -> Source:
-    """Return the source with this name.
-
-    Raises:
-        InputError: there is no such source.
-    """
-    if name not in known:
-        raise InputError(f"'{name}' is not known. {did_you_mean(name, known)}")
-    return known[name]
 
 
 def _is_address(text: str) -> bool:

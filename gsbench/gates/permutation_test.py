@@ -63,7 +63,11 @@ def follow_time(
         return float(energies[: slow.shape[1]].sum() / left) if left > 0 else 0.0
 
     actual = share(np.arange(len(times)))
-    null = np.array([share(_permutation(len(times), groups, random)) for _ in range(PERMUTATIONS)])
+    order, null = np.arange(len(times)), np.empty(PERMUTATIONS)
+    for i in range(PERMUTATIONS):
+        for group in groups or [range(len(times))]:  # no groups: None or an empty list
+            order[list(group)] = random.permutation(list(group))
+        null[i] = share(order)
     return ResidualsTest(*compare(actual, null), free)
 
 
@@ -87,14 +91,6 @@ def compare(
     p = (1 + int((null >= actual - TIE * abs(actual)).sum())) / (1 + len(null))
     spread = float(null.std())
     return p, (actual - float(null.mean())) / spread if spread > TIE * abs(actual) else 0.0
-
-
-def _permutation(views: int, groups: Sequence[Sequence[int]] | None, random: np.random.Generator) -> NDArray[np.int64]:
-    """Draw a random permutation of views; with `groups`, views are permuted only within each group."""
-    order = np.arange(views)
-    for group in groups or [range(views)]:  # no groups: None or an empty list
-        order[list(group)] = random.permutation(list(group))
-    return order
 
 
 def _range(columns: Array) -> Array:

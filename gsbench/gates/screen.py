@@ -18,7 +18,7 @@ import torch
 
 from gsbench.errors import InputError
 from gsbench.gates.fixed_camera_test import compare_images
-from gsbench.gates.permutation_test import Array, follow_time
+from gsbench.gates.permutation_test import follow_time
 from gsbench.gates.shared_viewpoints import Viewpoints, group_by_viewpoint
 from gsbench.gates.static_fit_residuals import camera_basis, gradient_products, smaller
 from gsbench.measure.record import TimeScreen
@@ -108,7 +108,8 @@ def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str)
     times = np.array([view.time for view in views], dtype=np.float64)
     ends = np.cumsum([len(group) for group in viewpoints.held])  # views of a held camera are next to each other
     held = [list(range(end - len(group), end)) for end, group in zip(ends, viewpoints.held, strict=True)]
-    camera = _indicators(held) if held else camera_basis(views)  # the influence that the test removes
+    # The influence that the test removes: [V, P] 1 for a view from a position, or functions of the camera.
+    camera = np.repeat(np.eye(len(held)), list(map(len, held)), axis=0) if held else camera_basis(views)
     test = follow_time(gradient_products(views, scene, seed, backend), times, camera, seed, held)
     if test.free < LEAST_FREE:
         reason = (
@@ -127,11 +128,6 @@ def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str)
     else:
         decision, reason = OFF, f"a static model's error does not change over time (p = {test.p:.3f})"
     return _answer(decision, reason, test.p, test.z, test.free)
-
-
-def _indicators(groups: list[list[int]]) -> Array:  # [V, P]
-    """Return indicator variables of P camera positions: 1 for a view from the position, 0 for other views."""
-    return np.repeat(np.eye(len(groups)), [len(group) for group in groups], axis=0)
 
 
 def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:

@@ -181,16 +181,11 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
 
 def check_runs(runs: Sequence[RunConfig]) -> None:
     """Raise InputError if an override does nothing in any of the runs, or if two of them are one run."""
-    _check_needs(runs)
-    _check_distinct(runs)
-
-
-def _check_needs(runs: Sequence[RunConfig]) -> None:
-    """Raise InputError if an override does nothing in any of the runs, for lack of another key that it needs."""
     for key in sorted({key_of(word) for run in runs for word in run.overrides}):
         needed = facts(key).needs
         if needed and all(OmegaConf.select(run.config, needed) in (None, facts(needed).absent) for run in runs):
             raise InputError(f"{key}: expected {needed} too, without which it does nothing: set it, or leave {key} out")
+    _check_distinct(runs)
 
 
 def _check_distinct(runs: Sequence[RunConfig]) -> None:

@@ -83,11 +83,6 @@ def forget(folder: Path) -> None:
         folder.parent.rmdir()
 
 
-def log_of(folder: Path, number: int) -> Path:
-    """Return the path of the log of a run's Slurm job."""
-    return folder / f"{number}.log"
-
-
 def write_ended(folder: Path, number: int, ended: Ended) -> None:
     """Write the outcome of run `number` of the sweep whose plan is in `folder`."""
     write_atomically(folder / ENDED / f"{number}.json", as_json(ended).encode())

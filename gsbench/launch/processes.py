@@ -95,7 +95,10 @@ def launch_parallel(configs: Sequence[RunConfig], folder: Path) -> None:
         raise InputError(f"launch.at_once: expected at least 1, or -1 for one run for each CPU, got {at_once}")
     most = cpus if at_once == -1 else at_once
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, cpus // most)))
-    _import_torch()
+    if too_little_address_space() is None:
+        # What a run needs is imported here, so that its process has it; if that fails, each run says so itself.
+        with contextlib.suppress(ImportError, OSError, MemoryError):
+            import gsbench.run.execution  # noqa: F401
     running: Running = {}
     try:
         with stop.requested() as request:
@@ -150,14 +153,6 @@ def _end(running: Running, signal_number: int) -> None:
             del running[process]
     except Stopped as again:
         _end(running, again.number)
-
-
-def _import_torch() -> None:
-    """Import what a run needs, so that its process has it; if that fails, each run says so itself."""
-    if too_little_address_space() is not None:
-        return
-    with contextlib.suppress(ImportError, OSError, MemoryError):
-        import gsbench.run.execution  # noqa: F401
 
 
 def _work(config: RunConfig, folder: Path, run_number: int, request: Request, parent: int, at_once: int) -> None:

@@ -10,6 +10,8 @@ import platform
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsbench.process.memory import lines_of
+
 CPUINFO = Path("/proc/cpuinfo")
 MEMINFO = Path("/proc/meminfo")
 # Keys of /proc/cpuinfo, on x86-64 and on aarch64.
@@ -63,8 +65,5 @@ def processor_name() -> str:
 
 def _facts(path: Path) -> dict[str, str]:
     """Return the first value of each key in a file of lines `key : value`, such as /proc/cpuinfo; {} without it."""
-    try:
-        lines = path.read_text().splitlines()
-    except OSError:
-        return {}
-    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    pairs = (line.partition(":") for line in reversed(lines_of(path)))
+    return {key.strip(): value.strip() for key, _, value in pairs}

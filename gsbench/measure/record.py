@@ -335,7 +335,8 @@ def run_path(root: Path, experiment: str, scene: str, model: str, seed: int, *, 
         InputError: a name has characters that a folder name may not have, or the seed is out of range.
     """
     _check_names(experiment, scene, model, variant, "")
-    _check_seed(seed, "")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed: expected 0 <= seed < 2^63, got {seed}")
     return root / experiment / scene / model_folder(model, variant) / f"seed{seed}"
 
 
@@ -352,11 +353,6 @@ def _check_names(experiment: str, scene: str, model: str, variant: str, where: s
             raise InputError(f"{where}{what}: expected a name of letters, digits and _ . + -, got {name!r:.80}")
     if not re.fullmatch(r"([A-Za-z0-9][A-Za-z0-9_.+,=-]{0,99})?", variant):
         raise InputError(f"{where}variant: expected words such as iterations=10, got {variant!r:.80}")
-
-
-def _check_seed(seed: int, where: str) -> None:
-    if not 0 <= seed < 2**63:
-        raise InputError(f"{where}seed: expected 0 <= seed < 2^63, got {seed}")
 
 
 def check(record: Record, file: str) -> None:

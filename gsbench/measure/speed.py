@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from gsbench.errors import InputError
 
@@ -119,7 +119,7 @@ class StageClock:
 
     def __init__(self, device: str = "cpu") -> None:
         self._seconds: dict[str, float] = {}
-        self._clock = _clock_of(device)
+        self._clock = _DeviceClock(device) if device.startswith("cuda") else _HostClock()
         self._ended: deque[tuple[str, Any, Any]] = deque()  # name, start and end of stages that are not yet in the sums
         self._current: str | None = None
         self._last: Any = None  # when the last stage ended; None outside of `running`
@@ -127,12 +127,20 @@ class StageClock:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Time a block of work as a whole: what is in none of its stages counts as the stage OTHER."""
-        self._last = self._clock.mark()
+        self.start()
         try:
             yield
         finally:
-            self._end(OTHER, self._last)
+            self.lap(OTHER)
             self._last = None
+
+    def start(self) -> None:
+        """Start the first of consecutive stages, which end by `lap`."""
+        self._last = self._clock.mark()
+
+    def lap(self, name: str) -> None:
+        """End a stage that began where the one before ended, and name it."""
+        self._end(name, self._last)
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
@@ -181,7 +189,7 @@ class StageClock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Return the seconds of each stage; on a GPU this waits for the device."""
+        """Return the seconds of each stage, ordered by when it first ended; on a GPU this waits for the device."""
         while self._ended:
             self._add_one()
         return self._seconds
@@ -215,37 +223,6 @@ class StageClock:
         """Replace the seconds of each stage by those of a checkpoint."""
         self._ended.clear()
         self._seconds = {name: float(seconds) for name, seconds in state.items()}
-
-
-class Laps:
-    """Measures the seconds of consecutive stages in a block of work; each stage begins where the previous one ended.
-
-    On a GPU, CUDA events mark the ends of stages, so that the CPU waits for the GPU only when the seconds are read.
-    """
-
-    def __init__(self, device: str = "cpu") -> None:
-        """Start the first stage."""
-        self._clock = _clock_of(device)
-        self._last = self._clock.mark()
-        self._ended: list[tuple[str, Any, Any]] = []  # name, start and end of each stage
-
-    def end(self, name: str) -> None:
-        """End the current stage and give it a name; the seconds of stages with equal names are added."""
-        end = self._clock.mark()
-        self._ended.append((name, self._last, end))
-        self._last = end
-
-    def has(self, name: str) -> bool:
-        """Return whether a stage with this name has ended."""
-        return any(name == ended for ended, _, _ in self._ended)
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Return the seconds of each stage, ordered by when it first ended; on a GPU this waits for the device."""
-        sums: dict[str, float] = {}
-        for name, start, end in self._ended:
-            sums[name] = sums.get(name, 0.0) + self._clock.seconds(start, end)
-        return sums
 
 
 class Effort:
@@ -306,15 +283,9 @@ def load() -> float:
         return math.nan
 
 
-class _Clock(Protocol):
-    """A clock that marks moments and measures the seconds between two marks."""
-
-    def mark(self) -> Any: ...
-    def has_passed(self, mark: Any) -> bool: ...
-    def seconds(self, start: Any, end: Any) -> float: ...
-
-
 class _HostClock:
+    """A clock that marks moments, and measures the seconds between two marks."""
+
     def mark(self) -> float:
         return time.perf_counter()
 
@@ -344,10 +315,6 @@ class _DeviceClock:
     def seconds(self, start: Any, end: Any) -> float:
         end.synchronize()
         return float(start.elapsed_time(end)) / 1000
-
-
-def _clock_of(device: str) -> _Clock:
-    return _DeviceClock(device) if device.startswith("cuda") else _HostClock()
 
 
 def reset_peak_memory(device: str = "cpu") -> None:

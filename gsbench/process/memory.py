@@ -65,7 +65,7 @@ def available() -> int | None:
 
 
 def _system() -> int | None:
-    lines = _lines(Path("/proc/meminfo"))
+    lines = lines_of(Path("/proc/meminfo"))
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
@@ -119,13 +119,13 @@ def left_by_control_groups(root: Path = Path("/")) -> int | None:
 def _folders(root: Path) -> Iterator[tuple[str, Path]]:
     """Yield the version and the folder of each control group that can limit this process: its own and those above."""
     groups = {}  # the path of this process' group, by the version of control groups
-    for line in _lines(root / "proc/self/cgroup"):
+    for line in lines_of(root / "proc/self/cgroup"):
         number, controllers, path = (*line.split(":", 2), "", "")[:3]  # also of a damaged line
         if number == "0" and not controllers:
             groups["cgroup2"] = path
         elif "memory" in controllers.split(","):
             groups["cgroup"] = path
-    for line in _lines(root / "proc/self/mountinfo"):
+    for line in lines_of(root / "proc/self/mountinfo"):
         mount, _, filesystem = line.partition(" - ")
         kind, _, options = filesystem.partition(" ")
         fields = [re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), x) for x in mount.split(" ")]
@@ -142,13 +142,14 @@ def _left(folder: Path, files: Files) -> int | None:
     """Return the bytes that one control group leaves; None if it has no limit."""
     try:
         left = int((folder / files.limit).read_text()) - int((folder / files.used).read_text())
-        cached = [int(n) for key, n in (x.split() for x in _lines(folder / "memory.stat")) if key == files.cache]
+        cached = [int(n) for key, n in (x.split() for x in lines_of(folder / "memory.stat")) if key == files.cache]
     except (OSError, ValueError):  # no such group, no limit ("max"), or something else than numbers
         return None
     return max(0, left + sum(cached))
 
 
-def _lines(path: Path) -> list[str]:
+def lines_of(path: Path) -> list[str]:
+    """Return the lines of a file of the system, such as /proc/meminfo; none if it cannot be read."""
     try:
         return path.read_text().splitlines()
     except (OSError, ValueError):  # ValueError: not text

@@ -9,6 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
+from gsbench.process.memory import lines_of
+
 HUGE = 1 << 29  # bytes of the heap that ask for huge pages
 HUGE_PAGE = 1 << 21  # bytes of one
 MADV_HUGEPAGE = 14  # madvise(2)
@@ -102,8 +104,4 @@ def compute_the_same_bits() -> None:
 
 
 def _has_avx512() -> bool:
-    try:
-        lines = CPUINFO.read_text().splitlines()
-    except OSError:
-        return False
-    return any(line.startswith("flags") and " avx512f" in line for line in lines)
+    return any(line.startswith("flags") and " avx512f" in line for line in lines_of(CPUINFO))

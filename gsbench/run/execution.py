@@ -143,7 +143,8 @@ class Execution:
     def measure(self, trainer: Trainer) -> Record:
         """Measure image quality, speed and size of the trained model, and return the record."""
         results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
-        measured = measuring.measure(trainer, self.chosen.config, with_effect_sets="on_demand" in results)
+        with_effect_sets = "on_demand" in results
+        measured, cost, frames = measuring.measure(trainer, self.chosen.config, with_effect_sets=with_effect_sets)
         self._images = measured.images
         record = self.describe("ok", None)
         fields = {name: value for name, value in results.items() if hasattr(record, name)}  # `parts` has the others
@@ -151,12 +152,12 @@ class Execution:
         exact_views = trainer.exact.union(*(view.exact for view in measured.per_view))  # the render equals the image
         return replace(
             record,
-            protocol=record.protocol | measured.frames,
+            protocol=record.protocol | frames,
             metrics=measured.metrics,
             missing=measured.missing,
             per_view=measured.per_view,
             regions=measured.regions,
-            cost=measured.cost,
+            cost=cost,
             curve=trainer.curve.points,
             **fields,
             parts=of_other_hooks | {"steps": trainer.gradients.replay.counts},

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from gsbench.errors import InputError
 from gsbench.models import GaussianModel
 from gsbench.run import progress, stop
 from gsbench.run.identity import RunSpec
-from gsbench.run.load import plain_description
+from gsbench.run.load import SceneDescription
 from gsbench.run.setup import evaluated_views
 from gsbench.scenes import Points, Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -70,7 +71,7 @@ def resume(trainer: Trainer, spec: RunSpec, state: dict[str, Any] | None) -> boo
 def save(state: dict[str, Any], spec: RunSpec, scene: Scene, plain: dict[str, Any]) -> None:
     """Write the checkpoint of a run: a trainer's state, with the settings as plain values."""
     path, hashes = _checkpoint_of(spec, scene)
-    checkpoint.save(path, Checkpoint(*hashes, state, plain, plain_description(scene)))
+    checkpoint.save(path, Checkpoint(*hashes, state, plain, asdict(SceneDescription.of(scene))))
 
 
 def _checkpoint_of(spec: RunSpec, scene: Scene) -> tuple[Path, tuple[str, str]]:

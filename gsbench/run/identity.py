@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +54,6 @@ def identify(composed: DictConfig, choices: Mapping[str, str] | None = None, ove
     Raises:
         InputError: a name is not a valid folder name, or the file of trained Gaussians does not exist.
     """
-    for key in fields(Config):
-        if key.name not in composed:
-            raise deleted_key(key.name)
     config: Config = OmegaConf.to_object(composed)  # type: ignore[assignment]
     for dotted, name in (("experiment", config.experiment), ("scene.name", config.scene.name)):
         if name == records.PUBLISHED:
@@ -93,7 +90,8 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     Raises:
         InputError: a setting of the model was deleted, which no name could tell.
     """
-    standard = _standard_choices()
+    defaults: Any = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
+    standard = {group: choice for entry in defaults if isinstance(entry, dict) for group, choice in entry.items()}
     groups = {group: choice for group, choice in choices.items() if choice and names_variant(group)}
     words = [f"{group}={_printed(choice)}" for group, choice in groups.items() if standard.get(group) != choice]
     # The overrides that compose the experiment as it is, with this model, scene and seed, to compare with.
@@ -114,12 +112,6 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     for (key, value), short in zip(changed.items(), shorts, strict=True):
         words.append(f"{short if shorts.count(short) == 1 else key}={_printed(value)}")
     return _cut(words)
-
-
-def _standard_choices() -> dict[str, str]:
-    """Return the choice of each config group in conf/config.yaml."""
-    entries: Any = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
-    return {group: choice for entry in entries if isinstance(entry, dict) for group, choice in entry.items()}
 
 
 def _storable(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """Load the model of a finished or interrupted run from its folder, and the scene on which it was trained."""
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -170,11 +170,6 @@ def trusted_root(root: str, where: Path) -> str:
             f"which would be imported: if you trust it, name it by --data-root"
         )
     return root
-
-
-def plain_description(scene: Scene) -> dict[str, Any]:
-    """Return the description of a scene as plain values, for a checkpoint."""
-    return asdict(SceneDescription.of(scene))
 
 
 def typed_config(plain: dict[str, Any], path: Path) -> Config:

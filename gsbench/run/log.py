@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from gsbench.config_roles import flat
 from gsbench.errors import InputError, did_you_mean, how_to_install, one_line
@@ -33,8 +33,17 @@ LONGEST_PARAMETER = 500  # letters, of MLflow
 SECONDS = "10"  # that MLflow waits for a server
 WANDB_SECONDS = 30.0  # that Weights & Biases waits for a server
 
+# By the name of a number in a tracker, the key in a line of curve.jsonl.
+SENT = {
+    "val/psnr": "psnr_val",
+    "train/loss": "loss",
+    "train/seconds": "seconds",
+    "train/gaussians": "gaussians",
+}
+
 Numbers = Mapping[str, float]
 Line = dict[str, Any]  # of curve.jsonl
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -112,7 +121,7 @@ class MLflow:
     """Logs to the server that MLFLOW_TRACKING_URI names, or else into this folder."""
 
     def __init__(self, subject: Subject) -> None:
-        for key, value in (("TIMEOUT", SECONDS), ("MAX_RETRIES", "1")):
+        for key, value in (("TIMEOUT", SECONDS), ("MAX_RETRIES", "1")):  # which MLflow may read when it is imported
             os.environ.setdefault(f"MLFLOW_HTTP_REQUEST_{key}", value)
         import mlflow
 
@@ -161,43 +170,6 @@ def check_tracker(name: str | None) -> None:
         )
 
 
-class Guarded:
-    """Calls a tracker until its first error, which is printed once; the run goes on without the tracker."""
-
-    def __init__(self, name: str | None, subject: Subject) -> None:
-        """Start the tracker `name`; None stands for no tracker."""
-        self.name = name
-        self.tracker: Tracker | None = None
-        if name is not None:
-            self._guard(lambda: self._start(name, subject))
-
-    def _start(self, name: str, subject: Subject) -> None:
-        self.tracker = TRACKERS[name](subject)
-
-    def add(self, step: int, numbers: Numbers) -> None:
-        """Send numbers that were measured after `step` steps."""
-        if tracker := self.tracker:
-            self._guard(lambda: tracker.add(step, numbers))
-
-    def end(self, status: str) -> None:
-        """End the tracking."""
-        if tracker := self.tracker:
-            self._guard(lambda: tracker.end(status))
-        self.tracker = None
-
-    def _guard(self, call: Callable[[], None]) -> None:
-        """Call a function; if it raises an error, print this and use the tracker no more."""
-        try:
-            call()
-        except Exception as error:
-            self.tracker = None
-            print(
-                f"gsbench: warning: log={self.name}: {type(error).__name__}: {one_line(error)}: the run goes on "
-                f"without it",
-                file=sys.stderr,
-            )
-
-
 def _read_id(subject: Subject) -> str | None:
     """Return the id of a run that continues; None if it starts anew or no id was stored."""
     try:
@@ -220,9 +192,7 @@ class RunLog:
         A line of a later step is removed from curve.jsonl: a killed run wrote it after its last checkpoint, and the
         step is trained again.
         """
-        self.path = spec.folder / FILE_NAME
-        self.trainer = trainer
-        self.split = spec.config.scene.eval_split
+        self.path, self.trainer, self.config = spec.folder / FILE_NAME, trainer, spec.config
         points = trainer.curve.points
         earlier_lines = _read_curve(self.path)
         lines = [earlier_lines.get(point, _line(point)) for point in points]
@@ -231,10 +201,12 @@ class RunLog:
             write_atomically(self.path, "".join(map(_text, lines)).encode(), lasting=False)
         continued = trainer.step if spec.config.resume else 0
         subject = Subject(spec.folder, spec.name, spec.config.experiment, dict(flat(spec.plain)), continued)
-        self.tracker = Guarded(spec.config.log, subject)
+        self.tracker: Tracker | None = None  # None also after its first error
+        if (name := spec.config.log) is not None:
+            self.tracker = self._guarded(lambda: TRACKERS[name](subject))
         for point, line in zip(points, lines, strict=True):
             if point not in earlier_lines:  # measured before the run had a log, while models or lengths were compared
-                self._send(point, line)
+                self._send_line(line)
 
     def follow(self) -> None:
         """Write what was measured since the last call; called after every step."""
@@ -242,31 +214,42 @@ class RunLog:
             line = _line(point, self.trainer.finite_check.loss, len(self.trainer.model))
             with contextlib.suppress(OSError), self.path.open("a") as file:
                 file.write(_text(line))
-            self._send(point, line)
+            self._send_line(line)
             self.written += 1
-
-    def _send(self, point: Point, line: Line) -> None:
-        """Send a line of curve.jsonl to the tracker."""
-        self.tracker.add(
-            point.iteration,
-            _finite(
-                {
-                    "val/psnr": line["psnr_val"],
-                    "train/loss": line["loss"],
-                    "train/seconds": line["seconds"],
-                    "train/gaussians": line["gaussians"],
-                }
-            ),
-        )
 
     def end(self, record: Record | None) -> None:
         """Send the results of the record and end the tracking; None if a signal has stopped the run."""
         if record and record.metrics and record.cost:
             names = ("train_s", "fps", "num_gaussians", "bytes")
-            numbers = {f"{self.split}/{name}": value for name, value in record.metrics.items()}
+            numbers = {f"{self.config.scene.eval_split}/{name}": value for name, value in record.metrics.items()}
             numbers |= {f"cost/{name}": getattr(record.cost, name) for name in names}
-            self.tracker.add(self.trainer.step, _finite(numbers))
-        self.tracker.end(record.status if record else "stopped")
+            self._send(self.trainer.step, numbers)
+        if tracker := self.tracker:
+            self._guarded(lambda: tracker.end(record.status if record else "stopped"))
+        self.tracker = None
+
+    def _send_line(self, line: Line) -> None:
+        """Send a line of curve.jsonl to the tracker."""
+        self._send(line["iteration"], {name: line[key] for name, key in SENT.items()})
+
+    def _send(self, step: int, numbers: Mapping[str, float | None]) -> None:
+        """Send what is known and finite of some numbers to the tracker."""
+        finite = {name: float(value) for name, value in numbers.items() if value is not None and math.isfinite(value)}
+        if tracker := self.tracker:
+            self._guarded(lambda: tracker.add(step, finite))
+
+    def _guarded(self, call: Callable[[], T]) -> T | None:
+        """Call a function of the tracker; if it raises an error, print this once, and go on without the tracker."""
+        try:
+            return call()
+        except Exception as error:
+            self.tracker = None
+            print(
+                f"gsbench: warning: log={self.config.log}: {type(error).__name__}: {one_line(error)}: the run goes on "
+                f"without it",
+                file=sys.stderr,
+            )
+            return None
 
 
 def _line(point: Point, loss: float | None = None, gaussians: int | None = None) -> Line:
@@ -299,7 +282,3 @@ def _read_curve(path: Path) -> dict[Point, Line]:
 
 def _number(value: Any) -> Any:
     return value if type(value) in (int, float) else None
-
-
-def _finite(numbers: dict[str, float | None]) -> dict[str, float]:
-    return {name: float(value) for name, value in numbers.items() if value is not None and math.isfinite(value)}

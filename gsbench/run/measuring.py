@@ -5,7 +5,7 @@
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy.typing as npt
@@ -34,25 +34,12 @@ Pairs = list[tuple[npt.ArrayLike, npt.ArrayLike]]  # render and ground truth, [H
 
 @dataclass(frozen=True)
 class Measured:
-    """The measurements of a trained model for its record, and images to be written beside the record."""
+    """The measurements of the images of evaluated views for a record, and pictures to be written beside it."""
 
     metrics: dict[str, float | None]
     missing: dict[str, str]  # why a metric has no value
     per_view: list[ViewScore]
-    regions: dict[str, Region]  # the pixels of `psnr_moving` and `psnr_object`
-    cost: Cost
-    frames: dict[str, str]  # whether frames on a GPU are replayed from a CUDA graph, for the record
-    images: dict[str, Pixels]  # images by file name
-
-
-@dataclass(frozen=True)
-class MeasuredImages:
-    """The measurements of the images of evaluated views alone, and pictures of some of them beside the ground truth."""
-
-    metrics: dict[str, float | None]
-    missing: dict[str, str]  # why a metric has no value
-    per_view: list[ViewScore]
-    regions: dict[str, Region]
+    regions: dict[str, Region]  # the pixels of `psnr_moving`, `psnr_object` and `flicker`
     images: dict[str, Pixels]  # by file name
     still: Sequence[Still]  # films with their static pixels
     no_film: str  # why there is none
@@ -63,7 +50,7 @@ def measure_images(
     renders: Iterable[Tensor],  # [H, W, 3] of each view
     background: tuple[float, float, float],
     config: Config,
-) -> MeasuredImages:
+) -> Measured:
     """Measure the renders of the evaluated views, of which one at a time is in memory, by the protocol of a config.
 
     `evaluate` asks for one (name, render, ground truth) after the other; regions and flicker look at each on its way.
@@ -78,7 +65,7 @@ def measure_images(
         quantised=config.protocol.quantise,
         weights=lpips_weights(config),
     )
-    return MeasuredImages(
+    return Measured(
         metrics=quality.metrics | regions.metrics() | flicker.metrics(),
         missing=quality.missing | regions.missing() | flicker.missing(),
         per_view=regions.with_scores(quality.per_view),
@@ -105,8 +92,11 @@ def protocol_of(config: Config, scene: Scene | None) -> dict[str, Any]:
     }
 
 
-def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Measured:
-    """Measure a trained model on the evaluated views; `with_effect_sets` also draws what each Gaussian depends on."""
+def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> tuple[Measured, Cost, dict[str, str]]:
+    """Measure a trained model on the evaluated views: images, cost, and the note of `frames`, which the record has too.
+
+    `with_effect_sets` also draws what each Gaussian depends on.
+    """
     views = trainer.views
     measured = measure_images(views, map(trainer.render, views), trainer.scene.background, config)
     times, note = time_frames(trainer, views)
@@ -134,7 +124,7 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> Meas
         first = views[0]
         effect_sets = picture.draw(trainer.model, first.camera, first.time, renderer.background, renderer.antialias)
         images = images | {"effect_sets.png": effect_sets}
-    return Measured(metrics, missing, measured.per_view, measured.regions, cost, note, images)
+    return replace(measured, metrics=metrics, missing=missing, images=images), cost, note
 
 
 def _beside_truth(
@@ -174,9 +164,7 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
     return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
 
 
-def with_best(
-    measured: MeasuredImages, trainer: Trainer, config: Config
-) -> tuple[dict[str, float | None], dict[str, str]]:
+def with_best(measured: Measured, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
     """Return the metrics of the last iteration, with the PSNR at the iteration that was best on val added.
 
     With `protocol.best_on_test`, the highest PSNR on the evaluated split during training is added too.

@@ -27,7 +27,7 @@ from gsbench.measure.speed import Effort
 from gsbench.models.gated import has_gates
 from gsbench.run import fitting, measuring, progress
 from gsbench.run.identity import RunSpec
-from gsbench.run.settings import HOW_TO, candidates, is_auto, with_candidate
+from gsbench.run.settings import HOW_TO, candidates, with_candidate
 from gsbench.run.setup import build, build_with_placeholders, check_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
@@ -146,7 +146,8 @@ class Candidates:
                 reporter=lambda: progress.Reporter(spec.folder, spec.overrides, steps, done, seconds),
             )
             frame_ms = measuring.time_frames(trainer, self.scene.val)[0].p50
-            self._check_frame(frame_ms)
+            if (most := spec.config.effects.most_frame_ms) is not None and frame_ms > most:
+                raise OverBudgetError(f"more than effects.most_frame_ms={most:g}")
         except (DivergedError, fitting.NoGaussianError, OverBudgetError) as raised:
             error = raised.with_traceback(None)  # the traceback keeps the trainer in memory, and so does the context
             error.__context__ = None
@@ -159,12 +160,6 @@ class Candidates:
         most, last = self.spec.config.effects.most_seconds, trainer.curve.last
         if most is not None and last is not None and last.seconds > most:
             raise OverBudgetError(f"more than effects.most_seconds={most:g} after {last.iteration} iterations")
-
-    def _check_frame(self, frame_ms: float) -> None:
-        """Raise OverBudgetError if a frame takes too long."""
-        most = self.spec.config.effects.most_frame_ms
-        if most is not None and frame_ms > most:
-            raise OverBudgetError(f"more than effects.most_frame_ms={most:g}")
 
     def _run(self, name: str) -> RunSpec:
         """Return the run of a candidate, whose folder is in that of the run and holds only its checkpoint."""
@@ -256,13 +251,11 @@ def choose_model(spec: RunSpec, scene: Scene) -> ChosenModel:
     """Replace model=auto by a model with or without time, after a test whether the training views change with time.
 
     The reason is printed. If the test is undecided, the model has time: training 7DGS on a static scene costs a few
-    seconds, but 6DGS on a moving scene loses the motion. Other settings are returned unchanged.
+    seconds, but 6DGS on a moving scene loses the motion.
 
     Raises:
         InputError: the settings lack a candidate of model=auto.
     """
-    if not is_auto(spec.config):
-        return ChosenModel(spec.config)
     import_compiler()
     effort = Effort()
     with effort:

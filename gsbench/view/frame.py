@@ -16,7 +16,7 @@ from gsbench.gates.picture import cost_colors, effect_set_colors
 from gsbench.kernels.operation import Operation, Results
 from gsbench.kernels.tape import Tape
 from gsbench.measure.images import STEPS, Pixels, inferno, rounding_image, to_bytes
-from gsbench.measure.speed import Laps
+from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.render import rasterize_slice, render_slice
@@ -91,7 +91,9 @@ class StageWatch(Tape):
 
     def __init__(self, device: str) -> None:
         super().__init__()
-        self._laps = Laps(device)
+        self._clock = StageClock(device)
+        self._clock.start()
+        self._ended: set[str] = set()  # stages that a kernel has ended
 
     def record(
         self, operation: Operation, tensors: list[Tensor], numbers: Sequence[Any], results: Results | None
@@ -103,21 +105,22 @@ class StageWatch(Tape):
         if results is not None:
             return results[0]
         if operation.name in _FOLLOWS:
-            self._laps.end(_FOLLOWS[operation.name])
+            self._clock.lap(_FOLLOWS[operation.name])
         outputs, _ = operation.run(tensors, numbers)
         if operation.name in _ENDS:
-            self._laps.end(_ENDS[operation.name])
+            self._ended.add(_ENDS[operation.name])
+            self._clock.lap(_ENDS[operation.name])
         return outputs
 
     def end(self, part: str) -> None:
         """End SLICE or RASTER; the time since its last kernel belongs to its last stage, or to it if there is none."""
         last = STAGES[part][-1]
-        self._laps.end(last if self._laps.has(last) else part)
+        self._clock.lap(last if last in self._ended else part)
 
     @property
     def ms(self) -> dict[str, float]:
         """Return the milliseconds of each stage that was measured."""
-        return {name: 1000 * seconds for name, seconds in self._laps.seconds.items()}
+        return {name: 1000 * seconds for name, seconds in self._clock.seconds.items()}
 
 
 class FrameRenderer:

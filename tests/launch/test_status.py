@@ -55,7 +55,7 @@ def traced(
     folder.mkdir(parents=True, exist_ok=True)
     if plan_of is not None:
         at_plan = planned(experiment, **plan_of)
-        plan.log_of(at_plan, 0).write_text(log)
+        (at_plan / "0.log").write_text(log)
         if ended:
             plan.write_ended(at_plan, 0, ended)
     if progress_of is not None:

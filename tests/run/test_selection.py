@@ -235,16 +235,14 @@ def test_a_candidate_that_fails_loses(choice, square, tmp_path, monkeypatch):
         ("undecided", ("auto",), "7dgs", True),
         ("off", ("auto",), "6dgs", False),
         ("on", ("auto", "agr=false"), "7dgs", False),
-        (None, ("4dgs",), "4dgs", False),
     ],
 )
 def test_a_scene_that_may_move_has_a_model_with_time(decision, words, model, agr, monkeypatch):
-    """Catches an undecided scene that loses its motion, AGR in a static model, and a screen for a model with a name."""
-    monkeypatch.setattr(selection, "screen_time", lambda *_: screen(str(decision)))
+    """Catches an undecided scene that loses its motion, and AGR in a static model."""
+    monkeypatch.setattr(selection, "screen_time", lambda *_: screen(decision))
     config = compose(words[0], 10, *words[1:])
     chosen = choose_model(RunSpec(config, {}, Path("nowhere"), config.model.name), moving_square())
-    screened = chosen.screen.decision if chosen.screen else None
-    assert (chosen.config.model.name, chosen.config.agr, screened) == (model, agr, decision)
+    assert (chosen.config.model.name, chosen.config.agr, chosen.screen.decision) == (model, agr, decision)
 
 
 def test_a_scene_without_times_is_static_and_not_compared(tmp_path):
