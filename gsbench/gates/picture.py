@@ -5,14 +5,13 @@ refinement). In the third, the time that each Gaussian takes in a frame (constan
 alpha-composited like a colour. Bright yellow is a Gaussian with AGR and the full SH degree, black is no cost.
 """
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsbench.gates.gate import cost_of, most_cost
 from gsbench.gates.messages import EFFECT_SETS
-from gsbench.measure.images import GAP, Pixels, in_a_row, inferno, to_bytes, write_text
+from gsbench.measure.images import GAP, Pixels, in_a_row, inferno, reduced, to_bytes, write_text
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
 from gsbench.models.render import rasterize_slice, render_slice
@@ -84,11 +83,8 @@ def _arrange(panels: list[Pixels], counts: dict[str, int], most: float) -> Pixel
 
     `counts` has the number of Gaussians by effect set, and `most` is the cost in nanoseconds of the brightest pixels.
     """
-    height, width = panels[0].shape[:2]
-    factor = max(1, -(-LEAST_WIDTH // width))  # rounded up
-    if width > MOST_WIDTH:
-        size = (MOST_WIDTH, max(1, round(height * MOST_WIDTH / width)))
-        panels = [np.asarray(cv2.resize(panel, size, interpolation=cv2.INTER_AREA), np.uint8) for panel in panels]
+    factor = max(1, -(-LEAST_WIDTH // panels[0].shape[1]))  # rounded up
+    panels = [reduced(panel, MOST_WIDTH) for panel in panels]
     row, step = in_a_row(panels, factor), panels[0].shape[1] * factor + GAP  # pixels from panel to panel
     titles, legend = (np.full((LINE, row.shape[1], 3), 255, np.uint8) for _ in range(2))
     by_set = f"{sum(counts.values()):,} Gaussians by effect set"

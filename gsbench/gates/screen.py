@@ -57,21 +57,15 @@ def import_compiler() -> None:
     torch.optim.Adam([torch.zeros(1)])
 
 
-def _answer(
-    decision: str, reason: str, p: float | None = None, z: float | None = None, free: float | None = None
-) -> TimeScreen:
-    return TimeScreen(decision, reason, p, z, free, seconds=0.0)
-
-
 def _screen(scene: Scene, seed: int, backend: str) -> TimeScreen:
     """Test whether the scene changes with time, on views that share a camera position, on other views, or on both."""
     views = scene.train
     if not scene.has_time:
-        return _answer(OFF, "the views have no times")
+        return TimeScreen(OFF, "the views have no times")
     if len({view.time for view in views}) == 1:
-        return _answer(UNDECIDED, "all training views have the same time")
+        return TimeScreen(UNDECIDED, "all training views have the same time")
     if len(views) < LEAST_VIEWS:
-        return _answer(UNDECIDED, f"{len(views)} training views are too few; {LEAST_VIEWS} are needed")
+        return TimeScreen(UNDECIDED, f"{len(views)} training views are too few; {LEAST_VIEWS} are needed")
     viewpoints = group_by_viewpoint(views, scene.extent)
     answers = []
     if viewpoints.fixed:
@@ -87,15 +81,15 @@ def _screen_fixed(scene: Scene, viewpoints: Viewpoints, seed: int) -> TimeScreen
     count = len(viewpoints.fixed)
     where = f"the images of each of {count} camera positions" if count > 1 else "the images of the camera's position"
     if not result.changed:
-        return _answer(OFF, f"{where} differ by exposure and noise only")
+        return TimeScreen(OFF, f"{where} differ by exposure and noise only")
     share = f"{result.changed:.0%}" if result.changed >= 0.01 else "less than 1%"
     blocks = f"{share} of their blocks"
     if result.p is None:
-        return _answer(UNDECIDED, f"{where} differ in {blocks}, but are too few to test for a change over time")
+        return TimeScreen(UNDECIDED, f"{where} differ in {blocks}, but are too few to test for a change over time")
     if result.p <= LEVEL:
-        return _answer(ON, f"{where} change over time, in {blocks} (p = {result.p:.3f})", result.p, result.z)
+        return TimeScreen(ON, f"{where} change over time, in {blocks} (p = {result.p:.3f})", result.p, result.z)
     reason = f"{where} differ in {blocks}, but not clearly over time (p = {result.p:.3f})"
-    return _answer(UNDECIDED, reason, result.p, result.z)
+    return TimeScreen(UNDECIDED, reason, result.p, result.z)
 
 
 def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str) -> TimeScreen:
@@ -116,7 +110,7 @@ def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str)
             f"the camera moves along with time, so that only {test.free:.0%} of a slow change can be told from "
             f"its motion; {LEAST_FREE:.0%} are needed"
         )
-        return _answer(UNDECIDED, reason, test.p, test.z, test.free)
+        return TimeScreen(UNDECIDED, reason, test.p, test.z, test.free)
     if test.p <= LEVEL:
         decision, reason = ON, f"a static model's error changes over time (p = {test.p:.3f})"
     elif held:
@@ -127,7 +121,7 @@ def _screen_loose(scene: Scene, viewpoints: Viewpoints, seed: int, backend: str)
         )
     else:
         decision, reason = OFF, f"a static model's error does not change over time (p = {test.p:.3f})"
-    return _answer(decision, reason, test.p, test.z, test.free)
+    return TimeScreen(decision, reason, test.p, test.z, test.free)
 
 
 def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:
@@ -139,16 +133,16 @@ def _both(fixed: TimeScreen, loose: TimeScreen) -> TimeScreen:
     """
     reason = f"{fixed.reason}; of the other views, {loose.reason}"
     if OFF == fixed.decision == loose.decision:  # `fixed` has no p-value then
-        return _answer(OFF, reason, loose.p, loose.z, loose.free)
+        return TimeScreen(OFF, reason, loose.p, loose.z, loose.free)
     is_blind = loose.free is not None and loose.free < LEAST_FREE  # time and camera position are too correlated
     usable = [fixed] if is_blind else [fixed, loose]
     tested = [(answer.p, answer.z) for answer in usable if answer.p is not None and answer.z is not None]
     if not tested:
-        return _answer(UNDECIDED, reason, free=loose.free)
+        return TimeScreen(UNDECIDED, reason, free=loose.free)
     if len(tested) == 1:
         p, z = tested[0]
     else:
         q = math.prod(p for p, _ in tested)
         p, z = q * (1 - math.log(q)), sum(z for _, z in tested) / math.sqrt(2)
         reason += f"; together p = {p:.3f}"
-    return _answer(ON if p <= LEVEL else UNDECIDED, reason, p, z, loose.free)
+    return TimeScreen(ON if p <= LEVEL else UNDECIDED, reason, p, z, loose.free)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsbench.gates.static_fit_residuals import center_of
+from gsbench.measure.regions import grouped
 from gsbench.scenes import View
 
 SAME = 1e-4  # largest shift within a position, in units of the longer side: less than a tenth of a pixel of 800
@@ -40,14 +41,14 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
         extent: the radius of the scene; it replaces the distance to the scene if the cameras look at no common point.
     """
     poses = _poses(views, extent)
-    of_one_position = _groups(list(range(len(views))), poses, SAME)
+    of_one_position = grouped(poses, range(len(views)), SAME, 2)
     fixed = [group for group in of_one_position if len(group) > 1]
     loose = sorted(v for group in of_one_position if len(group) == 1 for v in group)
     times = np.array([view.time for view in views], dtype=np.float64)
     span = float(np.ptp(times))
     near = [
         group
-        for group in _groups(loose, poses, NEAR)
+        for group in grouped(poses, loose, NEAR, 2)
         if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span
     ]
     held = near if 2 * sum(map(len, near)) > len(loose) else []  # a minority stays with the others
@@ -71,14 +72,3 @@ def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 20]
     turns = viewmats[:, :3, :3].reshape(-1, 9) / math.sqrt(2)  # they differ by the angle: |R - R'| is sqrt 2 times it
     # Sizes are in pixels: cameras whose images have other sizes are never in one group.
     return np.concatenate([focal * turns, focal * centers / max(distance, 1e-12), K / side, sizes], 1)  # 9 + 3 + 6 + 2
-
-
-def _groups(indices: list[int], poses: Array, tolerance: float) -> list[list[int]]:
-    """Group views so that the distance of each pose vector to the first one of its group is at most `tolerance`."""
-    groups: list[list[int]] = []
-    left = np.array(indices, dtype=np.int64)
-    while len(left):
-        near = np.linalg.norm(poses[left] - poses[left[0]], axis=1) <= tolerance
-        groups.append(left[near].tolist())
-        left = left[~near]
-    return groups

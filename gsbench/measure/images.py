@@ -97,6 +97,16 @@ def data_url(image: Pixels) -> str:  # [H, W, 3] RGB
     return f"data:image/png;base64,{base64.b64encode(png(image)).decode()}"
 
 
+def reduced(image: Pixels, most: int, *, by_longer_side: bool = False) -> Pixels:  # [H, W, 3]
+    """Reduce an image to `most` pixels of width, or of its longer side; a smaller image stays as it is."""
+    height, width = image.shape[:2]
+    factor = most / (max(height, width) if by_longer_side else width)
+    if factor >= 1:
+        return image
+    size = max(1, round(factor * width)), max(1, round(factor * height))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def in_a_row(images: list[Pixels], factor: int) -> Pixels:
     """Enlarge images of one size by an integer factor, and put them side by side with gaps between them."""
     large = [image.repeat(factor, 0).repeat(factor, 1) for image in images]

@@ -65,12 +65,6 @@ def versions() -> dict[str, str]:
 NO_CODE = ("results", "docs", "*.md")
 
 
-@functools.cache
-def running_commit() -> str | None:
-    """Return `git_commit()` of the first call, because the code that runs stays when the checkout changes later."""
-    return git_commit()
-
-
 def git_commit() -> str | None:
     """Return the git commit of gsbench's checkout, with the suffix "-dirty" if code was changed or added.
 
@@ -86,6 +80,9 @@ def git_commit() -> str | None:
     added = _git(here.parent, "ls-files", "--others", "--exclude-standard", "--", ":/gsbench", ":/conf")
     is_clean = (changed, added) == ("", "")  # None: git failed
     return head if head is None or is_clean else f"{head}-dirty"
+
+
+running_commit = functools.cache(git_commit)  # the code that runs stays when the checkout changes later
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

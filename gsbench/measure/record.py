@@ -135,10 +135,11 @@ class TimeScreen:
 
     decision: str  # on, off or undecided
     reason: str
-    p: float | None  # p-value: share of permutations of time with at least this energy; None: not tested
-    z: float | None  # z-score of the energy in low frequencies of time, among those of permutations
-    free: float | None  # share of the variance that the camera path does not explain; None: fixed camera, or not tested
-    seconds: float  # duration of the test
+    p: float | None = None  # p-value: share of permutations of time with at least this energy; None: not tested
+    z: float | None = None  # z-score of the energy in low frequencies of time, among those of permutations
+    # share of the variance that the camera path does not explain; None: fixed camera, or not tested
+    free: float | None = None
+    seconds: float = 0.0  # duration of the test
 
 
 @dataclass(frozen=True)

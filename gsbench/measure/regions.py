@@ -163,11 +163,16 @@ def by_camera(views: Sequence[View]) -> list[list[View]]:
     keys = np.array(
         [[each.width, each.height, *each.viewmat.flatten().tolist(), *each.K.flatten().tolist()] for each in cameras]
     )
-    groups, remaining = [], np.arange(len(views))  # indices of the views that are in no group yet
-    while len(remaining):
-        same = (np.abs(keys[remaining] - keys[remaining[0]]) <= SAME).all(1)
-        groups.append([views[i] for i in remaining[same]])
-        remaining = remaining[~same]
+    return [[views[i] for i in group] for group in grouped(keys, range(len(views)), SAME, np.inf)]
+
+
+def grouped(vectors: npt.NDArray[np.float64], indices: Sequence[int], most: float, order: float) -> list[list[int]]:
+    """Group some of the vectors [V, n] so that each differs from the first of its group by a norm of at most `most`."""
+    groups, left = [], np.array(indices, dtype=np.int64)  # those in no group yet
+    while len(left):
+        near = np.linalg.norm(vectors[left] - vectors[left[0]], order, axis=1) <= most
+        groups.append(left[near].tolist())
+        left = left[~near]
     return groups
 
 

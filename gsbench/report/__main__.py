@@ -34,8 +34,8 @@ def main(arguments: list[str] | None = None) -> int:
         return output.watch(options.results, columns)
     differs = False
     try:
-        chosen = select.parse(options.select)
-        results = chosen.of(merge.read(options.merge) if options.merge else load(options.results))
+        selection = select.parse(options.select)
+        results = select.selected(merge.read(options.merge) if options.merge else load(options.results), selection)
         if options.publish:
             print(output.publish(options.results, options.publish))
         elif len(results.runs) and options.tables:
@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
         elif len(results.runs) and options.against:
             differs = _against(results, options)
         elif len(results.runs):
-            _report(results, chosen.columns or columns, options)
+            _report(results, selection.get("column", columns), options)
         if len(results.runs) and options.figures:
             paths = page.figures(results, options.figures)
             print(f"Written: {len(paths) // 2} figures in {options.figures}", file=sys.stderr)

@@ -15,7 +15,7 @@ from gsbench.report.section import Section
 from gsbench.report.sections import built
 from gsbench.report.sections.experiment import table
 
-EVERY = 5.0  # seconds after which the folder is read again and an open page reloads itself
+EVERY = 5  # seconds after which the folder is read again and an open page reloads itself
 NOT_IN_FILE = ["config", "missing", "path", "record"]  # columns of `runs` that are no values
 
 
@@ -57,7 +57,7 @@ def write(
     return [folder / "table.md", folder / "table.csv", shown_page]
 
 
-def watch(folder: Path, columns: Sequence[str] = (), *, every: float = EVERY) -> int:
+def watch(folder: Path, columns: Sequence[str] = ()) -> int:
     """Rewrite the files of `write` whenever run records arrive, until Ctrl-C; return 0.
 
     If the folder has no record or only damaged ones, the reason is printed, and the function keeps waiting. The page
@@ -66,18 +66,17 @@ def watch(folder: Path, columns: Sequence[str] = (), *, every: float = EVERY) ->
     Args:
         folder: the folder where records are or will be.
         columns: the columns of the result table; empty for those that the runs have.
-        every: seconds between two checks of the folder.
     """
     before, printed = frozenset[tuple[Path, int]](), ""
     try:
         while True:
             state = _state(folder)
             if state != before or not printed:
-                before, line = state, _rewrite(folder, columns, reload=max(1, round(every)))
+                before, line = state, _rewrite(folder, columns, reload=EVERY)
                 if line != printed:
                     printed = line
                     print(f"{time.strftime('%H:%M:%S')} {line}", flush=True)
-            time.sleep(every)
+            time.sleep(EVERY)
     except KeyboardInterrupt:
         print(f"\nStopped. {_rewrite(folder, columns, reload=0)}")
         return 0

@@ -49,12 +49,7 @@ class Progress:
 
 def write(folder: Path, progress: Progress) -> None:
     """Write progress.json in the folder of a run, atomically."""
-    write_atomically(folder / FILE_NAME, encode(progress), lasting=False)
-
-
-def encode(progress: Progress) -> bytes:
-    """Return a progress as JSON."""
-    return as_json(progress).encode()
+    write_atomically(folder / FILE_NAME, as_json(progress).encode(), lasting=False)
 
 
 class Reporter:
@@ -139,7 +134,7 @@ def take_claim(folder: Path, claim: Progress) -> Progress | None:
             return other
         if content is not None:
             _remove(path, content, claim)  # its process has ended, or the file is damaged
-        if create_atomically(path, encode(claim)):
+        if create_atomically(path, as_json(claim).encode()):
             return None
         time.sleep(PAUSE)
     raise InputError(f"{path}: expected to claim the run, other processes claim it again and again: try later")
@@ -152,7 +147,7 @@ def _remove(path: Path, content: bytes, claim: Progress) -> None:
     was read. An heir that was killed leaves this file. It is a claim too, and is removed in the same way.
     """
     heir = path.with_name(f"{HEIR}.{hashlib.sha256(content).hexdigest()[:16]}")
-    if not create_atomically(heir, encode(claim)):
+    if not create_atomically(heir, as_json(claim).encode()):
         left, other = _read(heir)
         if left is not None and (other is None or _may_be_taken(other, claim)):
             _remove(heir, left, claim)
@@ -175,7 +170,7 @@ def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) ->
         if other is not None and _is_same_process(other, claim):
             if is_stopped:
                 stopped = dataclasses.replace(other, updated=time.time())
-                write_atomically(folder / STOPPED, encode(stopped), lasting=False)
+                write_atomically(folder / STOPPED, as_json(stopped).encode(), lasting=False)
             path.unlink(missing_ok=True)
     except OSError:  # the folder cannot be written any more; the claim expires with this process
         return

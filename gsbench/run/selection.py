@@ -33,7 +33,7 @@ from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import Schedule
 from gsbench.train.divergence import DivergedError
-from gsbench.train.hooks.choices import Choices, choices_in, lengths_of
+from gsbench.train.hooks.choices import Choices, ChosenOnVal, choices_in, lengths_of
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import check_rates
 
@@ -70,17 +70,17 @@ class Candidates:
         config = self.settings[name]
         return fitting.trainer_of(build(config), self.scene, config, self.start)
 
-    def chosen(self, chosen_in: Callable[[dict[str, Any]], str | None], choose: Callable[[], Trainer]) -> Trainer:
+    def chosen(self, chosen_in: Callable[[ChosenOnVal], str | None], choose: Callable[[], Trainer]) -> Trainer:
         """Return the trainer of the candidate that the run's own checkpoint names; if it names none, that of `choose`.
 
         The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `chosen_in`
-        returns the name of the chosen candidate in the state of a checkpoint.
+        returns the name of the chosen candidate by the choices in a checkpoint.
 
         Raises:
             InputError: a checkpoint is damaged.
         """
         state = fitting.saved_state(self.spec, self.scene)
-        name = chosen_in(state) if state else None
+        name = chosen_in(choices_in(state)) if state else None
         if name is None:
             trainer = choose()
             fitting.save(trainer.state_dict(), self.spec, self.scene, plain(self.spec, trainer.config))
@@ -283,14 +283,12 @@ def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: 
         DivergedError, NoGaussianError, OverBudgetError: no candidate can be chosen; the error is that of the first.
         Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
     """
-
-    def chosen_in(state: dict[str, Any]) -> str | None:
-        comparison = choices_in(state).comparison
-        return None if comparison is None else comparison.chosen
-
     settings = {name: gated_if_possible(candidate) for name, candidate in candidates(spec.config).items()}
     trainings = Candidates(spec, scene, start, settings)
-    return trainings.chosen(chosen_in, lambda: _trained_models(trainings, model))
+    return trainings.chosen(
+        lambda choices: choices.comparison.chosen if choices.comparison else None,
+        lambda: _trained_models(trainings, model),
+    )
 
 
 def _trained_models(trainings: Candidates, model: ChosenModel) -> Trainer:
@@ -346,12 +344,10 @@ def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, mod
         Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
     """
     trainings = Candidates(spec, scene, start, lengths(model.config))
-    return trainings.chosen(_kept_length, lambda: _trained_lengths(trainings, model))
-
-
-def _kept_length(state: dict[str, Any]) -> str | None:
-    length = choices_in(state).length
-    return None if length is None else length_name(length.kept)
+    return trainings.chosen(
+        lambda choices: length_name(choices.length.kept) if choices.length else None,
+        lambda: _trained_lengths(trainings, model),
+    )
 
 
 def _trained_lengths(trainings: Candidates, model: ChosenModel) -> Trainer:

@@ -52,12 +52,13 @@ def main(arguments: list[str] | None = None) -> int:
     from gsbench.stability import report  # imports matplotlib
 
     try:
-        if is_ply(options.model):
+        if options.model.suffix.lower() == ".ply":
             refuse_options(options, ("data_root", "model_module"), "a PLY")
+            subject = of_ply(options.model, options.out or OUT)
         else:
             refuse_options(options, ("out",), "a run")
-        import_models(options.model_module)
-        subject = load(options.model, options.out or OUT, options.data_root)
+            import_models(options.model_module)
+            subject = of_run(options.model, options.data_root)
         exactness = measure(subject.model, subject.shots, subject.background, subject.title, subject.antialias)
         if options.json:
             print(report.json_of(exactness))
@@ -73,25 +74,12 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def load(
-    path: Path,  # the folder of a run, or a PLY of 3DGS
-    out: Path,  # the folder of a PLY's picture; a run's lies in its folder
-    data_root: str | None = None,  # of the data set, if it has moved
-) -> Subject:
-    """Load a model with its evaluated views; without data set, or from a PLY, with views of an orbit, no photographs.
+def of_run(folder: Path, data_root: str | None = None) -> Subject:
+    """Load the model of a run with its evaluated views; without its data set with views of an orbit, no photographs.
 
     Raises:
-        InputError: the folder has no checkpoint, or the file is not a PLY of trained Gaussians.
+        InputError: the folder has no checkpoint, or `data_root`, where the data set has moved, does not have it.
     """
-    return _of_ply(path, out) if is_ply(path) else _of_run(path, data_root)
-
-
-def is_ply(path: Path) -> bool:
-    """Tell whether a path names a PLY, and not the folder of a run."""
-    return path.suffix.lower() == ".ply"
-
-
-def _of_run(folder: Path, data_root: str | None) -> Subject:
     run, note = load_run(folder), ""
     try:
         shots = [Shot.of(view) for view in evaluated_views(scene_of(run, data_root), run.config.scene.eval_split)]
@@ -106,8 +94,12 @@ def _of_run(folder: Path, data_root: str | None) -> Subject:
     )
 
 
-def _of_ply(path: Path, out: Path) -> Subject:
-    """Load a PLY as a 3DGS model, with views of an orbit around the median of its means."""
+def of_ply(path: Path, out: Path) -> Subject:
+    """Load a PLY as a 3DGS model, with views of an orbit around the median of its means; `out` is for its picture.
+
+    Raises:
+        InputError: the file is not a PLY of trained Gaussians.
+    """
     trained = read_trained(path)
     if len(trained) < LEAST_GAUSSIANS:
         raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")

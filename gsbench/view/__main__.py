@@ -41,10 +41,10 @@ def serve(options: argparse.Namespace) -> None:
         InputError: viser is not installed, a folder has no checkpoint, or the runs are of different scenes.
         KeyboardInterrupt: the user ends the viewer with Ctrl-C.
     """
-    if options.page is None and importlib.util.find_spec("viser") is None:
-        raise InputError(f"the viewer needs viser: {how_to_install('view')}", docs="viewing.md#the-viewer")
     if options.page is not None:
         refuse_options(options, ("host", "port"), "--page")
+    elif importlib.util.find_spec("viser") is None:
+        raise InputError(f"the viewer needs viser: {how_to_install('view')}", docs="viewing.md#the-viewer")
     host = HOST if options.host is None else options.host
     port = PORT if options.port is None else options.port
     if not 0 < port < 65536:

@@ -12,11 +12,10 @@ import viser
 from numpy.typing import NDArray
 from viser import transforms
 
-from gsbench.measure.images import to_bytes
+from gsbench.measure.images import reduced, to_bytes
 from gsbench.measure.quality import evenly
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import CLASS, COLOURS, FLOAT32, IMAGE, PLAIN, FrameRenderer, FrameRequest
-from gsbench.view.training_views import reduced
 
 PLAYED_S = 4.0  # seconds in which the time goes from 0 to 1
 ONE, SIDE, WIPE = "one image", "side by side", "wipe"

@@ -155,7 +155,9 @@ class RequestGuard:
         def serve(*arguments: Any, process_request: Callable[..., Answer], **options: Any) -> Any:
             asyncio.get_running_loop().set_exception_handler(_print_error)
             self._is_active = True
-            options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": _silent_logger()}
+            # `websockets` would log a traceback if a client does not speak HTTP.
+            silent = logging.Logger("gsbench.view", logging.CRITICAL + 1)
+            options |= {"max_size": MOST_BYTES, "create_connection": Connection, "logger": silent}
 
             def check(connection: ServerConnection, request: Request) -> Answer:
                 return self._refusal(connection, request) or _entrance(request) or process_request(connection, request)
@@ -238,14 +240,6 @@ def _entrance(request: Request) -> Response | None:
 def _response(status: HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Cache-Control": "no-store"})
     return Response(status, status.phrase, headers, f"{text}\n".encode())
-
-
-def _silent_logger() -> logging.Logger:
-    """Return a silent logger for `websockets`, which otherwise prints a traceback if a client does not speak HTTP."""
-    logger = logging.getLogger("gsbench.view.request_guard")
-    logger.propagate = False
-    logger.addHandler(logging.NullHandler())
-    return logger
 
 
 def _print_error(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -3,11 +3,9 @@
 import math
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
 
-from gsbench.measure.images import Pixels, error_image, to_bytes
+from gsbench.measure.images import Pixels, error_image, reduced, to_bytes
 from gsbench.measure.quality import capped_psnr, quantise
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view.frame import FrameRenderer, FrameRequest
@@ -61,13 +59,3 @@ def compare(renderer: FrameRenderer, view: View, request: FrameRequest) -> ViewC
         reduced(error_image(shown.numpy(), view.image.numpy()), MOST_WIDTH),
         capped_psnr(shown, view.image),
     )
-
-
-def reduced(image: Pixels, most: int, *, by_longer_side: bool = False) -> Pixels:
-    """Reduce an image to `most` pixels of width, or of its longer side; a smaller image stays as it is."""
-    height, width = image.shape[:2]
-    factor = most / (max(height, width) if by_longer_side else width)
-    if factor >= 1:
-        return image
-    size = max(1, round(factor * width)), max(1, round(factor * height))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -404,7 +404,7 @@ def test_other_forms_are_printed_and_nothing_is_written(folder, tmp_path, capsys
 def test_a_wrong_selection_lists_what_there_is(words, expected):
     """Catches a stack trace, and an empty table without a word."""
     with pytest.raises(InputError, match=re.escape(expected)):
-        select.parse(words).of(results(*every_row()))
+        select.selected(results(*every_row()), select.parse(words))
 
 
 def test_figures_are_written_in_real_colours(tmp_path):

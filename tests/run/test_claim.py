@@ -16,6 +16,7 @@ from tiny_run import overrides, spec_of
 
 from gsbench.errors import InputError
 from gsbench.measure import atomic
+from gsbench.reading import as_json
 from gsbench.run import execution, progress
 from gsbench.run.progress import FILE_NAME, Progress
 
@@ -127,7 +128,7 @@ def test_a_stale_handle_makes_no_claim_a_dead_one(times, tmp_path, monkeypatch):
 
 def test_a_dead_claim_that_is_seen_late_costs_no_live_one(tmp_path):
     """Catches a claim that is removed by a process which read the one before it."""
-    dead, claim = progress.encode(Progress([], born=1)), Progress([])
+    dead, claim = as_json(Progress([], born=1)).encode(), Progress([])
     progress.write(tmp_path, claim)
     progress._remove(tmp_path / FILE_NAME, dead, Progress([], host="elsewhere"))
     assert progress.read(tmp_path / FILE_NAME) == claim
@@ -180,7 +181,7 @@ def test_a_run_that_another_process_does_is_left_to_it(square, tmp_path, monkeyp
     assert "left to process 12 on elsewhere, which is at step 7 of it" in capsys.readouterr().err
     assert not claims
     progress.write(spec.folder, Progress([], host="elsewhere", updated=0.0))
-    (spec.folder / progress.STOPPED).write_bytes(progress.encode(Progress([])))
+    (spec.folder / progress.STOPPED).write_bytes(as_json(Progress([])).encode())
     record = execution.execute(spec)
     assert record.status == "ok"
     assert claims == [spec.folder / FILE_NAME]

@@ -141,15 +141,15 @@ def centers(subject: Subject) -> torch.Tensor:
 def test_an_orbit_is_a_full_circle_at_a_moment_each(run, monkeypatch):
     """Catches half a circle, times that end before 1, and a data set that is named, cannot be read and is left out.
     Also an orbit of another size or middle, one of a PLY without extent, and a PLY seen otherwise than by itself."""
-    ply = stability.load(write_ply(run / "a.ply"), run)
+    ply = stability.of_ply(write_ply(run / "a.ply"), run)
     assert {(shot.camera.width, shot.camera.height, shot.time) for shot in ply.shots} == {(400, 400, None)}
     assert (ply.model.active.sh_degree, ply.background, ply.antialias) == (3, BLACK, False)
     means = ply.model.splats["means"]
     assert (centers(ply) - means.median(0).values).norm(dim=-1).tolist() == pytest.approx([2.98] * 10, abs=0.005)
-    at_one_point = stability.load(write_ply(run / "point.ply", spread=0.0), run)
+    at_one_point = stability.of_ply(write_ply(run / "point.ply", spread=0.0), run)
     assert centers(at_one_point).norm(dim=-1).tolist() == pytest.approx([1e-6] * 10)
     monkeypatch.setattr(stability, "scene_of", lambda *_: (_ for _ in ()).throw(InputError("gone")))
-    subject = stability.load(run, run)
+    subject = stability.of_run(run)
     assert subject.note == "No photographs, so 10 views of an orbit: gone"
     assert subject.title == "/".join((run.parent.parent.name, run.parent.name, run.name))
     assert [shot.time for shot in subject.shots] == [i / 9 for i in range(10)]
@@ -157,7 +157,7 @@ def test_an_orbit_is_a_full_circle_at_a_moment_each(run, monkeypatch):
         steps = (centers(orbit) - centers(orbit).roll(1, 0)).norm(dim=-1)
         assert torch.allclose(steps, steps.mean().expand(10), rtol=1e-3)
     with pytest.raises(InputError, match="gone"):
-        stability.load(run, run, "elsewhere")
+        stability.of_run(run, "elsewhere")
 
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path, capsys):

@@ -127,14 +127,9 @@ def _row_height(body: Pixels) -> int:
 def _enlargement(parts: list[Pixels]) -> int:
     """Return the integer factor by which images were enlarged without interpolation; 1 if they were not."""
     for factor in range(8, 1, -1):
-        if all(not (p.shape[0] % factor or p.shape[1] % factor) and _has_blocks(p, factor) for p in parts):
+        if all(np.array_equal(p[::factor, ::factor].repeat(factor, 0).repeat(factor, 1), p) for p in parts):
             return factor
     return 1
-
-
-def _has_blocks(image: Pixels, factor: int) -> bool:
-    small = image[::factor, ::factor]
-    return bool((small.repeat(factor, 0).repeat(factor, 1) == image).all())
 
 
 def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quality: int, most: int) -> list[View]:
