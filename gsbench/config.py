@@ -154,7 +154,7 @@ class ProtocolConfig:
     best_on_test: bool = key(False, "record the best test PSNR (a leak)", role="training")  # while it trains
     lpips_alex: str | None = key(None, "AlexNet's weights; null: in $TORCH_HOME/hub/checkpoints", role="place")
     lpips_vgg: str | None = key(None, "VGG16's weights", role="place")  # checked by their hash
-    renders: int = key(30, "least timed renders", low=30, high=1_000_000)
+    renders: int = key(30, "least timed renders", low=30, high=1_000_000)  # for percentiles
     pictures: int = key(3, "test views in pictures.png", low=0, high=10_000)
 
 

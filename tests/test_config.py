@@ -17,7 +17,6 @@ from gsbench.config_key import Key, declared, described, extended, joins, key
 from gsbench.config_roles import facts, flat, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError
 from gsbench.measure.record import MAX_POINTS
-from gsbench.measure.speed import LEAST_RENDERS
 from gsbench.run.settings import check_settings
 from gsbench.run.setup import BACKGROUNDS, LEAST_GAUSSIANS
 from gsbench.scenes import RESIZES
@@ -63,7 +62,6 @@ def test_facts_are_those_of_the_code():
     for name, known in choices.items():
         assert set(KEYS[name].choices) == set(known), name
     assert KEYS["train.curve_points"].high == MAX_POINTS
-    assert KEYS["protocol.renders"].low == LEAST_RENDERS
     assert KEYS["train.densify.max_gaussians"].low == KEYS["data.initial_points"].low == LEAST_GAUSSIANS
 
 

@@ -86,10 +86,7 @@ def write_png(image: Pixels, path: Path) -> None:  # [H, W, 3] RGB
 
 def png(image: Pixels) -> bytes:  # [H, W, 3] RGB
     """Return an image as the bytes of a PNG file."""
-    done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    if not done:
-        raise InputError(f"expected an image that PNG can hold, got {image.shape} of {image.dtype}")
-    return data.tobytes()
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def data_url(image: Pixels) -> str:  # [H, W, 3] RGB

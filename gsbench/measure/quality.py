@@ -18,7 +18,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from gsbench.errors import InputError
-from gsbench.kernels.tensors import check_number, check_tensor
+from gsbench.kernels.tensors import check_tensor
 from gsbench.measure import perceptual
 from gsbench.measure.exact_views import capped
 from gsbench.measure.perceptual import BACKBONES, BackboneMissing
@@ -182,14 +182,14 @@ def evaluate(
     weights of its LPIPS network are missing, an image is too small for it, or it is not a number in a view.
 
     Args:
-        images: name, render and ground truth of each view.
+        images: name, render and ground truth of each view, at least one.
         background: the background colour of the ground truth; the metric `psnr_background_only` is the PSNR of an image
             that has only this colour.
         quantised: whether renders are rounded to 8 bits first.
         weights: the files with the weights of LPIPS' networks, by backbone (`gsbench.measure.perceptual.load`).
 
     Raises:
-        InputError: there is no image, sizes differ, or a weights file is missing or has the wrong SHA-256.
+        InputError: sizes differ, or a weights file is missing or has the wrong SHA-256.
     """
     measures: dict[str, Callable[[Tensor, Tensor], float]] = {
         "psnr": capped_psnr,
@@ -203,10 +203,6 @@ def evaluate(
     for backbone, network in BACKBONES.items():
         measures[f"lpips_{backbone}"] = partial(lpips, backbone=backbone, weights=(weights or {}).get(backbone))
         least_side[f"lpips_{backbone}"] = network.least_side
-    if not isinstance(background, tuple | list) or len(background) != 3:
-        raise InputError(f"evaluate: expected a background of three numbers, got {background!r:.80}")
-    for value in background:
-        check_number(value, "evaluate: background", 0, 1)
     scores: dict[str, list[float]] = {metric: [] for metric in measures}
     missing: dict[str, str] = {}
     per_view = []
@@ -229,8 +225,6 @@ def evaluate(
                 missing.setdefault(metric, f"not a number in {name}")
         del of_view["psnr_background_only"]  # a property of the split and not of the render
         per_view.append(ViewScore(name, **of_view))
-    if not per_view:
-        raise InputError("evaluate: expected at least one image, got none")
     metrics = {metric: None if metric in missing else fmean(values) for metric, values in scores.items()}
     return Quality(metrics, missing, per_view)
 

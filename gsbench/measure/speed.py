@@ -18,7 +18,6 @@ from typing import Any
 
 from gsbench.errors import InputError
 
-LEAST_RENDERS = 30
 OTHER = "other"  # the stage of all work that is in no other stage, such as checks of values and Python
 
 
@@ -56,7 +55,7 @@ def synchroniser(device: str) -> Callable[[], None]:
 
 def time_renders(
     render: Callable[[int], object],
-    count: int = LEAST_RENDERS,
+    count: int,
     warmup: int = 5,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> RenderTimes:
@@ -64,12 +63,7 @@ def time_renders(
 
     A call renders an image from the model, including slicing (conditioning on time and direction) and AGR (the neural
     refinement), and caches nothing for the next call. The device is synchronised before and after each call.
-
-    Raises:
-        InputError: `count` is below 30, too few for percentiles.
     """
-    if count < LEAST_RENDERS:
-        raise InputError(f"time_renders: expected count >= {LEAST_RENDERS}, got {count}")
     for i in range(warmup):
         render(i % count)
     return _percentiles([_milliseconds(render, i, synchronise) for i in range(count)])
@@ -77,7 +71,7 @@ def time_renders(
 
 def time_in_turns(
     renders: Sequence[Callable[[int], object]],
-    count: int = LEAST_RENDERS,
+    count: int,
     synchronise: Callable[[], None] = nothing_to_wait_for,
 ) -> list[RenderTimes]:
     """Time several render functions in turns, frame by frame, so that other load on the machine affects all alike.

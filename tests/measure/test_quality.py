@@ -3,7 +3,6 @@
 import hashlib
 import math
 import os
-import re
 from pathlib import Path
 
 import cv2
@@ -174,7 +173,7 @@ def test_torchvision_weights_are_found_by_name_and_hash(no_weights, monkeypatch)
 
 @pytest.mark.usefixtures("no_weights")
 def test_evaluate_means_over_views_and_quantises_on_request():
-    """Would catch a mean over pixels or over nothing, truth that is quantised too, a wrong background."""
+    """Would catch a mean over pixels, truth that is quantised too, a wrong background."""
     truth = [torch.full((16, 16, 3), 0.5), torch.full((16, 16, 3), 0.25)]
     render = [t + 0.0019 for t in truth]
     measured = quality.evaluate(zip("ab", render, truth, strict=True), background=(1.0, 1.0, 1.0))
@@ -186,11 +185,6 @@ def test_evaluate_means_over_views_and_quantises_on_request():
     eight = quality.evaluate(zip("ab", render, truth, strict=True), background=(1.0, 1.0, 1.0), quantised=True)
     assert eight.per_view[0].psnr == quality.psnr(quality.quantise(render[0]), truth[0])
     assert eight.metrics["psnr"] != measured.metrics["psnr"]
-    with pytest.raises(InputError, match="at least one image"):
-        quality.evaluate([], background=(0.0, 0.0, 0.0))
-    for wrong in ("red", 5, (0.0, 0.0)):
-        with pytest.raises(InputError, match=re.escape(f"expected a background of three numbers, got {wrong!r}")):
-            quality.evaluate(zip("ab", render, truth, strict=True), background=wrong)
 
 
 @pytest.mark.usefixtures("no_weights")
