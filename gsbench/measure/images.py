@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gsbench.errors import InputError
 from gsbench.measure.atomic import write_atomically
 
 ERROR_SCALE = 0.2  # the error that has the brightest colour, equal for all images, so that they can be compared
@@ -24,22 +23,14 @@ Pixels = npt.NDArray[np.uint8]
 def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
     """Make a comparison image of renders and ground truths, uint8 [H', W', 3] RGB.
 
-    Each (render, truth) pair, two images [H, W, 3] in [0, 1], is one row. The third column shows the absolute error
-    (mean over RGB), from black for no error to bright yellow for 0.2 or more. A header names the columns and shows this
-    scale.
-
-    Raises:
-        InputError: there is no pair, or the images differ in size.
+    Each (render, truth) pair, two images [H, W, 3] in [0, 1], is one row; there is at least one, and all have one size.
+    The third column shows the absolute error (mean over RGB), from black for no error to bright yellow for 0.2 or more.
+    A header names the columns and shows this scale.
     """
-    if not rows:
-        raise InputError("strip: expected at least one pair (render, truth), got none")
     pairs = [(np.asarray(render, np.float32), np.asarray(truth, np.float32)) for render, truth in rows]
-    shape = pairs[0][0].shape
-    for image in (image for pair in pairs for image in pair):
-        if image.shape != shape or image.ndim != 3 or shape[2] != 3 or 0 in shape:
-            raise InputError(f"strip: expected images [H, W, 3] of one size, got {image.shape} beside {shape}")
-    factor = -(-LEAST_WIDTH // shape[1])  # rounded up
-    picture = [_header(shape[1] * factor)]
+    width = pairs[0][0].shape[1]
+    factor = -(-LEAST_WIDTH // width)  # rounded up
+    picture = [_header(width * factor)]
     gap = np.full((GAP, picture[0].shape[1], 3), GREY, np.uint8)
     for render, truth in pairs:
         picture += [in_a_row([to_bytes(render), to_bytes(truth), error_image(render, truth)], factor), gap]
