@@ -111,7 +111,7 @@ class Cost:
     train_s: float | None
     stage_s: dict[str, float]  # the same seconds by stage of training; "other": between the stages
     render_ms: RenderTimes | None
-    fps: float | None  # 1000 / render_ms.p50: gsbench.measure.speed.time_renders
+    fps: float | None  # 1000 / render_ms.p50: gsbench.measure.speed.time_in_turns
     num_gaussians: int | None
     bytes: int | None  # size of the model's parameters
     peak_memory: int | None  # bytes: gsbench.measure.speed.peak_memory

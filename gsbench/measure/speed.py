@@ -18,6 +18,7 @@ from typing import Any
 
 from gsbench.errors import InputError
 
+WARM_UP = 5  # frames
 OTHER = "other"  # the stage of all work that is in no other stage, such as checks of values and Python
 
 
@@ -40,65 +41,36 @@ class RenderTimes:
         return 1000.0 / self.p50
 
 
-def nothing_to_wait_for() -> None:
-    """Do nothing; this replaces GPU synchronisation on the CPU, where a call returns only after its work is done."""
-
-
 def synchroniser(device: str) -> Callable[[], None]:
     """Return a function that waits until `device` ("cpu", "cuda", "cuda:1") has finished its work."""
     if not device.startswith("cuda"):
-        return nothing_to_wait_for
+        return lambda: None  # a call returns only after its work is done
     import torch
 
     return lambda: torch.cuda.synchronize(device)
 
 
-def time_renders(
-    render: Callable[[int], object],
-    count: int,
-    warmup: int = 5,
-    synchronise: Callable[[], None] = nothing_to_wait_for,
-) -> RenderTimes:
-    """Time `count` calls of `render(i)`, i = 0, 1, ..., after `warmup` calls that do not count.
-
-    A call renders an image from the model, including slicing (conditioning on time and direction) and AGR (the neural
-    refinement), and caches nothing for the next call. The device is synchronised before and after each call.
-    """
-    for i in range(warmup):
-        render(i % count)
-    return _percentiles([_milliseconds(render, i, synchronise) for i in range(count)])
-
-
 def time_in_turns(
     renders: Sequence[Callable[[int], object]],
     count: int,
-    synchronise: Callable[[], None] = nothing_to_wait_for,
+    synchronise: Callable[[], None] = lambda: None,
 ) -> list[RenderTimes]:
-    """Time several render functions in turns, frame by frame, so that other load on the machine affects all alike.
+    """Time `count` calls of each render(i), i = 0, 1, ..., after WARM_UP calls that do not count.
 
-    Two turns of frame 0 come before, and do not count.
+    Several functions take turns, so that other load on the machine affects all alike. A call renders an image from the
+    model, including slicing (conditioning on time and direction) and AGR (the neural refinement), and caches nothing
+    for the next call. The device is synchronised before and after each call.
     """
-    times: list[list[float]] = [[] for _ in renders]
-    for i in range(-2, count):
+    times: list[list[float]] = [[] for _ in renders]  # milliseconds
+    for i in range(-WARM_UP, count):
         for milliseconds, render in zip(times, renders, strict=True):
-            taken = _milliseconds(render, max(i, 0), synchronise)
-            if i >= 0:
-                milliseconds.append(taken)
-    return list(map(_percentiles, times))
-
-
-def _milliseconds(render: Callable[[int], object], i: int, synchronise: Callable[[], None]) -> float:
-    """Return how long a call takes until the device has finished its work."""
-    synchronise()
-    start = time.perf_counter()
-    render(i)
-    synchronise()
-    return 1000.0 * (time.perf_counter() - start)
-
-
-def _percentiles(milliseconds: Sequence[float]) -> RenderTimes:
-    deciles = statistics.quantiles(milliseconds, n=10, method="inclusive")
-    return RenderTimes(p10=deciles[0], p50=deciles[4], p90=deciles[8])
+            synchronise()
+            start = time.perf_counter()
+            render(i % count)
+            synchronise()
+            milliseconds.append(1000.0 * (time.perf_counter() - start))
+    deciles = [statistics.quantiles(milliseconds[WARM_UP:], n=10, method="inclusive") for milliseconds in times]
+    return [RenderTimes(p10=nine[0], p50=nine[4], p90=nine[8]) for nine in deciles]
 
 
 class StageClock:

@@ -192,7 +192,8 @@ def worth(published: Path) -> str:
 
 def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
     """Return one of CHANGES as differences [seeds, views] of each scene of a kind."""
-    return stats.contrast(arrays[kind], minus(*CHANGES[name], DNERF_VARIANT if kind == DNERF else ""))
+    weights = minus(*CHANGES[name], DNERF_VARIANT if kind == DNERF else "")
+    return list(stats.contrast(arrays[kind], weights).values())
 
 
 def minus(a: str, b: str, variant: str) -> stats.Weights:
@@ -326,7 +327,7 @@ def dnerf_signs(published: Path) -> str:
     for a, b in (("7dgs", "4dgs"), ("7dgs_noagr", "4dgs"), ("7dgs", "7dgs_noagr")):
         expected, cells, same = in_paper[a] - in_paper[b], {}, []
         for size, (_, variant) in variants.items():
-            gains = stats.contrast_by_scene(arrays[size], minus(a, b, variant))
+            gains = stats.contrast(arrays[size], minus(a, b, variant))
             cells[size] = gain_text(list(gains.values()))
             agree = sum((gain.mean() > 0) == (expected[scene] > 0) for scene, gain in gains.items())
             same.append(f"{agree}/{len(gains)}")

@@ -72,13 +72,8 @@ def grids(results: Results, quantity: str = "psnr_db") -> Grids:
     return arrays
 
 
-def contrast(arrays: Grids, weights: Weights) -> list[Values]:
-    """Return a weighted sum of models as arrays [seeds, views], over the scenes, seeds and views that all have."""
-    return list(contrast_by_scene(arrays, weights).values())
-
-
-def contrast_by_scene(arrays: Grids, weights: Weights) -> dict[str, Values]:
-    """Return the arrays [seeds, views] of `contrast` by scene."""
+def contrast(arrays: Grids, weights: Weights) -> dict[str, Values]:
+    """Return a weighted sum of models by scene as arrays [seeds, views], over the seeds and views that all have."""
     sums = {}
     for scene in sorted(arrays):
         if all(key in arrays[scene] for key in weights):
@@ -95,7 +90,8 @@ def differences(arrays: Grids, asked: Sequence[Weights]) -> pd.DataFrame:
 
     A difference that is asked twice, or with the opposite sign, counts as one comparison.
     """
-    table = pd.DataFrame([row_of(estimate(contrast(arrays, w))) for w in asked], columns=list(row_of(NOTHING)))
+    estimates = [estimate(list(contrast(arrays, weights).values())) for weights in asked]
+    table = pd.DataFrame(map(row_of, estimates), columns=list(row_of(NOTHING)))
     keys = [min(_terms(weights, sign) for sign in (1, -1)) for weights in asked]  # equal for a - b and b - a
     distinct = table.p[~pd.Series(keys, table.index, dtype=object).duplicated()]
     adjusted = dict(zip([keys[i] for i in distinct.index], holm(distinct.tolist()), strict=True))

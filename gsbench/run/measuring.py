@@ -19,7 +19,7 @@ from gsbench.measure.images import Pixels, strip
 from gsbench.measure.quality import evaluate, evenly
 from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
-from gsbench.measure.speed import RenderTimes, peak_memory, synchroniser, time_renders
+from gsbench.measure.speed import RenderTimes, peak_memory, synchroniser, time_in_turns
 from gsbench.models.render import GraphedFrames
 from gsbench.run import drift
 from gsbench.run.drift import Still
@@ -144,7 +144,8 @@ def time_frames(trainer: Trainer, views: Sequence[View]) -> tuple[RenderTimes, d
     """Time frames of a trained model at some views in turn, and return the note of `frames` too."""
     frame, note = frames(trainer, views[0])
     count, synchronise = max(trainer.config.protocol.renders, len(views)), synchroniser(trainer.config.device)
-    return time_renders(lambda i: frame(views[i % len(views)]), count, synchronise=synchronise), note
+    (times,) = time_in_turns([lambda i: frame(views[i % len(views)])], count, synchronise)
+    return times, note
 
 
 def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dict[str, str]]:

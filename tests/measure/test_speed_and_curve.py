@@ -29,17 +29,17 @@ def test_render_times_are_percentiles_after_warm_up(clock):
         rendered.append(i)
         clock[0] += next(costs) / 1000
 
-    times = speed.time_renders(render, count=31, warmup=5)
+    (times,) = speed.time_in_turns([render], count=31)
     assert (times.p10, times.p50, times.p90) == pytest.approx((4, 16, 28))
     assert times.fps == pytest.approx(1000 / 16)
-    assert rendered == [*range(5), *range(31)]
+    assert rendered == [*range(26, 31), *range(31)]
 
 
 def test_the_device_is_waited_for_inside_the_timed_region():
     """Would catch unsynchronised timing, which reports how fast work is queued rather than done."""
     events: list[str] = []
-    speed.time_renders(lambda i: events.append(f"render {i}"), 30, 0, lambda: events.append("wait"))
-    assert events == [event for i in range(30) for event in ("wait", f"render {i}", "wait")]
+    speed.time_in_turns([lambda i: events.append(f"render {i}")], 30, lambda: events.append("wait"))
+    assert events[3 * speed.WARM_UP :] == [event for i in range(30) for event in ("wait", f"render {i}", "wait")]
 
 
 def test_stages_survive_a_resume_and_do_not_nest(clock):
