@@ -192,9 +192,8 @@ def check_start(trained: TrainedGaussians, scene: Scene) -> None:
 
 
 def check_machine(config: Config) -> None:
-    """Raise InputError if this machine lacks the device, the backend or the LPIPS weights of the settings."""
+    """Raise InputError if this machine lacks the device or the LPIPS weights of the settings."""
     check_device(config.device)
-    resolve(config.raster.backend, torch.device(config.device).type)
     for backbone, file in lpips_weights(config).items():
         perceptual.load(backbone, file, config.device)
 

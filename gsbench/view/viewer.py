@@ -251,7 +251,11 @@ class Viewer:
         """
         self.renderers, first = renderers_of(runs), runs[0]
         guard = RequestGuard(host, port)
-        self.scene: Scene | str = _scene_or_reason(first, data_root)
+        self.scene: Scene | str  # or the reason why its data cannot be loaded; its model can be shown without them
+        try:
+            self.scene = scene_of(first, data_root)
+        except InputError as error:
+            self.scene = str(error)
         self.browsers: dict[int, Browser] = {}
         self.wake = threading.Event()  # a browser needs a frame
         self.bounds = ThreadPoolExecutor(1)  # on the error of float32, which take so long that frames must not wait
@@ -296,11 +300,3 @@ def _label(shown: ShownImage) -> Label:
     """Return the label of an image: its model, and its colours if they mean something else, and what was measured."""
     name, *rows = shown.renderer.label
     return name + ("" if shown.colours == IMAGE else f", {shown.colours}"), *rows
-
-
-def _scene_or_reason(run: LoadedRun, data_root: str | None) -> Scene | str:
-    """Return the scene of a run, or the reason why its data cannot be loaded; its model can be shown in both cases."""
-    try:
-        return scene_of(run, data_root)
-    except InputError as error:
-        return str(error)
