@@ -44,23 +44,19 @@ class LongLived(Hook):
         return self.longest is not None and self.training.schedule.gates(step)
 
     def after_density(self, step: int) -> None:
-        """Make long-lived Gaussians static once, at the step at which gates act."""
+        """Make the Gaussians static whose lifetime, a standard deviation in clips, is long; once, when gates act."""
         if self.longest is None or not self.acts(step):
             return
         with self.training.stages("gate"):
-            self.make_static(self.longest)
-
-    def make_static(self, longest: float) -> None:
-        """Make the Gaussians static whose lifetime, a standard deviation in clips, is longer than `longest`."""
-        model = as_gated(self.training.model)
-        times_and_lifetimes = model.lifetimes()
-        assert times_and_lifetimes is not None
-        is_long = times_and_lifetimes[1] > longest  # [N]
-        views = evenly(self.training.scene.train, VIEWS_IN_TRAINING)
-        queries = [CameraTime.of(view.camera, view.time) for view in views]
-        ways = simplifications_of(model, queries, [model.slice(query) for query in queries])
-        chosen = {LIVE: ~is_long, STATIC: is_long, REMOVED: torch.zeros_like(is_long)}
-        orders = effect_sets_of(model).orders
-        assert orders is not None
-        choice = ChosenSimplifications(chosen, orders, predicted=0.0)
-        self.training.rows.moved(*apply(model, [way for way in ways if way.name == STATIC], choice))
+            model = as_gated(self.training.model)
+            times_and_lifetimes = model.lifetimes()
+            assert times_and_lifetimes is not None
+            is_long = times_and_lifetimes[1] > self.longest  # [N]
+            views = evenly(self.training.scene.train, VIEWS_IN_TRAINING)
+            queries = [CameraTime.of(view.camera, view.time) for view in views]
+            ways = simplifications_of(model, queries, [model.slice(query) for query in queries])
+            chosen = {LIVE: ~is_long, STATIC: is_long, REMOVED: torch.zeros_like(is_long)}
+            orders = effect_sets_of(model).orders
+            assert orders is not None
+            choice = ChosenSimplifications(chosen, orders, predicted=0.0)
+            self.training.rows.moved(*apply(model, [way for way in ways if way.name == STATIC], choice))

@@ -46,9 +46,8 @@ def do_planned(config: RunConfig, folder: Path, run_number: int, at_once: int = 
 
 def do(config: RunConfig) -> Ended:
     """Do a run, and return its outcome; a reason why it did not end well is printed too."""
-    began, results = time.time(), Path(config.config.results).absolute()
     try:
-        ended = _done(config, began, results)
+        ended = _done(config)
     except OmegaConfBaseException as error:  # a reference in the config that leads nowhere
         ended = Ended(reason=explain(error), is_refused=True)
     except InputError as error:
@@ -63,8 +62,9 @@ def do(config: RunConfig) -> Ended:
     return ended
 
 
-def _done(config: RunConfig, began: float, results: Path) -> Ended:
-    """Do a run that `began` at a time, and return its outcome, with the path of its record relative to `results`."""
+def _done(config: RunConfig) -> Ended:
+    """Do a run, and return its outcome, with the path of its record relative to the folder of all results."""
+    began, results = time.time(), Path(config.config.results).absolute()
     if (limit := too_little_address_space()) is not None:
         raise MemoryError(limit)
     from gsbench.run.execution import UnrecordedError, execute  # imports torch
