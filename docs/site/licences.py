@@ -11,7 +11,7 @@ import json
 import re
 import sys
 import tomllib
-from collections.abc import Iterable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -51,27 +51,20 @@ SHORT = {
 }
 
 
-def installed(requirements: Iterable[str]) -> dict[str, metadata.Distribution | None]:
-    """Return what requirements bring along by name, sorted; None: it is not installed here."""
-    packages: dict[str, metadata.Distribution | None] = {}
-    waiting = [*requirements]
+def of_users() -> dict[str, metadata.Distribution]:
+    """Return what users install, as far as it is here: gsbench's requirements, of extras too, and what these bring."""
+    packages: dict[str, metadata.Distribution] = {}
+    extras = [requirement for extra in EXTRAS.keys() - {*OF_DEVELOPERS} for requirement in EXTRAS[extra]]
+    waiting = [*PROJECT["dependencies"], *extras]
     while waiting:
         requirement = Requirement(waiting.pop())
         name = canonicalize_name(requirement.name)
         if name in packages or (requirement.marker and not requirement.marker.evaluate({"extra": ""})):
             continue
-        try:
-            package = packages[name] = metadata.distribution(name)
-            waiting += package.requires or []
-        except metadata.PackageNotFoundError:
-            packages[name] = None
+        with suppress(metadata.PackageNotFoundError):
+            packages[name] = metadata.distribution(name)
+            waiting += packages[name].requires or []
     return dict(sorted(packages.items()))
-
-
-def of_users() -> dict[str, metadata.Distribution]:
-    """Return what users install: gsbench's requirements, those of all extras for users, and what these bring along."""
-    extras = [requirement for extra in EXTRAS.keys() - {*OF_DEVELOPERS} for requirement in EXTRAS[extra]]
-    return {name: package for name, package in installed([*PROJECT["dependencies"], *extras]).items() if package}
 
 
 def direct() -> dict[str, str]:

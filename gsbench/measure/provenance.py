@@ -4,6 +4,7 @@ import functools
 import platform
 import subprocess
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -55,10 +56,8 @@ def versions() -> dict[str, str]:
     """Return the versions of Python, gsbench and the installed packages that results depend on."""
     installed = {"python": platform.python_version(), "gsbench": __version__}
     for package in PACKAGES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             installed[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
     return installed
 
 

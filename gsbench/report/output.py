@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
 
@@ -86,10 +87,8 @@ def _state(folder: Path) -> frozenset[tuple[Path, int]]:
     """Return the paths of all run records with their times; a record that is just being replaced is skipped."""
     state = set()
     for path in files.find(folder) if folder.is_dir() else []:
-        try:
+        with suppress(FileNotFoundError):
             state.add((path, path.stat().st_mtime_ns))
-        except FileNotFoundError:
-            continue
     return frozenset(state)
 
 

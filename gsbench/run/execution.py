@@ -6,6 +6,7 @@ A finished run is not trained again: its record is kept, or it is measured again
 import gc
 import sys
 import traceback
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,16 +166,12 @@ class Execution:
         )
 
     def draw(self) -> None:
-        """Write the measured renders, such as pictures.png, and the effects that Gaussians keep as effect_sets.png.
-
-        If the disk is full, the run has no images, but its record is already written.
-        """
-        for name, image in self._images.items():
-            path = self.spec.folder / name
-            try:
-                write_png(image, path)
-            except OSError as error:
-                print(f"{self.spec.name}: no pictures: {path}: {error.strerror}", file=sys.stderr)
+        """Write the measured renders, such as pictures.png, and the effects that Gaussians keep as effect_sets.png."""
+        try:
+            for name, image in self._images.items():
+                write_png(image, self.spec.folder / name)
+        except Exception as error:  # the record is written, so an error in the pictures must not end the sweep
+            print(f"{self.spec.name}: no pictures: {one_line(error)}", file=sys.stderr)
 
     def describe(self, status: Status, reason: str | None) -> Record:
         """Return a record without measurements, to check it before step 0, and for a run that failed for a `reason`."""
@@ -276,10 +273,7 @@ def _record_of(execution: Execution) -> Record:
         print(f"{spec.name}: {line}")
     ended = summary(record) if record.status == "ok" else record.status  # the caller prints the reason
     print(f"{spec.name}: {ended}; {spec.folder / records.FILE_NAME}")
-    try:
-        execution.draw()
-    except Exception as error:  # the record is written, so an error in the pictures must not end the sweep
-        print(f"{spec.name}: no pictures: {one_line(error)}", file=sys.stderr)
+    execution.draw()
     return record
 
 
@@ -323,11 +317,9 @@ def write(record: Record, folder: Path) -> None:
         records.write(record, path)
         stale.unlink(missing_ok=True)
         return
-    try:
+    with suppress(InputError):  # no record, or a damaged one
         if records.read(path).status == "ok":
             path.replace(stale)
-    except InputError:
-        pass  # no record, or a damaged one
     if stale.exists():
         record = replace(record, reason=f"{record.reason} (what an earlier run measured is kept in {STALE})")
     records.write(record, path)

@@ -12,6 +12,7 @@ import hashlib
 import os
 import socket
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -81,10 +82,8 @@ class Reporter:
             self.progress, step=self.done + step, seconds=self.seconds + seconds, psnr_val=psnr, updated=time.time()
         )
         self._written = time.monotonic()
-        try:
+        with suppress(OSError):  # a full disk must not end the run here, but at its checkpoint or record
             write(self.folder, self.progress)
-        except OSError:  # a full disk must not end the run here, but at its checkpoint or record
-            return
 
 
 def read(path: Path) -> Progress:
@@ -165,15 +164,13 @@ def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) ->
     If a signal has stopped the run, its progress becomes stopped.json.
     """
     path = folder / FILE_NAME
-    try:
+    with suppress(OSError):  # the folder cannot be written any more; the claim expires with this process
         _, other = _read(path)
         if other is not None and _is_same_process(other, claim):
             if is_stopped:
                 stopped = dataclasses.replace(other, updated=time.time())
                 write_atomically(folder / STOPPED, as_json(stopped).encode(), lasting=False)
             path.unlink(missing_ok=True)
-    except OSError:  # the folder cannot be written any more; the claim expires with this process
-        return
 
 
 def _read(path: Path) -> tuple[bytes | None, Progress | None]:
