@@ -19,13 +19,11 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from gsbench import kernels
 from gsbench.errors import InputError, one_line, printable
 from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
 from gsbench.measure import record as records
 from gsbench.measure.flicker import films_of, grey_of, tof
 from gsbench.measure.images import write_png
-from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import SSIM_LEAST_SIDE, capped_psnr
 from gsbench.measure.record import Cost, Record
 from gsbench.measure.renders import HOW_TO, CheckedRenders, check_renders
@@ -35,7 +33,7 @@ from gsbench.process.memory import is_out_of_memory
 from gsbench.run import drift
 from gsbench.run.execution import summary
 from gsbench.run.identity import RunSpec, identify
-from gsbench.run.measuring import measure_images, protocol_of
+from gsbench.run.measuring import measure_images, protocol_of, provenance_of
 from gsbench.run.settings import AUTO
 from gsbench.run.setup import check_folder, check_machine, evaluated_views, load_scene
 from gsbench.scenes import View
@@ -100,7 +98,6 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
     print(printable(_matching(renders, views)))
     check_folder(folder)
     measured = measure_images(views, renders.images(), scene.background, config)
-    on_gpu = config.device.startswith("cuda")
     record = Record(
         status="ok",
         reason=None,
@@ -111,14 +108,7 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
         seed=config.seed,
         effects=None,
         protocol=protocol_of(config, scene) | _departures(renders),
-        provenance=provenance(
-            config={key: spec.plain[key] for key in RECORDED},
-            data_hash=scene.fingerprint,
-            data_notes=scene.notes,
-            threads=torch.get_num_threads(),
-            instruction_set=kernels.instruction_set(),
-            device=torch.cuda.get_device_name(config.device) if on_gpu else None,
-        ),
+        provenance=provenance_of({key: spec.plain[key] for key in RECORDED}, scene, config.device),
         metrics=measured.metrics | dict.fromkeys(drift.NAMES),
         missing=measured.missing | dict.fromkeys(drift.NAMES, "needs the Gaussians, not their images"),
         per_view=measured.per_view,

@@ -10,9 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
-from gsbench import kernels, models
+from gsbench import models
 from gsbench.config_roles import listed, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError, one_line, printable
 from gsbench.gates import messages
@@ -23,8 +21,6 @@ from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.curve import FALL, Curve
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.images import Pixels, write_png
-from gsbench.measure.machine import hardware, named
-from gsbench.measure.provenance import provenance
 from gsbench.measure.record import Effects, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
@@ -177,7 +173,6 @@ class Execution:
         """Return a record without measurements, to check it before step 0, and for a run that failed for a `reason`."""
         config, scene, spec = self.chosen.config, self.scene, self.spec
         observes = models.find(config.model.name, config.model.module).observes
-        on_gpu = config.device.startswith("cuda") and self.model is not None
         return Record(
             status=status,
             reason=reason,
@@ -191,14 +186,8 @@ class Execution:
                 **measuring.protocol_of(config, scene),
                 "backend": self.model.backend.name if self.model else config.raster.backend,
             },
-            provenance=provenance(
-                config=spec.plain,
-                data_hash=scene.fingerprint if scene else "not loaded",
-                data_notes=scene.notes if scene else (),
-                threads=torch.get_num_threads(),
-                instruction_set=kernels.instruction_set(),
-                device=torch.cuda.get_device_name(config.device) if on_gpu else None,
-            ),
+            # Without a model, the device may be one that is not here.
+            provenance=measuring.provenance_of(spec.plain, scene, config.device if self.model is not None else "cpu"),
             variant=spec.variant,
             overrides=spec.overrides,
         )
@@ -379,10 +368,8 @@ def finished(spec: RunSpec, scene: Scene) -> Record | None:
 
 def _where(spec: RunSpec, record: Record) -> str:
     """Return the date and the machine of a record as text."""
-    here, device = hardware(kernels.instruction_set()), spec.config.device
-    name = torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor
     machine = record.provenance.machine
-    is_here = machine == named(name, torch.get_num_threads(), here)
+    is_here = machine == measuring.provenance_of(spec.plain, None, spec.config.device).machine
     return f"{record.provenance.time.partition('T')[0]:.20} on {'this machine' if is_here else machine}"
 
 
