@@ -95,13 +95,11 @@ class Candidates:
         shutil.rmtree(self.spec.folder / FOLDER, ignore_errors=True)
         return trainer
 
-    def trained(
-        self, chosen: "Result", results: Sequence["Result"], screen: TimeScreen | None, effort: Effort
-    ) -> Trainer:
+    def trained(self, chosen: "Result", results: Sequence["Result"], model: "ChosenModel") -> Trainer:
         """Return the trainer of the chosen candidate at the step of its checkpoint.
 
         The training of all other candidates counts as training before its own, and so do the time screen of model=auto
-        and its CPU time, `effort`.
+        and its CPU time.
 
         Raises:
             InputError: the checkpoint is gone or damaged.
@@ -115,11 +113,11 @@ class Candidates:
         others = [result for result in results if result is not chosen]
         seconds = sum(other.candidate.seconds for other in others)
         trainer.stages.add("compare", seconds)
-        if screen is not None:
-            trainer.stages.add("screen", screen.seconds)
-            seconds += screen.seconds
+        if model.screen is not None:
+            trainer.stages.add("screen", model.screen.seconds)
+            seconds += model.screen.seconds
         trainer.curve.delay(seconds)
-        for spent in (effort, *(other.effort for other in others)):
+        for spent in (model.effort, *(other.effort for other in others)):
             trainer.effort.add(spent)
         return trainer
 
@@ -301,7 +299,7 @@ def _trained_models(trainings: Candidates, model: ChosenModel) -> Trainer:
     chosen = best(results)
     comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
     print(f"{trainings.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
-    trainer = trainings.trained(chosen, results, model.screen, model.effort)
+    trainer = trainings.trained(chosen, results, model)
     trainer.hook(Choices).chosen.comparison = comparison
     return trainer
 
@@ -362,6 +360,6 @@ def _trained_lengths(trainings: Candidates, model: ChosenModel) -> Trainer:
     chosen = best(results)
     choice = LengthChoice(chosen.steps, [result.candidate for result in results])
     print(f"{trainings.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = trainings.trained(chosen, results, model.screen, model.effort)
+    trainer = trainings.trained(chosen, results, model)
     trainer.hook(Choices).chosen.length = choice
     return trainer
