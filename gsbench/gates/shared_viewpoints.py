@@ -26,11 +26,7 @@ class Viewpoints:
     fixed: list[list[int]]  # groups of at least two views from exactly the same position
     held: list[list[int]]  # groups of views from a camera that moves a little; empty if these are a minority
     other: list[int]  # the views of no group
-
-    @property
-    def loose(self) -> list[int]:
-        """The views that share their exact camera position with no other view, sorted."""
-        return sorted([v for group in self.held for v in group] + self.other)
+    loose: list[int]  # the views of `held` and `other`: those that share their exact position with no other view
 
 
 def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
@@ -52,7 +48,7 @@ def group_by_viewpoint(views: Sequence[View], extent: float) -> Viewpoints:
         if len(group) >= LEAST_HELD and np.ptp(times[group]) >= LEAST_SPAN * span
     ]
     held = near if 2 * sum(map(len, near)) > len(loose) else []  # a minority stays with the others
-    return Viewpoints(fixed, held, sorted(set(loose).difference(*held)))
+    return Viewpoints(fixed, held, sorted(set(loose).difference(*held)), loose)
 
 
 def _poses(views: Sequence[View], extent: float) -> Array:  # [V, 20]

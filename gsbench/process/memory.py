@@ -80,14 +80,10 @@ def _address_space_limit() -> int | None:
 
 def _address_space() -> int | None:
     """Return what the limit of the address space (`ulimit -v`) leaves; None if there is none."""
-    limit = _address_space_limit()
-    if limit is None:
+    limit, used = _address_space_limit(), lines_of(Path("/proc/self/statm"))
+    if limit is None or not used:
         return None
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except OSError:
-        return None
-    return max(0, limit - pages * os.sysconf("SC_PAGE_SIZE"))
+    return max(0, limit - int(used[0].split()[0]) * os.sysconf("SC_PAGE_SIZE"))  # its first number: all pages
 
 
 class Files(NamedTuple):
