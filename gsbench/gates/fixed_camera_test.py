@@ -59,7 +59,7 @@ def compare_images(views: Sequence[View], groups: Sequence[Sequence[int]], seed:
         groups: for each camera position the indices of its views, at least two.
         seed: the seed of the random permutations.
     """
-    most = max(4, MOST_VIEWS // len(groups))  # images of a position; of fewer than 3 no slow change can be seen
+    most = max(4, MOST_VIEWS // len(groups))  # images of a position; 4 have 24 orders to permute, 3 only 6
     block_count, changed_count = 0, 0  # over all positions
     means, times = [], []  # of each position with enough images: [n, 3 B] and [n]
     for position, group in enumerate(groups):

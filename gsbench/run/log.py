@@ -34,12 +34,7 @@ SECONDS = "10"  # that MLflow waits for a server
 WANDB_SECONDS = 30.0  # that Weights & Biases waits for a server
 
 # By the name of a number in a tracker, the key in a line of curve.jsonl.
-SENT = {
-    "val/psnr": "psnr_val",
-    "train/loss": "loss",
-    "train/seconds": "seconds",
-    "train/gaussians": "gaussians",
-}
+SENT = {"val/psnr": "psnr_val", "train/loss": "loss", "train/seconds": "seconds", "train/gaussians": "gaussians"}
 
 Numbers = Mapping[str, float]
 Line = dict[str, Any]  # of curve.jsonl
