@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.kernels.operation import Gradient, Input, Operation, Output, Tensors, address, in_rows
+from gsbench.kernels.operation import Gradient, Input, Operation, Output, Sums, Tensors, Upstream, address, in_rows
 from gsbench.kernels.tensors import check_number, check_tensor
 
 _TARGET = (torch.float32, torch.uint8)
@@ -59,13 +59,7 @@ class _Similarity(Operation):
         return {}  # `backward` calls no kernel
 
     def backward(
-        self,
-        tensors: Tensors,
-        slots: Slots,
-        outputs: Tensors,
-        upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool],
-        sums: dict[int, Tensor] | None = None,
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Upstream, wanted: Sequence[bool], sums: Sums
     ) -> list[Tensor | None]:
         """Multiply the gradients that `run` has computed by those by the losses; there is none by the target."""
         by_loss, image = upstream[0], tensors[0]  # [C], [C, H, W, 3]

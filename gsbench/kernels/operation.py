@@ -25,6 +25,8 @@ Tensors = list[Tensor]  # an input that is left out is an empty 1D tensor
 Sizes = dict[str, int]
 Results = tuple[Tensors, Slots]  # outputs of a call, and the kernel arguments that its backward pass needs
 Shape = tuple[int | str, ...]
+Upstream = Sequence[Tensor | None]  # the gradient of the loss by each output of an operation; None: zero
+Sums = dict[int, Tensor]  # by the number of an input, the tensor to which its gradient is added
 
 _SCHEMA = {int: "int", float: "float", bool: "bool"}
 _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # accepted Python types
@@ -232,13 +234,7 @@ class Operation:
         return slots
 
     def backward(
-        self,
-        tensors: Tensors,
-        slots: Slots,
-        outputs: Tensors,
-        upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool],
-        sums: dict[int, Tensor] | None = None,
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Upstream, wanted: Sequence[bool], sums: Sums
     ) -> list[Tensor | None]:
         """Run the backward kernel and return the gradients of the inputs.
 
@@ -246,11 +242,10 @@ class Operation:
             tensors: the inputs of `run`.
             slots: the kernel arguments that `run` returned.
             outputs: the outputs that `run` returned.
-            upstream: the gradient of the loss by each output; None for zero.
+            upstream: the gradient of the loss by each output.
             wanted: whether the caller needs the gradient of each input; a gradient that is declared ON_REQUEST is
                 computed only if the caller needs it.
-            sums: for the index of each input whose gradient is declared ADDED, the tensor to which this gradient is
-                added.
+            sums: where to add gradients that are declared ADDED; those that have no place there get new memory.
         """
         like = tensors[0]
         library = library_of(like.device.type)
@@ -271,7 +266,7 @@ class Operation:
                 gradients.append(None)
                 slots[key] = 0
                 continue
-            if sums is not None and i in sums:
+            if i in sums:
                 gradient = sums[i]
             else:
                 gradient = allocate("gradients", like, x.shape)
@@ -305,6 +300,9 @@ class Operation:
         slots = self._known.get(call)  # training calls an operation with few different shapes
         if slots is None:
             slots = self._match(tensors, numbers)
+            device = tensors[0].device
+            if "views" in slots and not library_of(device.type).takes_views:
+                raise InputError(f"{self.name}: expected one view on {device}, got {slots['views']} in one call")
             for length in self._lists.values():  # calls with lists of other lengths share the entry
                 del slots[length]
             if len(self._known) >= MOST_KNOWN:
@@ -341,8 +339,6 @@ class Operation:
                 raise InputError(
                     f"{self.name}: expected {key} on {device}, as {next(iter(self.inputs))} is, got it on {x.device}"
                 )
-        if "views" in slots and not library_of(device.type).takes_views:
-            raise InputError(f"{self.name}: expected one view on {device}, got {slots['views']} in one call")
         return slots
 
     def _wrong_kind(self, arguments: Sequence[Any]) -> InputError:
@@ -360,10 +356,6 @@ class Operation:
         """Return uninitialised outputs of the right shapes, for torch.compile."""
         slots = self._match(tensors, numbers)
         return [tensors[0].new_empty(_filled(shape, slots)) for _, shape in self._out]
-
-    def fake_backward(self, tensors: Tensors) -> Tensors:
-        """Return uninitialised gradients of the right shapes, for torch.compile."""
-        return [x.new_empty(x.shape) for x in tensors]
 
 
 class _Eager(torch.autograd.Function):
@@ -387,7 +379,7 @@ class _Eager(torch.autograd.Function):
         tensors, outputs = list(ctx.saved_tensors[: ctx.inputs]), list(ctx.saved_tensors[ctx.inputs :])
         operation, wanted = ctx.operation, ctx.needs_input_grad[3:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
-        gradients = operation.backward(tensors, slots, outputs, upstream, wanted)
+        gradients = operation.backward(tensors, slots, outputs, upstream, wanted, {})
         # Zeros are made only for inputs that need a gradient; the registered operator makes them for all.
         return (
             *[None] * 3,  # for operation, numbers and results
@@ -464,7 +456,8 @@ def _register(operation: Operation) -> Callable[..., Any]:
 
     def backward(tensors: Tensors, *rest: Any) -> Tensors:
         values, (outputs, upstream, wanted) = rest[:count], rest[count:]
-        gradients = operation.backward(tensors, operation.prepare(tensors, values, outputs), outputs, upstream, wanted)
+        slots = operation.prepare(tensors, values, outputs)
+        gradients = operation.backward(tensors, slots, outputs, upstream, wanted, {})
         filled = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
         return _apart(filled, upstream)
 
@@ -488,6 +481,6 @@ def _register(operation: Operation) -> Callable[..., Any]:
         schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] upstream, bool[] wanted) -> Tensor[]",
     )
     forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
-    backward_op.register_fake(lambda tensors, *_: operation.fake_backward(tensors))
+    backward_op.register_fake(lambda tensors, *_: [x.new_empty(x.shape) for x in tensors])
     forward_op.register_autograd(gradient, setup_context=keep)
     return forward_op

@@ -59,8 +59,13 @@ def read(numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
     An active recording reads the tensor again in every repetition, and raises OutdatedError unless `holds(values)` is
     true.
     """
-    recording = current()
-    return numbers.tolist() if recording is None else recording.read(numbers, holds)
+    if (recording := current()) is None:
+        values: list[int] = numbers.tolist()
+        return values
+    recording.add(partial(_check, numbers, holds))
+    with _disable_current_modes():  # a repetition need not copy what it reads from a GPU twice
+        values = numbers.tolist()
+    return values
 
 
 class Recording(TorchDispatchMode):
@@ -121,13 +126,6 @@ class Recording(TorchDispatchMode):
     def add(self, call: Callable[[], Any]) -> None:
         """Record a call, such as that of a kernel, that is no torch operation and writes to the same memory again."""
         self._calls.append(call)
-
-    def read(self, numbers: Tensor, holds: Callable[[list[int]], bool]) -> list[int]:
-        """Read a tensor, as the function `read` describes."""
-        self._calls.append(partial(_check, numbers, holds))
-        with _disable_current_modes():  # a repetition need not copy what it reads from a GPU twice
-            values: list[int] = numbers.tolist()
-        return values
 
     @torch.no_grad()
     def capture(self) -> None:

@@ -14,7 +14,17 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.kernels.headers import HIDDEN, MAX_NETWORKS, MAX_VALUES
 from gsbench.kernels.library import Slots, allocate, library_of
-from gsbench.kernels.operation import EVERY_ROW, Operation, Tensors, address, addresses, first_rows, in_rows
+from gsbench.kernels.operation import (
+    EVERY_ROW,
+    Operation,
+    Sums,
+    Tensors,
+    Upstream,
+    address,
+    addresses,
+    first_rows,
+    in_rows,
+)
 from gsbench.kernels.tensors import check_tensor
 
 
@@ -35,18 +45,8 @@ class _Inputs(NamedTuple):
     def of(cls, tensors: Tensors) -> "_Inputs":
         """Return the inputs by name from the list of tensors; `intervals` and `time` are None if both are empty."""
         *values, weight_in, bias_in, weight_out, bias_out, units, gamma, intervals, time = tensors
-        left_out = intervals.shape == time.shape == (0,)
-        return cls(
-            values,
-            weight_in,
-            bias_in,
-            weight_out,
-            bias_out,
-            units,
-            gamma,
-            None if left_out else intervals,
-            None if left_out else time,
-        )
+        when = (None, None) if intervals.shape == time.shape == (0,) else (intervals, time)
+        return cls(values, weight_in, bias_in, weight_out, bias_out, units, gamma, *when)
 
     def named(self) -> list[tuple[str, Tensor]]:
         """Return all tensors in order, each with its name for error messages."""
@@ -60,8 +60,7 @@ class _Inputs(NamedTuple):
 
     def weights(self) -> dict[str, Tensor]:
         """Return the weights of the MLPs as they are, which the kernels of a GPU take."""
-        weights = {key: getattr(self, key).detach() for key in ("weight_in", "bias_in", "weight_out", "bias_out")}
-        return dict(zip(weights, in_rows(list(weights.values())), strict=True))
+        return {key: getattr(self, key).detach() for key in ("weight_in", "bias_in", "weight_out", "bias_out")}
 
     def layers(self) -> dict[str, Tensor]:
         """Return the weights of the MLPs in the form that the kernels of the CPU take.
@@ -72,13 +71,12 @@ class _Inputs(NamedTuple):
         """
         features = self.weight_in.shape[1] - self.gamma.shape[0]
         weight_in = self.weight_in.detach()
-        weights = {
+        return {
             "weight_in": weight_in[:, :features] / self.units[:features],
             "bias_in": F.linear(self.gamma, weight_in[:, features:], self.bias_in.detach()),
             "weight_out": self.weight_out.detach() * self.units[:, None],
             "bias_out": self.bias_out.detach() * self.units,
         }
-        return dict(zip(weights, in_rows(list(weights.values())), strict=True))
 
     def of_layers(self, g: dict[str, Tensor]) -> Tensors:
         """Return the gradients of the original weights from those of the weights that `layers` returns."""
@@ -118,13 +116,7 @@ class _Refine(Operation):
         return out, slots
 
     def backward(
-        self,
-        tensors: Tensors,
-        slots: Slots,
-        outputs: Tensors,
-        upstream: Sequence[Tensor | None],
-        wanted: Sequence[bool],
-        sums: dict[int, Tensor] | None = None,
+        self, tensors: Tensors, slots: Slots, outputs: Tensors, upstream: Upstream, wanted: Sequence[bool], sums: Sums
     ) -> list[Tensor | None]:
         """Run the backward kernel, as `Operation.backward`; return gradients of the values and the MLPs' weights."""
         values, weights = slots["rows"], slots["weights"]
@@ -159,6 +151,7 @@ class _Refine(Operation):
             weights, (units, gamma) = inputs.weights(), in_rows([inputs.units, inputs.gamma])
         else:  # units and gamma are merged into the weights
             weights = inputs.layers()
+        weights = dict(zip(weights, in_rows(list(weights.values())), strict=True))
         intervals, time = inputs.intervals, inputs.time
         if intervals is not None and time is not None:
             intervals, time = in_rows([intervals, time])
@@ -202,8 +195,6 @@ class _Refine(Operation):
         # The shapes of `listed`, in the order of `_Inputs`.
         shapes: list[tuple[int, ...]] = [(len(like), width) for width in value_widths]
         views = () if inputs.views is None else (inputs.views,)
-        if views and not library_of(like.device.type).takes_views:
-            raise InputError(f"refine: expected one view on {like.device}, got {inputs.views} in one call")
         encoded = inputs.gamma.shape[-1]
         shapes += [(hidden, features + encoded), (hidden,), (outputs, HIDDEN), (outputs,)]
         shapes += [(outputs,), (*views, encoded)]
@@ -215,7 +206,8 @@ class _Refine(Operation):
                     f"refine: expected {name} of shape {list(shape)} on {like.device}, got "
                     f"{list(x.shape)} on {x.device}"
                 )
-        return {
+        sizes = {} if inputs.views is None else {"views": inputs.views}
+        return sizes | {
             "N": len(like),
             "V": inputs.views or 1,
             "refined": rows,

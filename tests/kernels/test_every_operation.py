@@ -249,7 +249,7 @@ def test_what_is_added_is_added(operation):
     tensors, numbers = list(at.tensors.values()), list(at.numbers.values())
     outputs, slots = operation.run(tensors, numbers)
     by_outputs, wanted = [torch.ones_like(x) for x in outputs], [True] * len(tensors)
-    alone = operation.backward(tensors, slots, outputs, by_outputs, wanted)
+    alone = operation.backward(tensors, slots, outputs, by_outputs, wanted, {})
     sums = {i: torch.full_like(tensors[i], 3.0) for i in operation.adds}
     both = operation.backward(tensors, slots, outputs, by_outputs, wanted, sums)
     for i in operation.adds:
@@ -267,7 +267,6 @@ def test_torch_compile_is_told_the_shapes(operation):
         fakes = [mode.from_tensor(x) for x in at.tensors.values()]
         outputs = getattr(torch.ops.gsbench, operation.name)(fakes, *at.numbers.values())
         assert [tuple(x.shape) for x in outputs] == at.shapes
-        assert [x.shape for x in operation.fake_backward(fakes)] == [x.shape for x in fakes]
     flags = operation.differentiable(list(at.tensors.values()))
     tensors = [x.detach().requires_grad_(flag) for x, flag in zip(at.tensors.values(), flags, strict=True)]
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")

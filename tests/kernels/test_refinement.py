@@ -119,7 +119,7 @@ def backward_of_refinement(values: list[Tensor], weights: list[Tensor], g_out: l
     """By the kernel: gradients of the two features, then of the weights."""
     tensors = [*values, *weights, torch.ones(16), *[torch.empty(0)] * 3]  # units, no encoded time, no intervals
     outputs, slots = refining._refine.run(tensors, (EVERY_ROW,))
-    every = refining._refine.backward(tensors, slots, outputs, g_out, [True] * len(tensors))
+    every = refining._refine.backward(tensors, slots, outputs, g_out, [True] * len(tensors), {})
     known = [g for g in every if g is not None]
     return [*known[:2], *known[4:]]
 

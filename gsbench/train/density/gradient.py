@@ -3,13 +3,11 @@
 import torch
 from torch import Tensor
 
-from gsbench.config import DensifyConfig
 from gsbench.kernels.library import library_of
 from gsbench.kernels.raster import add_density
 from gsbench.models.base import CHILDREN
 from gsbench.train.checkpoint import tensor
-from gsbench.train.density.rule import DensificationRule, Score
-from gsbench.train.rows import Rows
+from gsbench.train.density.rule import DensificationRule
 
 
 class GradientRule(DensificationRule):
@@ -17,10 +15,7 @@ class GradientRule(DensificationRule):
 
     unseen: Tensor | None = None  # [N] int32: views since each Gaussian was last visible, where a rule prunes by it
 
-    def __init__(
-        self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
-    ) -> None:
-        super().__init__(rows, config, min_opacity, views, score)
+    def start(self) -> None:
         self.forget()
 
     def forget(self) -> None:
@@ -75,12 +70,10 @@ class GradientDensification(GradientRule):
 
     unseen: Tensor
 
-    def __init__(
-        self, rows: Rows, config: DensifyConfig, min_opacity: float, views: int, score: Score | None = None
-    ) -> None:
-        super().__init__(rows, config, min_opacity, views, score)
-        self.patience = 2 * views - 1  # so many consecutive views always contain a whole epoch
-        self.unseen = torch.zeros(len(rows), dtype=torch.int32, device=self.model.splats["means"].device)
+    def start(self) -> None:
+        super().start()
+        self.patience = 2 * self.views - 1  # so many consecutive views always contain a whole epoch
+        self.unseen = torch.zeros_like(self.gradient, dtype=torch.int32)
 
     @torch.no_grad()
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:

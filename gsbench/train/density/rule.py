@@ -45,7 +45,11 @@ class DensificationRule(ABC):
         self.min_opacity = min_opacity
         self.views = views
         self.score = score
+        self.start()
         rows.add(self.reindex)
+
+    def start(self) -> None:
+        """Make what the rule accumulates, before the first step."""
 
     @abstractmethod
     def densify(self, generator: torch.Generator, has_reset: bool, most: int) -> int:
