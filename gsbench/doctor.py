@@ -48,6 +48,11 @@ class Check:
         return printable(f"{self.state:7} {self.name:11} {self.detail}" + (f" -> {self.todo}" if self.todo else ""))
 
 
+def _judged(name: str, is_ok: bool, detail: str, todo: str, otherwise: str = BROKEN) -> Check:
+    """Return the result of a check that is ok, or else `otherwise` with what to do."""
+    return Check(name, OK, detail) if is_ok else Check(name, otherwise, detail, todo)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the checks of this installation; return 1 if a part is broken, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m gsbench doctor", description=__doc__.partition("\n")[0])
@@ -78,10 +83,8 @@ def _packages() -> Iterator[Check]:
     core, extras = _requirements()
     missing = [name for name in core if _version(name) is None]
     versions = ", ".join(f"{name} {_version(name)}" for name in ("torch", "numpy", "hydra-core"))
-    if missing:
-        yield Check("packages", BROKEN, f"missing: {', '.join(missing)}", INSTALL)
-    else:
-        yield Check("packages", OK, f"{versions} and {len(core) - 3} more")
+    detail = f"missing: {', '.join(missing)}" if missing else f"{versions} and {len(core) - 3} more"
+    yield _judged("packages", not missing, detail, INSTALL)
     there = [extra for extra, names in extras.items() if all(map(_version, names))]
     lacking = [extra for extra in extras if extra not in there]
     yield Check(
@@ -131,33 +134,18 @@ def _machine() -> Iterator[Check]:
     usable = len(os.sched_getaffinity(0))
     yield Check("processor", OK, f"{here.processor}, {here.cores} cores, {usable} for this process")
     threads = torch.get_num_threads()
-    fit = threads <= usable
-    yield Check(
-        "threads",
-        OK if fit else BROKEN,
-        f"{threads} of torch and the kernels",
-        "" if fit else f"set OMP_NUM_THREADS={usable}: more threads than cores are slow",
-    )
+    todo = f"set OMP_NUM_THREADS={usable}: more threads than cores are slow"
+    yield _judged("threads", threads <= usable, f"{threads} of torch and the kernels", todo)
     if free is not None:
-        enough = free >= LEAST_MEMORY
-        yield Check(
-            "memory",
-            OK if enough else BROKEN,
-            f"{free / 2**30:.1f} of {here.memory_gib} GiB free",
-            "" if enough else "end other programs",
-        )
+        detail = f"{free / 2**30:.1f} of {here.memory_gib} GiB free"
+        yield _judged("memory", free >= LEAST_MEMORY, detail, "end other programs")
 
 
 def _disk() -> Iterator[Check]:
     """Check the free space where results are written by default."""
     free = shutil.disk_usage(Path.cwd()).free
-    enough = free >= LEAST_DISK
-    yield Check(
-        "disk",
-        OK if enough else BROKEN,
-        f"{free / 2**30:.1f} GiB free in {Path.cwd()}",
-        "" if enough else "free a GiB, or set results=FOLDER on another disk",
-    )
+    todo = "free a GiB, or set results=FOLDER on another disk"
+    yield _judged("disk", free >= LEAST_DISK, f"{free / 2**30:.1f} GiB free in {Path.cwd()}", todo)
 
 
 def _compiler() -> Iterator[Check]:
@@ -176,22 +164,13 @@ def _kernels() -> Iterator[Check]:
     from gsbench import kernels
 
     if not kernels.available():
-        yield Check(
-            "kernels",
-            BROKEN,
-            "not built: the CPU renders by the slow reference",
-            "install a C++20 compiler, then reinstall (docs/install.md)",
-        )
+        todo = "install a C++20 compiler, then reinstall (docs/install.md)"
+        yield Check("kernels", BROKEN, "not built: the CPU renders by the slow reference", todo)
         return
     error = _difference()
-    right = error <= LARGEST_ERROR
     used = f"{kernels.instruction_set()} (here: {', '.join(kernels.native().instruction_sets())})"
-    yield Check(
-        "kernels",
-        OK if right else BROKEN,
-        f"for the CPU, instruction set {used}; an image differs by {error:.0e} from the reference",
-        "" if right else "build again: make clean && make setup",
-    )
+    detail = f"for the CPU, instruction set {used}; an image differs by {error:.0e} from the reference"
+    yield _judged("kernels", error <= LARGEST_ERROR, detail, "build again: make clean && make setup")
 
 
 def _difference() -> float:
@@ -216,26 +195,16 @@ def _gpu() -> Iterator[Check]:
     from gsbench.kernels import cuda
 
     if not torch.cuda.is_available():
-        driver = shutil.which("nvidia-smi") is not None
-        why = "a driver is there, but this torch sees no device" if driver else "none; the CPU trains"
-        yield Check(
-            "gpu",
-            BROKEN if driver else ABSENT,
-            why,
-            "install torch with CUDA for this driver (docs/gpu.md)" if driver else "",
-        )
+        if shutil.which("nvidia-smi") is None:
+            yield Check("gpu", ABSENT, "none; the CPU trains")
+        else:
+            why = "a driver is there, but this torch sees no device"
+            yield Check("gpu", BROKEN, why, "install torch with CUDA for this driver (docs/gpu.md)")
         return
     device = torch.cuda.get_device_properties(0)
     name = f"{device.name}, {device.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
-    if cuda.built():
-        yield Check("gpu", OK, f"{name}, kernels built")
-    else:
-        yield Check(
-            "gpu",
-            BROKEN,
-            f"{name}, kernels not built: the GPU renders by the slow reference",
-            "install nvcc, then reinstall (docs/gpu.md)",
-        )
+    state = "built" if cuda.built() else "not built: the GPU renders by the slow reference"
+    yield _judged("gpu", cuda.built(), f"{name}, kernels {state}", "install nvcc, then reinstall (docs/gpu.md)")
 
 
 def _weights() -> Iterator[Check]:
@@ -244,12 +213,8 @@ def _weights() -> Iterator[Check]:
 
     for backbone, chosen in BACKBONES.items():
         there = is_here(backbone)
-        yield Check(
-            f"lpips {backbone}",
-            OK if there else ABSENT,
-            f"{chosen.file}{'' if there else ' is not here'}",
-            "" if there else f"python -m gsbench.fetch lpips-{backbone}",
-        )
+        detail = f"{chosen.file}{'' if there else ' is not here'}"
+        yield _judged(f"lpips {backbone}", there, detail, f"python -m gsbench.fetch lpips-{backbone}", ABSENT)
 
 
 def _data() -> Iterator[Check]:

@@ -1,7 +1,7 @@
 """Define the errors for wrong input; a message says what was expected, what was found, and what to do."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 DOCS = "docs"  # the folder of the docs pages, in a checkout and in an sdist
 
@@ -28,6 +28,12 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
     guess = f"Did you mean '{close[0]}'? " if close else ""
     return f"{guess}Valid: {', '.join(choices)}."
+
+
+def check_known(what: str, name: str, valid: Collection[str]) -> None:
+    """Raise InputError if a name of `what`, such as a backend, is none of the valid ones."""
+    if name not in valid:
+        raise InputError(f"{what} '{name}' is not known. {did_you_mean(name, valid)}")
 
 
 def deleted_key(key: str) -> InputError:

@@ -14,7 +14,7 @@ from gsbench.gates.messages import EFFECT_SETS
 from gsbench.measure.images import GAP, Pixels, in_a_row, inferno, reduced, to_bytes, write_text
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.effect_sets import NAMES
-from gsbench.models.render import rasterize_slice, render_slice
+from gsbench.models.render import rasterize_slice, render_slices
 from gsbench.scenes import Camera
 
 # RGB colours, as on the report's page: a Gaussian has the colour of the model with the same effects.
@@ -51,7 +51,7 @@ def draw(
     white, black = torch.ones_like(background), torch.zeros_like(background)  # black: no cost
     replaced = ((effect_set_colors(model), white), (cost_colors(model, most), black))  # colours [N, 3] and background
     outputs = [
-        render_slice(model, gaussians, camera, background, antialias),
+        render_slices(model, gaussians, [camera], background, antialias),
         *(
             rasterize_slice(gaussians._replace(colors=colors), camera, behind, model.backend, antialias)
             for colors, behind in replaced

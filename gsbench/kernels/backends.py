@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsbench import kernels
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, check_known
 from gsbench.kernels import cuda
 from gsbench.kernels.library import library_of
 
@@ -50,8 +50,7 @@ def resolve(name: str, device: str = "cpu") -> Backend:
 
     Raises InputError if the backend does not exist, is not installed, or does not work on the device.
     """
-    if name not in BACKENDS:
-        raise InputError(f"raster backend '{name}' is not known. {did_you_mean(name, BACKENDS)}")
+    check_known("raster backend", name, BACKENDS)
     if name == "auto":
         _warn(device)
         return BACKENDS[device] if device in AUTO.devices and _built(device) else REFERENCE

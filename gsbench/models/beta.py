@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import check_known
 from gsbench.kernels.headers import BETA_LOG_MIN, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_universal
 from gsbench.kernels.tensors import check_positive
@@ -172,8 +172,7 @@ class UniversalBetaModel(BetaModel):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if modulation not in MODULATIONS:
-            raise InputError(f"modulation '{modulation}' is not known. {did_you_mean(modulation, MODULATIONS)}")
+        check_known("modulation", modulation, MODULATIONS)
         check_positive(time_size, "time_size")
         check_positive(view_size, "view_size")
         self.modulation = modulation

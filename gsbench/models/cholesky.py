@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, check_known
 from gsbench.kernels.headers import EXPONENT_MAX, LOG_SIZE_MAX
 from gsbench.kernels.slices import slice_triangular
 from gsbench.models.base import SHRINK, Raw
@@ -58,8 +58,7 @@ class CholeskyModel(JointModel):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if factor_order not in FACTOR_ORDERS:
-            raise InputError(f"factor_order '{factor_order}' is not known. {did_you_mean(factor_order, FACTOR_ORDERS)}")
+        check_known("factor_order", factor_order, FACTOR_ORDERS)
         check_scheme(scheme)
         self.factor_order = factor_order
         self.scheme = scheme

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import check_known
 from gsbench.kernels.slices import slice_static
 from gsbench.kernels.tape import collect_gradients
 from gsbench.kernels.tensors import check_number, check_whole
@@ -66,8 +66,7 @@ class Ex4DGSModel(MovingGaussians3D, gates=True):
         check_number(dynamic_share, "dynamic_share", 0, 1)
         check_number(velocity_penalty, "velocity_penalty", 0)
         check_number(key_penalty, "key_penalty", 0)
-        if rise not in RISES:
-            raise InputError(f"rise '{rise}' is not known. {did_you_mean(rise, RISES)}")
+        check_known("rise", rise, RISES)
         self.intervals, self.dynamic_share, self.rise = intervals, dynamic_share, rise
         self.velocity_penalty, self.key_penalty = velocity_penalty, key_penalty
 

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import check_known
 from gsbench.kernels.headers import LOG_SIZE_MAX
 from gsbench.models.portable_math import exp, log
 from gsbench.models.slicing import triangularise
@@ -40,8 +40,7 @@ class CholeskyLayout:
         `row_scaled`: it is (2 sigmoid(x) - 1) times the diagonal entry of its row, as in the authors' later code.
         `relative`: it is x times the diagonal entry of its row if row and column are "p", else x.
         """
-        if form not in OFF_DIAGONALS:
-            raise InputError(f"off_diagonal '{form}' is not known. {did_you_mean(form, OFF_DIAGONALS)}")
+        check_known("off_diagonal", form, OFF_DIAGONALS)
         self.form = form
         self.letters = letters
         below = [(i, j) for i in range(len(letters)) for j in range(i)]  # row by row, as `split` takes them
@@ -120,6 +119,10 @@ def turn_of_space(quaternions: Tensor) -> Tensor:
     A 4D rotation M_left(l) M_right(r) of 4DGS turns only space if r is a positive multiple of (l0, -l1, -l2, l3), and
     only then. It is then the 3D rotation with the quaternion wxyz = (l0, l3, -l2, l1). This function is its own
     inverse, so it also converts a 3D quaternion to l.
+
+    Derivation: `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It maps the axis k of time to itself if
+    r = k* l k. It then maps u = v k* = t - z i + y j - x k to l u l*, a 3D rotation in which (z, -y, x) stands for the
+    axis (x, y, z).
     """
     w, x, y, z = quaternions.unbind(-1)
     return torch.stack([w, z, -y, x], -1)
@@ -143,14 +146,3 @@ def rotation4d(left: Tensor, right: Tensor) -> Tensor:
     M_left = torch.stack([a, -b, -c, -d, b, a, -d, c, c, d, a, -b, d, -c, b, a], -1).unflatten(-1, (4, 4))
     M_right = torch.stack([p, q, r, s, -q, p, -s, r, -r, s, p, -q, -s, -r, q, p], -1).unflatten(-1, (4, 4))
     return M_left @ M_right
-
-
-def quaternions_in_space(quats: Tensor) -> tuple[Tensor, Tensor]:  # [N, 4] wxyz
-    """Return the left and right quaternions of the 4D rotation that rotates space by a quaternion wxyz.
-
-    Derivation: `rotation4d(l, r)` maps v = x + y i + z j + t k to l v r*. It maps the axis k of time to itself if
-    r = k* l k. It then maps
-    u = v k* = t - z i + y j - x k to l u l*, a 3D rotation in which (z, -y, x) stands for the axis (x, y, z).
-    """
-    w, x, y, z = quats.unbind(-1)
-    return torch.stack([w, z, -y, x], -1), torch.stack([w, -z, y, x], -1)

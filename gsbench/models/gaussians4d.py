@@ -15,7 +15,7 @@ from gsbench.models.appearance import ColorOrder, coefficients_within, order_of,
 from gsbench.models.base import SHRINK, Raw
 from gsbench.models.camera_time import CameraTime, initial_times, unit
 from gsbench.models.effect_sets import EffectSets
-from gsbench.models.factors import partner, quaternion, quaternions_in_space, rotation, rotation4d, sizes, turn_of_space
+from gsbench.models.factors import partner, quaternion, rotation, rotation4d, sizes, turn_of_space
 from gsbench.models.gated import OPACITY_MARGIN, JointModel
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.portable_math import exp, log
@@ -95,9 +95,9 @@ class Gaussians4DModel(JointModel, gates=True):
         return Conditioned(raw["means"], factors, torch.ones_like(raw["opacities"]))
 
     def shaped_as(self, trained: TrainedGaussians, raw: Raw) -> Raw:
-        left, right = quaternions_in_space(trained.quats)
+        left = turn_of_space(trained.quats)
         scales = torch.cat([trained.log_scales, raw["scales"][:, 3:]], 1)
-        return {"scales": scales, "left_quats": left, "right_quats": right}
+        return {"scales": scales, "left_quats": left, "right_quats": partner(left)}
 
     @torch.no_grad()
     def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import check_known
 from gsbench.kernels.headers import DIRECT_FADING
 from gsbench.kernels.slices import slice_direct, slice_direct_beta, slice_static
 from gsbench.kernels.tensors import check_positive
@@ -126,8 +126,7 @@ class DirectModel(MovingGaussians3D, gates=True):
         **options: Any,
     ) -> None:
         super().__init__(**options)
-        if coupling not in COUPLINGS:
-            raise InputError(f"coupling '{coupling}' is not known. {did_you_mean(coupling, COUPLINGS)}")
+        check_known("coupling", coupling, COUPLINGS)
         check_positive(view_precision, "view_precision")
         self.coupling = coupling
         self.view_precision = view_precision

@@ -62,13 +62,6 @@ def _behind(gaussians: Gaussians3D, background: Tensor) -> Tensor:
     return F.pad(background, (0, further)) if further else background
 
 
-def render_slice(
-    model: GaussianModel, gaussians: Gaussians3D, camera: Camera, background: Tensor, antialias: bool = False
-) -> RasterOutput:
-    """Render a slice of a model for one camera: rasterize it, and let the model decode what was blended."""
-    return render_slices(model, gaussians, [camera], background, antialias)
-
-
 def render_slices(
     model: GaussianModel,  # that does not decode, if there are several cameras
     gaussians: Gaussians3D,  # [N, ..] for all cameras, or [C, N, ..]
@@ -76,7 +69,7 @@ def render_slices(
     background: Tensor,
     antialias: bool = False,
 ) -> RasterOutput:
-    """Render slices of a model in one call, each for its camera."""
+    """Render slices of a model in one call, each for its camera, and let the model decode what was blended."""
     output = rasterize_slices(gaussians, cameras, background, model.backend, antialias)
     return replace(output, image=model.decode(output.image, cameras[0]))
 
@@ -86,7 +79,7 @@ def render(
 ) -> Tensor:
     """Render the image [H, W, 3] of a model for a camera and a time in [0, 1], with its backend."""
     gaussians = model.slice(CameraTime.of(camera, time))
-    return render_slice(model, gaussians, camera, background, antialias).image[0]
+    return render_slices(model, gaussians, [camera], background, antialias).image[0]
 
 
 T = TypeVar("T")

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsbench.errors import InputError, did_you_mean
+from gsbench.errors import InputError, check_known
 from gsbench.kernels.tensors import check_tensor
 from gsbench.models.portable_math import sqrt
 
@@ -96,11 +96,12 @@ def slice_gaussians(
             f"got {list(mean.shape)}, {list(factor.shape)} and {list(query.shape)}"
         )
     check_scheme(scheme)
+    mu_p, delta = mean[:, :3], query - mean[:, 3:]
     if scheme == "square_root":
-        return slice_reduced(mean, reduce(factor), query)
+        T_qq, T_pq, T_pp = reduce(factor)
+        return Slice(mu_p + (T_pq * whiten(T_qq, delta)[:, None]).sum(-1), T_pp, gain_of(T_pq, T_qq))
     gain, cov = subtract(factor, scheme)
-    moved = mean[:, :3] + (gain @ (query - mean[:, 3:])[..., None])[..., 0]
-    return Slice(moved, cholesky3(cov), gain)
+    return Slice(mu_p + (gain @ delta[..., None])[..., 0], cholesky3(cov), gain)
 
 
 def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
@@ -120,18 +121,7 @@ def subtract(factor: Tensor, scheme: str) -> tuple[Tensor, Tensor]:
 
 def check_scheme(scheme: str) -> None:
     """Raise InputError unless `scheme` is a method of conditioning: `square_root`, `schur` or `cholesky`."""
-    if scheme not in SCHEMES:
-        raise InputError(f"slicing scheme '{scheme}' is not known. {did_you_mean(scheme, SCHEMES)}")
-
-
-def slice_reduced(mean: Tensor, reduced: Reduced, query: Tensor) -> Slice:
-    """Condition Gaussians with covariance factors [T_qq 0; T_pq T_pp] on the value `query` of q (time, direction).
-
-    The 3D Gaussian over position p has the mean mu_p + T_pq T_qq^-1 (q - mu_q) and the covariance factor T_pp.
-    """
-    white = whiten(reduced.T_qq, query - mean[:, 3:])
-    moved = mean[:, :3] + (reduced.T_pq * white[:, None]).sum(-1)
-    return Slice(moved, reduced.T_pp, gain_of(reduced.T_pq, reduced.T_qq))
+    check_known("slicing scheme", scheme, SCHEMES)
 
 
 def reduce(factor: Tensor) -> Reduced:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from gsbench.config_roles import flat
-from gsbench.errors import InputError, did_you_mean, how_to_install, one_line
+from gsbench.errors import InputError, check_known, how_to_install, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Record
@@ -156,8 +156,7 @@ def check_tracker(name: str | None) -> None:
     """Raise InputError if `name` is not a tracker, or if its package is not installed; None stands for no tracker."""
     if name is None:
         return
-    if name not in TRACKERS:
-        raise InputError(f"log '{name}' is not known. {did_you_mean(name, TRACKERS)}")
+    check_known("log", name, TRACKERS)
     if importlib.util.find_spec(name) is None:
         raise InputError(
             f"log={name}: the package {name} is not installed: {how_to_install(name)}",

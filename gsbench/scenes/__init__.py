@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsbench.errors import InputError, did_you_mean, printable
+from gsbench.errors import InputError, check_known, printable
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
 
 RESIZES = ("pillow",)  # filters by which images can be reduced, besides the mean of blocks
@@ -120,8 +120,8 @@ def load(
     """
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise InputError(f"downscale: expected a whole number of at least 1, got {downscale!r:.80}")
-    if resize is not None and resize not in RESIZES:
-        raise InputError(f"resize '{resize!s:.80}' is not known. {did_you_mean(str(resize), RESIZES)}")
+    if resize is not None:
+        check_known("resize", f"{resize!s:.80}", RESIZES)
     are_numbers = isinstance(background, tuple | list) and all(isinstance(value, int | float) for value in background)
     if not are_numbers or len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise InputError(f"background: expected three numbers in [0, 1], got {background!r:.80}")

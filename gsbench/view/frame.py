@@ -19,7 +19,7 @@ from gsbench.measure.images import STEPS, Pixels, inferno, rounding_image, to_by
 from gsbench.measure.speed import StageClock
 from gsbench.models import GaussianModel
 from gsbench.models.camera_time import CameraTime
-from gsbench.models.render import rasterize_slice, render_slice
+from gsbench.models.render import rasterize_slice, render_slices
 from gsbench.run.load import LoadedRun
 from gsbench.scenes import Camera
 from gsbench.schedule import ActiveComponents
@@ -206,7 +206,7 @@ class FrameRenderer:
                 gaussians = gaussians._replace(colors=self._colors[request.colours])
                 output = rasterize_slice(gaussians, camera, background, run.model.backend, antialias)
             else:
-                output = render_slice(run.model, gaussians, camera, background, antialias)
+                output = render_slices(run.model, gaussians, [camera], background, antialias)
             watch.end(RASTER)
             return output.image[0], watch.ms
 

@@ -15,7 +15,7 @@ from gsbench.errors import InputError
 from gsbench.kernels.backends import REFERENCE
 from gsbench.models import CameraTime
 from gsbench.models.factors import rotation
-from gsbench.models.render import rasterize_slice, render, render_slice
+from gsbench.models.render import rasterize_slice, render, render_slices
 from gsbench.models.spacetime import pixel_rays
 from gsbench.scenes import Camera
 from gsbench.scenes.points import SH_C0
@@ -196,7 +196,7 @@ def test_a_training_of_the_full_model():
     weighed = WeighedImage(model, view, black, antialias=False)
     assert torch.equal(weighed.image, render(model, view.camera, view.time, black).detach())
     weights = weighed.weights(torch.ones(weighed.image.shape[:2]))
-    alpha = render_slice(model, model.slice(CameraTime.of(view.camera, view.time)), view.camera, black).alpha
+    alpha = render_slices(model, model.slice(CameraTime.of(view.camera, view.time)), [view.camera], black).alpha
     torch.testing.assert_close(weights.sum(), alpha.sum().detach())
     value, why = psnr_float32(model, [view], black, antialias=False)
     assert value is None
