@@ -18,9 +18,17 @@
 #define GSB_FIELDS(Structure, role, ...)
 #endif
 
-#include "arguments_moving.h"
+// Defines a structure whose fields are all arrays of floats, which the kernel writes (Floats) or reads (ConstFloats).
+#define GSB_ARRAYS(Structure, Type, role, ...) \
+    struct Structure {                         \
+        Type __VA_ARGS__;                      \
+    };                                         \
+    GSB_FIELDS(Structure, role, __VA_ARGS__)
 
 namespace gsb {
+
+using Floats = float*;
+using ConstFloats = const float*;
 
 // ---- gsbench/kernels/slices.py
 
@@ -46,12 +54,8 @@ GSB_FIELDS(TriangularArgs, INPUTS, N, V, conditioned, raw_per_view, conditioned_
            directions, times, log_diagonal, shape, motion, coupling, opacities, center, time, log_lambda_d,
            log_lambda_t, threads)
 
-// Those of Gaussians are added to.
-struct TriangularGrads {
-    float *means, *directions, *times, *log_diagonal, *shape, *motion, *coupling, *opacities;
-    float *log_lambda_d, *log_lambda_t;  // zero on entry
-};
-GSB_FIELDS(TriangularGrads, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
+// Those of Gaussians are added to; those of log_lambda_d and log_lambda_t are zero on entry.
+GSB_ARRAYS(TriangularGrads, Floats, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
            log_lambda_d, log_lambda_t)
 
 // Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
@@ -66,23 +70,12 @@ struct RotatedArgs {
 GSB_FIELDS(RotatedArgs, INPUTS, N, V, conditioned, raw_per_view, means, times, scales, left_quats, right_quats,
            opacities, clock, time, log_lambda_t, threads)
 
-// Those of Gaussians are added to.
-struct RotatedGrads {
-    float *means, *times, *scales, *left_quats, *right_quats, *opacities;
-    float* log_lambda_t;  // zero on entry
-};
-GSB_FIELDS(RotatedGrads, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
+// Those of Gaussians are added to; that of log_lambda_t is zero on entry.
+GSB_ARRAYS(RotatedGrads, Floats, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
 
-// The conditional 3D Gaussians (slice) for one camera and time.
-struct Observation {
-    float *means, *factors, *opacities;  // [N, 3] [N, 3, 3] [N]
-};
-GSB_FIELDS(Observation, OUTPUTS, means, factors, opacities)
-
-struct ObservationGrads {
-    const float *means, *factors, *opacities;
-};
-GSB_FIELDS(ObservationGrads, GIVEN, means, factors, opacities)
+// The conditional 3D Gaussians (slice) for one camera and time: [N, 3] [N, 3, 3] [N].
+GSB_ARRAYS(Observation, Floats, OUTPUTS, means, factors, opacities)
+GSB_ARRAYS(ObservationGrads, ConstFloats, GIVEN, means, factors, opacities)
 
 // Gaussians of Universal Beta Splatting over position, direction and, unless `times` is null, time, with C = 3 or 4
 // variables besides position, and the camera centre and time at which they are sliced.
@@ -97,21 +90,12 @@ struct UniversalArgs {
 GSB_FIELDS(UniversalArgs, INPUTS, N, V, raw_per_view, means, directions, times, scales, skew, lower, betas, opacities,
            center, time, threads)
 
-struct UniversalGrads {
-    float *means, *directions, *times, *scales, *skew, *lower, *betas, *opacities;  // added to
-};
-GSB_FIELDS(UniversalGrads, GRADS, means, directions, times, scales, skew, lower, betas, opacities)
+// Added to.
+GSB_ARRAYS(UniversalGrads, Floats, GRADS, means, directions, times, scales, skew, lower, betas, opacities)
 
-// A slice whose Gaussians have Beta profiles with the exponents `shapes`.
-struct BetaSlice {
-    float *means, *factors, *opacities, *shapes;  // [N, 3] [N, 3, 3] [N] [N]
-};
-GSB_FIELDS(BetaSlice, OUTPUTS, means, factors, opacities, shapes)
-
-struct BetaSliceGrads {
-    const float *means, *factors, *opacities, *shapes;
-};
-GSB_FIELDS(BetaSliceGrads, GIVEN, means, factors, opacities, shapes)
+// A slice whose Gaussians have Beta profiles with the exponents `shapes`: [N, 3] [N, 3, 3] [N] [N].
+GSB_ARRAYS(BetaSlice, Floats, OUTPUTS, means, factors, opacities, shapes)
+GSB_ARRAYS(BetaSliceGrads, ConstFloats, GIVEN, means, factors, opacities, shapes)
 
 // Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time. V is 1 unless
 // AGR has changed the raw parameters for each of several views.
@@ -122,20 +106,56 @@ struct StaticArgs {
 };
 GSB_FIELDS(StaticArgs, INPUTS, N, V, scales, quats, opacities, threads)
 
-struct StaticSlice {
-    float *factors, *opacities;  // [N, 3, 3] [N]
-};
-GSB_FIELDS(StaticSlice, OUTPUTS, factors, opacities)
+// [N, 3, 3] [N]
+GSB_ARRAYS(StaticSlice, Floats, OUTPUTS, factors, opacities)
+GSB_ARRAYS(StaticSliceGrads, ConstFloats, GIVEN, factors, opacities)
 
-struct StaticSliceGrads {
-    const float *factors, *opacities;
-};
-GSB_FIELDS(StaticSliceGrads, GIVEN, factors, opacities)
+// Added to.
+GSB_ARRAYS(StaticGrads, Floats, GRADS, scales, quats, opacities)
 
-struct StaticGrads {
-    float *scales, *quats, *opacities;  // added to
+// Gaussians of dGS, and the camera centre and time of the view.
+struct DirectArgs {
+    int64_t N, V, conditioned;  // Gaussians from `conditioned` on are static
+    bool raw_per_view;
+    const float *means, *directions, *times, *scales, *quats;  // [N, 3] [N, 3] [N, 1] logits, [N, 3] logs, [N, 4]
+    const float *precision, *coupling, *shares, *opacities;    // [N, 7] [N, 12] [N, 2] logits, [N] logits
+    const float *center, *time;                                // [3] []
+    int threads;
 };
-GSB_FIELDS(StaticGrads, GRADS, scales, quats, opacities)
+GSB_FIELDS(DirectArgs, INPUTS, N, V, conditioned, raw_per_view, means, directions, times, scales, quats, precision,
+           coupling, shares, opacities, center, time, threads)
+
+// Added to, as all gradients of this section below.
+GSB_ARRAYS(DirectGrads, Floats, GRADS, means, directions, times, scales, quats, precision, coupling, shares, opacities)
+
+// Gaussians of dBS, which depend on K = 4 variables, or on 3 if `times` and `time` are null.
+struct DirectBetaArgs {
+    int64_t N, V, conditioned;
+    bool raw_per_view;
+    const float *means, *directions, *times, *scales, *skew;  // [N, 3] [N, 3] [N, 1] [N, 3] [N, 3]
+    const float *precision, *coupling, *betas, *opacities;    // [N, 6 or 7] [N, 3 K] [N, 1 + K] [N] logits
+    const float *center, *time;                               // [3] []
+    int threads;
+};
+GSB_FIELDS(DirectBetaArgs, INPUTS, N, V, conditioned, raw_per_view, means, directions, times, scales, skew, precision,
+           coupling, betas, opacities, center, time, threads)
+
+GSB_ARRAYS(DirectBetaGrads, Floats, GRADS, means, directions, times, scales, skew, precision, coupling, betas,
+           opacities)
+
+// Gaussians of FreeTimeGS or, if `plateaus` is not null, of SharpTimeGS.
+struct FreeTimeArgs {
+    int64_t N, V, conditioned;
+    bool raw_per_view;
+    const float *means, *times, *scales, *quats;                 // [N, 3] [N, 1] [N, 3] logs, [N, 4]
+    const float *durations, *plateaus, *velocities, *opacities;  // [N, 1] logs, [N, 1] logs, [N, 3] [N] logits
+    const float* time;                                           // []
+    int threads;
+};
+GSB_FIELDS(FreeTimeArgs, INPUTS, N, V, conditioned, raw_per_view, means, times, scales, quats, durations, plateaus,
+           velocities, opacities, time, threads)
+
+GSB_ARRAYS(FreeTimeGrads, Floats, GRADS, means, times, scales, quats, durations, plateaus, velocities, opacities)
 
 // ---- gsbench/kernels/colors.py
 
@@ -159,20 +179,10 @@ GSB_FIELDS(ColorArgs, INPUTS, N, V, gaussian_per_view, time_per_view, degree, ba
 // coefficients again.
 constexpr float CLAMPED = -0.0f;
 
-struct Colors {
-    float* colors;  // [N, 3]
-};
-GSB_FIELDS(Colors, OUTPUTS, colors)
-
-struct ShownColors {
-    const float* colors;
-};
-GSB_FIELDS(ShownColors, OUTPUTS, colors)
-
-struct GivenColors {
-    const float* colors;
-};
-GSB_FIELDS(GivenColors, GIVEN, colors)
+// [N, 3]
+GSB_ARRAYS(Colors, Floats, OUTPUTS, colors)
+GSB_ARRAYS(ShownColors, ConstFloats, OUTPUTS, colors)
+GSB_ARRAYS(GivenColors, ConstFloats, GIVEN, colors)
 
 struct ColorGrads {
     float *sh0, *shN;  // added to, in the rows that have a gradient
@@ -244,10 +254,8 @@ struct Splats {
 };
 GSB_FIELDS(Splats, OUTPUTS, means2d, roots, depths, half_sizes)
 
-struct SplatGrads {
-    const float *means2d, *roots, *depths;  // depths null: zero
-};
-GSB_FIELDS(SplatGrads, GIVEN, means2d, roots, depths)
+// Depths null: zero.
+GSB_ARRAYS(SplatGrads, ConstFloats, GIVEN, means2d, roots, depths)
 
 struct ProjectGrads {
     float *means, *factors, *opacities;  // as the inputs
@@ -274,15 +282,10 @@ struct Picture {
 };
 GSB_FIELDS(Picture, OUTPUTS, image, alpha, transmittance, stop)
 
-struct BlendState {
-    const float *transmittance, *stop;
-};
-GSB_FIELDS(BlendState, OUTPUTS, transmittance, stop)
+GSB_ARRAYS(BlendState, ConstFloats, OUTPUTS, transmittance, stop)
 
-struct PictureGrads {
-    const float *image, *alpha;  // alpha null: zero
-};
-GSB_FIELDS(PictureGrads, GIVEN, image, alpha)
+// Alpha null: zero.
+GSB_ARRAYS(PictureGrads, ConstFloats, GIVEN, image, alpha)
 
 struct BlendGrads {
     float *means2d, *roots, *colors;  // [C, N, 2] [C, N, 4] as colors

@@ -3,7 +3,7 @@
 import re
 from importlib import resources
 
-_ARGUMENTS = ("arguments.h", "arguments_moving.h", "cpu/kernels.h", "cuda/kernels.h")
+_ARGUMENTS = ("arguments.h", "cpu/kernels.h", "cuda/kernels.h")
 _LINE = re.compile(r"^constexpr (int|float|double) (\w+) = ([\d.e-]+)f?(?: / ([\d.]+)f)?;", re.MULTILINE)
 
 
@@ -21,7 +21,7 @@ def argument_structures() -> set[tuple[str, str]]:
     """Return the role and the field names, such as ("OUTPUTS", "means, factors"), of each structure of arguments."""
     folder = resources.files("gsbench.kernels")
     text = "".join(folder.joinpath(header).read_text() for header in _ARGUMENTS)
-    declared = re.findall(r"^GSB_FIELDS\(\w+, (\w+), ([^)]*)\)", text, re.MULTILINE)
+    declared = re.findall(r"^GSB_(?:FIELDS\(\w+|ARRAYS\(\w+, \w+), (\w+), ([^)]*)\)", text, re.MULTILINE)
     return {(role, ", ".join(re.findall(r"\w+", names))) for role, names in declared}
 
 

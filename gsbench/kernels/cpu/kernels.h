@@ -93,25 +93,13 @@ struct LinearArgs {
 };
 GSB_FIELDS(LinearArgs, INPUTS, N, C, K, x, weight, bias, relu, threads)
 
-struct Layer {
-    float* y;  // [N, K]
-};
-GSB_FIELDS(Layer, OUTPUTS, y)
+// [N, K]
+GSB_ARRAYS(Layer, Floats, OUTPUTS, y)
+GSB_ARRAYS(LayerState, ConstFloats, OUTPUTS, y)
+GSB_ARRAYS(LayerGrads, ConstFloats, GIVEN, y)
 
-struct LayerState {
-    const float* y;
-};
-GSB_FIELDS(LayerState, OUTPUTS, y)
-
-struct LayerGrads {
-    const float* y;
-};
-GSB_FIELDS(LayerGrads, GIVEN, y)
-
-struct LinearGrads {
-    float *x, *weight, *bias;  // zero on entry; x null: not wanted
-};
-GSB_FIELDS(LinearGrads, GRADS, x, weight, bias)
+// Zero on entry; x null: not wanted.
+GSB_ARRAYS(LinearGrads, Floats, GRADS, x, weight, bias)
 
 // Planes of features over two of the axes x, y, z, read at points; on a GPU torch samples them.
 constexpr int MOST_LEVELS = 8;
@@ -125,20 +113,12 @@ struct PlaneArgs {
 };
 GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, positions, first, last, of_space, threads)
 
-struct Products {
-    float* products;  // [N, levels C]
-};
-GSB_FIELDS(Products, OUTPUTS, products)
+// [N, levels C]
+GSB_ARRAYS(Products, Floats, OUTPUTS, products)
+GSB_ARRAYS(ProductGrads, ConstFloats, GIVEN, products)
 
-struct ProductGrads {
-    const float* products;
-};
-GSB_FIELDS(ProductGrads, GIVEN, products)
-
-struct PlaneGrads {
-    float *positions, *of_space;  // of nodes: zero on entry
-};
-GSB_FIELDS(PlaneGrads, GRADS, positions, of_space)
+// Those of nodes are zero on entry.
+GSB_ARRAYS(PlaneGrads, Floats, GRADS, positions, of_space)
 
 // Products of samples in space, planes over one of the axes x, y, z and time, and a network that reads F = levels C
 // features: a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each. Head h has the
@@ -157,12 +137,9 @@ struct FieldArgs {
 GSB_FIELDS(FieldArgs, INPUTS, N, C, levels, x, y, z, t, F, H, heads, K, products, positions, first, last, time, of_time,
            first_weight, first_bias, hidden_weight, hidden_bias, last_weight, last_bias, ends, threads)
 
-struct FieldGrads {
-    float *products, *positions, *of_time;  // added to
-    float *first_weight, *first_bias, *hidden_weight, *hidden_bias, *last_weight, *last_bias;  // zero on entry
-};
-GSB_FIELDS(FieldGrads, GRADS, products, positions, of_time, first_weight, first_bias, hidden_weight, hidden_bias,
-           last_weight, last_bias)
+// The first three are added to, those of the network are zero on entry.
+GSB_ARRAYS(FieldGrads, Floats, GRADS, products, positions, of_time, first_weight, first_bias, hidden_weight,
+           hidden_bias, last_weight, last_bias)
 
 // How rough these planes are along their rows, and how far from 1 those of time, with a weight for each.
 struct PenaltyArgs {
@@ -174,20 +151,10 @@ struct PenaltyArgs {
 GSB_FIELDS(PenaltyArgs, INPUTS, C, levels, x, y, z, t, of_space, of_time, space_smoothness, time_smoothness,
            time_sparsity, threads)
 
-struct Penalty {
-    float* penalty;  // []
-};
-GSB_FIELDS(Penalty, OUTPUTS, penalty)
-
-struct PenaltyGrad {
-    const float* penalty;
-};
-GSB_FIELDS(PenaltyGrad, GIVEN, penalty)
-
-struct NodeGrads {
-    float *of_space, *of_time;
-};
-GSB_FIELDS(NodeGrads, GRADS, of_space, of_time)
+// []
+GSB_ARRAYS(Penalty, Floats, OUTPUTS, penalty)
+GSB_ARRAYS(PenaltyGrad, ConstFloats, GIVEN, penalty)
+GSB_ARRAYS(NodeGrads, Floats, GRADS, of_space, of_time)
 
 // Arrays to set to zero.
 struct ZeroArgs {
