@@ -1,6 +1,6 @@
 """Measure the CUDA backend beside gsplat in one process: python -m benchmarks.gpu; JSON and Markdown in results.
 
-The raster alone on equal Gaussians, its two backward kernels, whole frames of models (ours fused; theirs slices in
+The raster alone on equal Gaussians, whole frames of models (ours fused; theirs slices in
 torch and draws by gsplat), replayed frames, a step of training, and the loss. Without gsplat its columns stay empty,
 and why is said. A case that fails is a row that says so. `--device cpu` is a rehearsal: small sizes, the CPU's kernels.
 """

@@ -1,21 +1,19 @@
-"""What is compared on a GPU: steps of four views, the raster, its backward, frames, replays, steps, the loss."""
+"""What is compared on a GPU: steps of four views, the raster, frames, replays, steps, the loss."""
 
 import itertools
 from collections.abc import Iterator
-from contextlib import nullcontext
 from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
-from benchmarks.compare import Call, Case, Cost, Place, Row, attempted, compared
+from benchmarks.compare import Call, Case, Place, Row, attempted, compared
 from benchmarks.gsplat_way import gsplat_image
 from benchmarks.rows import useful_alphas
 from benchmarks.scene import camera, gaussians, model
 from benchmarks.training import training_step
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import backward_by_splat
 from gsbench.models import CameraTime, GaussianModel
 from gsbench.models.factors import rotation
 from gsbench.models.render import GraphedFrames, render
@@ -28,7 +26,7 @@ TIME = 0.4  # at which models are seen
 
 def every(place: Place) -> Iterator[Row]:
     """All rows, those that matter most first."""
-    for rows in (four_view_rows, raster_rows, backward_rows, frame_rows, replay_rows, step_rows, loss_rows):
+    for rows in (four_view_rows, raster_rows, frame_rows, replay_rows, step_rows, loss_rows):
         yield from rows(place)
 
 
@@ -88,27 +86,6 @@ def raster_case(place: Place, case: str, N: int, size: int) -> Case:
         4.0 * (16 * N + 4 * size * size),
         useful_alphas(N, size),
     )
-
-
-def backward_rows(place: Place) -> Iterator[Row]:
-    """The raster's backward with a pixel a lane against a splat a lane (docs/gpu.md)."""
-    sizes = itertools.product((10_000, 100_000, 1_000_000), (400, 800, 1600)) if place.on_gpu else ()
-    for N, size in sizes:
-        case = f"{N} / {size}x{size}, theirs is a splat a lane"
-        yield from attempted("backward", case, lambda a=(place, case, N, size): [backward_row(*a)])
-
-
-def backward_row(place: Place, case: str, N: int, size: int) -> Row:
-    by_pixel, by_splat = (backward_cost(place, N, size, by_splat) for by_splat in (False, True))
-    return compared("backward", case, "backward", by_pixel, by_splat)
-
-
-def backward_cost(place: Place, N: int, size: int, by_splat: bool) -> Cost:
-    inputs = [x.requires_grad_() for x in place.put(gaussians(N))]
-    image = rasterize(*inputs, *place.put(camera(size)), size, size).image
-    upstream = torch.ones_like(image)
-    with backward_by_splat() if by_splat else nullcontext():
-        return place.cost(lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True))
 
 
 def frame_rows(place: Place) -> Iterator[Row]:

@@ -18,7 +18,7 @@
 #define GSB_FIELDS(Structure, role, ...)
 #endif
 
-// Defines a structure whose fields are all arrays of floats, which the kernel writes (Floats) or reads (ConstFloats).
+// Defines a structure whose fields are all arrays of floats, which the kernel writes (Written) or reads (Read).
 #define GSB_ARRAYS(Structure, Type, role, ...) \
     struct Structure {                         \
         Type __VA_ARGS__;                      \
@@ -27,8 +27,8 @@
 
 namespace gsb {
 
-using Floats = float*;
-using ConstFloats = const float*;
+using Written = float*;
+using Read = const float*;
 
 // ---- gsbench/kernels/slices.py
 
@@ -55,7 +55,7 @@ GSB_FIELDS(TriangularArgs, INPUTS, N, V, conditioned, raw_per_view, conditioned_
            log_lambda_t, threads)
 
 // Those of Gaussians are added to; those of log_lambda_d and log_lambda_t are zero on entry.
-GSB_ARRAYS(TriangularGrads, Floats, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
+GSB_ARRAYS(TriangularGrads, Written, GRADS, means, directions, times, log_diagonal, shape, motion, coupling, opacities,
            log_lambda_d, log_lambda_t)
 
 // Gaussians of 4DGS over (x, y, z, t) with the factor M_left M_right diag(exp scales), and the time at which they are
@@ -71,11 +71,11 @@ GSB_FIELDS(RotatedArgs, INPUTS, N, V, conditioned, raw_per_view, means, times, s
            opacities, clock, time, log_lambda_t, threads)
 
 // Those of Gaussians are added to; that of log_lambda_t is zero on entry.
-GSB_ARRAYS(RotatedGrads, Floats, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
+GSB_ARRAYS(RotatedGrads, Written, GRADS, means, times, scales, left_quats, right_quats, opacities, log_lambda_t)
 
 // The conditional 3D Gaussians (slice) for one camera and time: [N, 3] [N, 3, 3] [N].
-GSB_ARRAYS(Observation, Floats, OUTPUTS, means, factors, opacities)
-GSB_ARRAYS(ObservationGrads, ConstFloats, GIVEN, means, factors, opacities)
+GSB_ARRAYS(Observation, Written, OUTPUTS, means, factors, opacities)
+GSB_ARRAYS(ObservationGrads, Read, GIVEN, means, factors, opacities)
 
 // Gaussians of Universal Beta Splatting over position, direction and, unless `times` is null, time, with C = 3 or 4
 // variables besides position, and the camera centre and time at which they are sliced.
@@ -91,11 +91,11 @@ GSB_FIELDS(UniversalArgs, INPUTS, N, V, raw_per_view, means, directions, times, 
            center, time, threads)
 
 // Added to.
-GSB_ARRAYS(UniversalGrads, Floats, GRADS, means, directions, times, scales, skew, lower, betas, opacities)
+GSB_ARRAYS(UniversalGrads, Written, GRADS, means, directions, times, scales, skew, lower, betas, opacities)
 
 // A slice whose Gaussians have Beta profiles with the exponents `shapes`: [N, 3] [N, 3, 3] [N] [N].
-GSB_ARRAYS(BetaSlice, Floats, OUTPUTS, means, factors, opacities, shapes)
-GSB_ARRAYS(BetaSliceGrads, ConstFloats, GIVEN, means, factors, opacities, shapes)
+GSB_ARRAYS(BetaSlice, Written, OUTPUTS, means, factors, opacities, shapes)
+GSB_ARRAYS(BetaSliceGrads, Read, GIVEN, means, factors, opacities, shapes)
 
 // Gaussians of 3DGS with the factor R diag(exp scales), which do not change with the camera or the time. V is 1 unless
 // AGR has changed the raw parameters for each of several views.
@@ -107,11 +107,11 @@ struct StaticArgs {
 GSB_FIELDS(StaticArgs, INPUTS, N, V, scales, quats, opacities, threads)
 
 // [N, 3, 3] [N]
-GSB_ARRAYS(StaticSlice, Floats, OUTPUTS, factors, opacities)
-GSB_ARRAYS(StaticSliceGrads, ConstFloats, GIVEN, factors, opacities)
+GSB_ARRAYS(StaticSlice, Written, OUTPUTS, factors, opacities)
+GSB_ARRAYS(StaticSliceGrads, Read, GIVEN, factors, opacities)
 
 // Added to.
-GSB_ARRAYS(StaticGrads, Floats, GRADS, scales, quats, opacities)
+GSB_ARRAYS(StaticGrads, Written, GRADS, scales, quats, opacities)
 
 // Gaussians of dGS, and the camera centre and time of the view.
 struct DirectArgs {
@@ -126,7 +126,7 @@ GSB_FIELDS(DirectArgs, INPUTS, N, V, conditioned, raw_per_view, means, direction
            coupling, shares, opacities, center, time, threads)
 
 // Added to, as all gradients of this section below.
-GSB_ARRAYS(DirectGrads, Floats, GRADS, means, directions, times, scales, quats, precision, coupling, shares, opacities)
+GSB_ARRAYS(DirectGrads, Written, GRADS, means, directions, times, scales, quats, precision, coupling, shares, opacities)
 
 // Gaussians of dBS, which depend on K = 4 variables, or on 3 if `times` and `time` are null.
 struct DirectBetaArgs {
@@ -140,7 +140,7 @@ struct DirectBetaArgs {
 GSB_FIELDS(DirectBetaArgs, INPUTS, N, V, conditioned, raw_per_view, means, directions, times, scales, skew, precision,
            coupling, betas, opacities, center, time, threads)
 
-GSB_ARRAYS(DirectBetaGrads, Floats, GRADS, means, directions, times, scales, skew, precision, coupling, betas,
+GSB_ARRAYS(DirectBetaGrads, Written, GRADS, means, directions, times, scales, skew, precision, coupling, betas,
            opacities)
 
 // Gaussians of FreeTimeGS or, if `plateaus` is not null, of SharpTimeGS.
@@ -155,7 +155,7 @@ struct FreeTimeArgs {
 GSB_FIELDS(FreeTimeArgs, INPUTS, N, V, conditioned, raw_per_view, means, times, scales, quats, durations, plateaus,
            velocities, opacities, time, threads)
 
-GSB_ARRAYS(FreeTimeGrads, Floats, GRADS, means, times, scales, quats, durations, plateaus, velocities, opacities)
+GSB_ARRAYS(FreeTimeGrads, Written, GRADS, means, times, scales, quats, durations, plateaus, velocities, opacities)
 
 // ---- gsbench/kernels/colors.py
 
@@ -180,9 +180,9 @@ GSB_FIELDS(ColorArgs, INPUTS, N, V, gaussian_per_view, time_per_view, degree, ba
 constexpr float CLAMPED = -0.0f;
 
 // [N, 3]
-GSB_ARRAYS(Colors, Floats, OUTPUTS, colors)
-GSB_ARRAYS(ShownColors, ConstFloats, OUTPUTS, colors)
-GSB_ARRAYS(GivenColors, ConstFloats, GIVEN, colors)
+GSB_ARRAYS(Colors, Written, OUTPUTS, colors)
+GSB_ARRAYS(ShownColors, Read, OUTPUTS, colors)
+GSB_ARRAYS(GivenColors, Read, GIVEN, colors)
 
 struct ColorGrads {
     float *sh0, *shN;  // added to, in the rows that have a gradient
@@ -255,7 +255,7 @@ struct Splats {
 GSB_FIELDS(Splats, OUTPUTS, means2d, roots, depths, half_sizes)
 
 // Depths null: zero.
-GSB_ARRAYS(SplatGrads, ConstFloats, GIVEN, means2d, roots, depths)
+GSB_ARRAYS(SplatGrads, Read, GIVEN, means2d, roots, depths)
 
 struct ProjectGrads {
     float *means, *factors, *opacities;  // as the inputs
@@ -282,10 +282,10 @@ struct Picture {
 };
 GSB_FIELDS(Picture, OUTPUTS, image, alpha, transmittance, stop)
 
-GSB_ARRAYS(BlendState, ConstFloats, OUTPUTS, transmittance, stop)
+GSB_ARRAYS(BlendState, Read, OUTPUTS, transmittance, stop)
 
 // Alpha null: zero.
-GSB_ARRAYS(PictureGrads, ConstFloats, GIVEN, image, alpha)
+GSB_ARRAYS(PictureGrads, Read, GIVEN, image, alpha)
 
 struct BlendGrads {
     float *means2d, *roots, *colors;  // [C, N, 2] [C, N, 4] as colors

@@ -142,7 +142,7 @@ class Operation:
         ]
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
         self._known: dict[tuple[Any, ...], Slots] = {}  # results of `match` by numbers, shapes and types
-        self.backward_kernel = f"{name}_backward"  # of the same arguments as any other that is put here
+        self._backward_kernel = f"{name}_backward"
         self._traced = _register(self)
 
     def __call__(self, *arguments: Any, **by_name: Any) -> Tensors:
@@ -282,7 +282,7 @@ class Operation:
                 slots["grad.scratch"] = 0
         if zeroed:
             library.zero(zeroed)
-        library.call(self.backward_kernel, slots, like)
+        library.call(self._backward_kernel, slots, like)
         return gradients
 
     # ---- what follows from the declaration

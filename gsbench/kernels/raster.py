@@ -1,7 +1,6 @@
 """Rasterize 3D Gaussians by kernels: project them, list the intersections of each tile, and blend them into images."""
 
-from collections.abc import Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import torch
@@ -171,19 +170,6 @@ def blend(splats: Splats, colors: Tensor, background: Tensor, bins: Bins, viewpo
     means2d, roots, _, half_sizes, beta_exponents = splats
     image, alpha, *_ = _blend(means2d, roots, half_sizes, colors, background, *bins, beta_exponents, *viewport[:2])
     return image, alpha
-
-
-@contextmanager
-def backward_by_splat() -> Iterator[None]:
-    """In a `with` block, compute gradients of blending on a GPU with one thread per Gaussian, not per pixel.
-
-    The gradients are the same; results/published/benchmarks/gpu.md has the times of both.
-    """
-    before, _blend.backward_kernel = _blend.backward_kernel, "blend_backward_by_splat"
-    try:
-        yield
-    finally:
-        _blend.backward_kernel = before
 
 
 def flag_values(inputs: RasterInputs) -> Tensor:

@@ -1,7 +1,6 @@
 """What only the CUDA kernels can do wrong: order of threads, rows that rest, memory that runs out."""
 
 import re
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from torch import Tensor
 from gsbench.kernels import raster
 from gsbench.kernels.library import CudaLibrary
 from gsbench.kernels.loss import l1_ssim
-from gsbench.kernels.raster import add_density, backward_by_splat, room_for
+from gsbench.kernels.raster import add_density, room_for
 from gsbench.kernels.recording import Recording
 from gsbench.kernels.tape import Tape
 from gsbench.raster import rasterize
@@ -106,9 +105,8 @@ def test_more_tiles_than_16_bits_can_number(cuda_device):
     assert many.info.pairs == C * single.info.pairs
 
 
-@pytest.mark.parametrize("kernel", [nullcontext, backward_by_splat])
 @pytest.mark.parametrize("name", ["random", "opaque_stack", "three_cameras", "five_channels", "beta"])
-def test_order_of_threads_does_not_matter(name, kernel, cuda_device, monkeypatch):
+def test_order_of_threads_does_not_matter(name, cuda_device, monkeypatch):
     """Catches a missing barrier: by the shim, a thread would read what another has not written yet, or has over."""
     if cuda_device != "cpu":
         pytest.skip("the order of threads can be chosen on the shim only; on a GPU, racecheck looks for races")
@@ -117,8 +115,7 @@ def test_order_of_threads_does_not_matter(name, kernel, cuda_device, monkeypatch
     for is_reversed in (False, True):
         if is_reversed:
             monkeypatch.setenv("GSBENCH_SHIM_REVERSED", "1")
-        with kernel():
-            output, gradients = differentiate(case(name, torch.float32), cuda_device, EVERY_PIXEL)
+        output, gradients = differentiate(case(name, torch.float32), cuda_device, EVERY_PIXEL)
         loss = l1_ssim(image, target, 0.2)
         results.append([output.image, output.alpha, loss, *torch.autograd.grad(loss, image), *gradients.values()])
     for x, y in zip(*results, strict=True):

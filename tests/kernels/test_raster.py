@@ -1,8 +1,6 @@
 """The rasterizer's kernels against a brute-force picture, the reference's gradients in float64, and their promises."""
 
 import math
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -77,13 +75,6 @@ def assert_gradients_close(actual: dict[str, Tensor], expected: dict[str, Tensor
         assert not ((want == 0) & (got.abs() > noise)).any(), f"{key}: a gradient should be zero"
 
 
-def backward_kernels(place: Place) -> Iterator[AbstractContextManager[None]]:
-    """Each of the backward kernels of a place: those of CUDA go by pixel or by splat."""
-    yield nullcontext()
-    if place.name == "cuda":
-        yield raster.backward_by_splat()
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_picture(name, place):
     """Catches another rule of the picture, a tile that loses a Gaussian, and other radii, means or depths."""
@@ -106,10 +97,8 @@ def test_picture(name, place):
 @pytest.mark.parametrize("name", CASES)
 def test_gradients(name, place):
     """Catches a wrong or missing derivative of any input, and sums that miss a patch, a lane or a camera."""
-    for kernel in backward_kernels(place):
-        with kernel:
-            _, actual = differentiate(with_background(name, device=place.device), place.device, decided(name))
-        assert_gradients_close(actual, by_reference(name)[1])
+    _, actual = differentiate(with_background(name, device=place.device), place.device, decided(name))
+    assert_gradients_close(actual, by_reference(name)[1])
 
 
 def test_many_tiles_and_rounds(place):
@@ -125,9 +114,7 @@ def test_many_tiles_and_rounds(place):
     assert error.quantile(0.999) < 1e-4
     assert error.max() < 1 / 255
     _, expected = differentiate(exact, "reference", error < 1e-4)
-    for kernel in backward_kernels(place):
-        with kernel:
-            assert_gradients_close(differentiate(single, place.device, error < 1e-4)[1], expected)
+    assert_gradients_close(differentiate(single, place.device, error < 1e-4)[1], expected)
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
@@ -147,10 +134,8 @@ def test_cameras_of_their_own_gaussians_have_the_bits_of_single_calls(name, is_r
         )
         return [output.image, output.alpha, output.info.half_sizes, output.info.depths, *gradients]
 
-    for kernel in backward_kernels(place):
-        with kernel:
-            single = zip(*(drawn(slice(c, c + 1)) for c in range(3)), strict=True)
-            assert all(map(torch.equal, drawn(slice(None)), map(torch.cat, single)))
+    single = zip(*(drawn(slice(c, c + 1)) for c in range(3)), strict=True)
+    assert all(map(torch.equal, drawn(slice(None)), map(torch.cat, single)))
 
 
 @pytest.mark.usefixtures("threads")

@@ -1,8 +1,8 @@
 // Projects Gaussians in float64, eight at a time, and joins each with its projection in float32; math/projection.h has
 // the formulas.
+#include "../math/projection.h"
 #include "../math/rounding.h"
 
-#include "camera.h"
 #include "doubles.h"
 #include "isa.h"
 

@@ -94,12 +94,12 @@ struct LinearArgs {
 GSB_FIELDS(LinearArgs, INPUTS, N, C, K, x, weight, bias, relu, threads)
 
 // [N, K]
-GSB_ARRAYS(Layer, Floats, OUTPUTS, y)
-GSB_ARRAYS(LayerState, ConstFloats, OUTPUTS, y)
-GSB_ARRAYS(LayerGrads, ConstFloats, GIVEN, y)
+GSB_ARRAYS(Layer, Written, OUTPUTS, y)
+GSB_ARRAYS(LayerState, Read, OUTPUTS, y)
+GSB_ARRAYS(LayerGrads, Read, GIVEN, y)
 
 // Zero on entry; x null: not wanted.
-GSB_ARRAYS(LinearGrads, Floats, GRADS, x, weight, bias)
+GSB_ARRAYS(LinearGrads, Written, GRADS, x, weight, bias)
 
 // Planes of features over two of the axes x, y, z, read at points; on a GPU torch samples them.
 constexpr int MOST_LEVELS = 8;
@@ -114,11 +114,11 @@ struct PlaneArgs {
 GSB_FIELDS(PlaneArgs, INPUTS, N, C, levels, x, y, z, positions, first, last, of_space, threads)
 
 // [N, levels C]
-GSB_ARRAYS(Products, Floats, OUTPUTS, products)
-GSB_ARRAYS(ProductGrads, ConstFloats, GIVEN, products)
+GSB_ARRAYS(Products, Written, OUTPUTS, products)
+GSB_ARRAYS(ProductGrads, Read, GIVEN, products)
 
 // Those of nodes are zero on entry.
-GSB_ARRAYS(PlaneGrads, Floats, GRADS, positions, of_space)
+GSB_ARRAYS(PlaneGrads, Written, GRADS, positions, of_space)
 
 // Products of samples in space, planes over one of the axes x, y, z and time, and a network that reads F = levels C
 // features: a layer of H numbers with ReLU, and heads of one more such layer and a layer without ReLU each. Head h has the
@@ -138,7 +138,7 @@ GSB_FIELDS(FieldArgs, INPUTS, N, C, levels, x, y, z, t, F, H, heads, K, products
            first_weight, first_bias, hidden_weight, hidden_bias, last_weight, last_bias, ends, threads)
 
 // The first three are added to, those of the network are zero on entry.
-GSB_ARRAYS(FieldGrads, Floats, GRADS, products, positions, of_time, first_weight, first_bias, hidden_weight,
+GSB_ARRAYS(FieldGrads, Written, GRADS, products, positions, of_time, first_weight, first_bias, hidden_weight,
            hidden_bias, last_weight, last_bias)
 
 // How rough these planes are along their rows, and how far from 1 those of time, with a weight for each.
@@ -152,9 +152,9 @@ GSB_FIELDS(PenaltyArgs, INPUTS, C, levels, x, y, z, t, of_space, of_time, space_
            time_sparsity, threads)
 
 // []
-GSB_ARRAYS(Penalty, Floats, OUTPUTS, penalty)
-GSB_ARRAYS(PenaltyGrad, ConstFloats, GIVEN, penalty)
-GSB_ARRAYS(NodeGrads, Floats, GRADS, of_space, of_time)
+GSB_ARRAYS(Penalty, Written, OUTPUTS, penalty)
+GSB_ARRAYS(PenaltyGrad, Read, GIVEN, penalty)
+GSB_ARRAYS(NodeGrads, Written, GRADS, of_space, of_time)
 
 // Arrays to set to zero.
 struct ZeroArgs {

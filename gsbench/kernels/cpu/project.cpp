@@ -1,6 +1,7 @@
 // Projects Gaussians to the image planes of all cameras, sixteen at a time; math/projection.h has the formulas.
+#include "../math/projection.h"
+
 #include "buffer.h"
-#include "camera.h"
 #include "isa.h"
 #include "rows.h"
 
@@ -68,7 +69,7 @@ Splat<Vec> splat_of(Projection<Vec>& projection, const ProjectArgs& a, int64_t i
 template <class Profile>
 void project_as(const ProjectArgs& a, const Splats& out) {
     for (int64_t c = 0; c < a.C; ++c) {
-        const Camera camera = camera_of<float>(a, c);
+        const Camera camera = camera_of(a, c);
         const int64_t first = first_of(a, c);
 #pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > CHUNK)
         for (int64_t i = 0; i < a.N; i += LANES) {
@@ -91,7 +92,7 @@ void project_backward_as(const ProjectArgs& a, const SplatGrads& grads, const Pr
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
         const int64_t begin = chunk * CHUNK, end = begin + CHUNK < a.N ? begin + CHUNK : a.N;
         for (int64_t c = 0; c < a.C; ++c) {
-            const Camera camera = camera_of<float>(a, c);
+            const Camera camera = camera_of(a, c);
             const bool adds = c > 0 && !a.gaussian_per_camera;  // to the gradients by the cameras before
             Vec3<Vec> g_view[4] = {};
             for (auto& row : g_view) row = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};

@@ -16,11 +16,8 @@ constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradient of lambda is s
 // Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
 // unit.
 GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameters<Vec>& p) {
-    gather_row(a.means, i, n, p.mean);
-    p.time = load_first(a.times + i, n) * *a.clock;
-    gather_row(a.scales, i, n, p.scales);
-    gather_row(a.left_quats, i, n, p.left);
-    gather_row(a.right_quats, i, n, p.right);
+    p.each(a, LoadRows{i, n});
+    p.time = p.time * *a.clock;
     p.opacity = load_first(a.opacities + i, n);
     if (n == LANES) return;
     const Mask real = Vec::load(INDEX) < Vec(static_cast<float>(n));  // what is no Gaussian gets harmless quaternions
@@ -101,11 +98,8 @@ void slice_rotated_backward(const RotatedArgs& a, const ObservationGrads& grads,
             RotatedGaussian<Vec> gaussian(raw, lambda_t, time);
             gaussian.observe();
             gaussian.vjp(given, g);
-            add_row(g.mean, out.means, i, n);
-            add_first(g.time * *a.clock, out.times + i, n);
-            add_row(g.scales, out.scales, i, n);
-            add_row(g.left, out.left_quats, i, n);
-            add_row(g.right, out.right_quats, i, n);
+            g.time = g.time * *a.clock;
+            g.each(out, AddRows{i, n});
             add_first(g.opacity, out.opacities + i, n);
             g_lambda += g.lambda_t;  // lanes past the end were given zero
         }

@@ -81,6 +81,41 @@ GSB_HD inline void add_columns(const Vec (&x)[W], float* rows, int width, int fi
     GSB_UNROLL for (int k = 0; k < W; ++k) scatter(sum[k] + x[k], rows + i * width + first + k, width, n);
 }
 
+// Loads rows i to i + n - 1 of an array, or some columns of it from `first` on, as `each` of raw parameters calls it.
+struct LoadRows {
+    int64_t i;
+    int n;
+
+    template <int W>
+    GSB_HD void operator()(const float* rows, Vec (&x)[W]) const { gather_row(rows, i, n, x); }
+    GSB_HD void operator()(const float* rows, Vec& x) const { x = load_first(rows + i, n); }
+    template <int W>
+    GSB_HD void operator()(const float* rows, int width, int first, Vec (&x)[W]) const {
+        gather_columns(rows, width, first, i, n, x);
+    }
+    GSB_HD void operator()(const float* rows, int width, int first, Vec& x) const {
+        x = gather(rows + i * width + first, width, n);
+    }
+};
+
+// Adds to them.
+struct AddRows {
+    int64_t i;
+    int n;
+
+    template <int W>
+    GSB_HD void operator()(float* rows, const Vec (&x)[W]) const { add_row(x, rows, i, n); }
+    GSB_HD void operator()(float* rows, Vec x) const { add_first(x, rows + i, n); }
+    template <int W>
+    GSB_HD void operator()(float* rows, int width, int first, const Vec (&x)[W]) const {
+        add_columns(x, rows, width, first, i, n);
+    }
+    GSB_HD void operator()(float* rows, int width, int first, Vec x) const {
+        const Vec column[1] = {x};
+        add_columns(column, rows, width, first, i, n);
+    }
+};
+
 // Returns whether rows i to i + n - 1 of `width` floats are all zero; if a given gradient is zero, the result is zero
 // too.
 GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {

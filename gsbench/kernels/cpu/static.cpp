@@ -10,12 +10,6 @@ namespace {
 
 constexpr int64_t FEW = 512;  // Gaussians that are not worth a second thread
 
-GSB_HD inline void load(const StaticArgs& a, int64_t i, int n, StaticParameters<Vec>& p) {
-    gather_row(a.scales, i, n, p.scales);
-    gather_row(a.quats, i, n, p.quat);
-    p.opacity = load_first(a.opacities + i, n);
-}
-
 }  // namespace
 
 void slice_static(const StaticArgs& a, const StaticSlice& out) {
@@ -23,7 +17,8 @@ void slice_static(const StaticArgs& a, const StaticSlice& out) {
     for (int64_t i = 0; i < a.N; i += LANES) {
         const int n = lanes_from(i, a.N);
         StaticParameters<Vec> raw;
-        load(a, i, n, raw);
+        raw.each(a, LoadRows{i, n});
+        raw.opacity = load_first(a.opacities + i, n);
         const StaticGaussian<Vec> seen(raw);
         scatter_matrix(seen.factor, out.factors, i, n);
         store_first(seen.opacity, out.opacities + i, n);
@@ -37,11 +32,11 @@ void slice_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, c
         if (all_zero(grads.opacities, 1, i, n) && all_zero(grads.factors, 9, i, n)) continue;
         StaticParameters<Vec> raw, g;
         Vec g_factor[3][3];
-        load(a, i, n, raw);
+        raw.each(a, LoadRows{i, n});
+        raw.opacity = load_first(a.opacities + i, n);
         gather_matrix(grads.factors, i, n, g_factor);
         StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
-        add_row(g.scales, out.scales, i, n);
-        add_row(g.quat, out.quats, i, n);
+        g.each(out, AddRows{i, n});
         add_first(g.opacity, out.opacities + i, n);
     }
 }

@@ -18,19 +18,6 @@ TriangularModel model_of(const TriangularArgs& a) {
             a.times ? expf(*a.log_lambda_t) : 0.0f, {a.center[0], a.center[1], a.center[2]}, a.times ? *a.time : 0.0f};
 }
 
-template <Query Q>
-GSB_HD inline void load(const TriangularArgs& a, int64_t i, int n, TriangularParameters<Vec, Q>& p) {
-    using P = TriangularParameters<Vec, Q>;
-    gather_row(a.means, i, n, p.mean);
-    if constexpr (P::DIRECTION) gather_row(a.directions, i, n, p.direction);
-    if constexpr (P::TIME) p.time = load_first(a.times + i, n);
-    gather_row(a.log_diagonal, i, n, p.log_diagonal);
-    gather_row(a.shape, i, n, p.shape);
-    gather_row(a.motion, i, n, p.motion);
-    if constexpr (P::COUPLED) gather_row(a.coupling, i, n, p.coupling);
-    p.opacity = load_first(a.opacities + i, n);
-}
-
 template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
@@ -38,7 +25,8 @@ void observe(const TriangularArgs& a, const Observation& out) {
     for (int64_t i = 0; i < a.conditioned; i += LANES) {
         const int n = lanes_from(i, a.conditioned);
         TriangularParameters<Vec, Q> raw;
-        load<Q>(a, i, n, raw);
+        raw.each(a, LoadRows{i, n});
+        raw.opacity = load_first(a.opacities + i, n);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
         store(gaussian.observe(), out, i, n);
     }
@@ -58,18 +46,13 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
             if (is_zero(grads, i, n)) continue;
             TriangularParameters<Vec, Q> raw, g;
             Observed<Vec> given;
-            load<Q>(a, i, n, raw);
+            raw.each(a, LoadRows{i, n});
+            raw.opacity = load_first(a.opacities + i, n);
             load(grads, i, n, given);
             TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
             gaussian.observe();
             gaussian.vjp(given, g);
-            add_row(g.mean, out.means, i, n);
-            if constexpr (g.DIRECTION) add_row(g.direction, out.directions, i, n);
-            if constexpr (g.TIME) add_first(g.time, out.times + i, n);
-            add_row(g.log_diagonal, out.log_diagonal, i, n);
-            add_row(g.shape, out.shape, i, n);
-            add_row(g.motion, out.motion, i, n);
-            if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, i, n);
+            g.each(out, AddRows{i, n});
             add_first(g.opacity, out.opacities + i, n);
             lambda_d += g.lambda_d;  // lanes past the end were given zero
             lambda_t += g.lambda_t;

@@ -1,13 +1,11 @@
 // Lists the projected Gaussians (splats) of each tile, front to back: sorts them by depth, lists the tiles that each
 // one reaches, and sorts these intersections stably by tile. A warp processes one splat, and its lanes the tiles in its
 // bounds.
-#include "bins.h"
+#include "patch.h"
+#include "sort.h"
 
 #include <algorithm>
 #include <limits>
-
-#include "patch.h"
-#include "sort.h"
 
 namespace gsb::cuda {
 namespace {

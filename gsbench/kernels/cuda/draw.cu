@@ -1,7 +1,6 @@
 // Draws images by one call from Python, which would take longer to call the kernels one by one than a GPU to run them.
 #include <cmath>
 
-#include "bins.h"
 #include "launch.h"
 
 namespace gsb::cuda {

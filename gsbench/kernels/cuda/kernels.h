@@ -47,12 +47,10 @@ GSB_FIELDS(DensityState, OUTPUTS, gradient, times_visible, unseen)
 
 // `draw` checks values, projects, lists the splats of each tile and blends; the inputs of blending are outputs of the
 // earlier kernels. If a value is bad, or `room` too small, each image gets a NaN, so that its loss is NaN.
-// `blend_backward` has one lane per pixel, and `blend_backward_by_splat` one lane per splat; the gradients are the same.
 #define GSB_CUDA_KERNELS(kernel)                                                                   \
     GSB_KERNELS(kernel)                                                                            \
     kernel(draw, ProjectArgs, Splats, BlendArgs, Picture, TileLists)                               \
-    kernel(add_density, DensityArgs, DensityState)                                                 \
-    kernel(blend_backward_by_splat, BlendArgs, BlendState, PictureGrads, BlendGrads)
+    kernel(add_density, DensityArgs, DensityState)
 
 namespace gsb::cuda {
 
@@ -61,6 +59,9 @@ using Stream = CUstream_st*;
 #define GSB_DECLARATION(name, ...) void name(GSB_PARAMETERS(__VA_ARGS__), Stream);
 GSB_CUDA_KERNELS(GSB_DECLARATION)
 #undef GSB_DECLARATION
+
+// Lists the splats of each tile, for `draw`: it reads the splats of `blend`, and their depths [C, N].
+void list_tiles(const BlendArgs&, const float* depths, const TileLists&, Stream);
 
 // Returns the bytes of scratch memory that `draw` needs for so many splats and tile intersections.
 size_t draw_scratch(int64_t splats, int64_t room);

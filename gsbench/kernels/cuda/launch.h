@@ -4,7 +4,7 @@
 
 #include <algorithm>
 
-#include "../math.h"
+#include "../math/scalar.h"
 #include "kernels.h"
 
 #ifdef GSB_CUDA_SHIM

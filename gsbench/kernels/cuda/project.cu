@@ -1,21 +1,10 @@
 // Projects Gaussians to the image planes, and computes the gradients: one Gaussian and one camera per thread.
+#include "../math/projection.h"
+
 #include "launch.h"
 
 namespace gsb::cuda {
 namespace {
-
-__device__ Camera camera_of(const ProjectArgs& a, int64_t c) {
-    const float *view = a.viewmats + c * 16, *K = a.Ks + c * 9;
-    Camera camera;
-    for (int i = 0; i < 3; ++i) {
-        for (int j = 0; j < 3; ++j) camera.rotation[i][j] = view[i * 4 + j];
-        camera.translation[i] = view[i * 4 + 3];
-    }
-    camera.fx = K[0], camera.cx = K[2], camera.fy = K[4], camera.cy = K[5];
-    camera.width = static_cast<float>(a.width), camera.height = static_cast<float>(a.height);
-    camera.near = a.near, camera.far = a.far, camera.eps2d = a.eps2d, camera.antialias = a.antialias;
-    return camera;
-}
 
 __device__ Vec3<float> vec3(const float* p) { return {p[0], p[1], p[2]}; }
 

@@ -1,6 +1,8 @@
 // AGR, the neural refinement of 7DGS (section 4.3): a few two-layer MLPs change the parameters of every Gaussian, for
 // the times of one or several views. Weights are in shared memory and hidden units in registers, so that only parameters
 // of Gaussians are read and written. The backward pass computes the hidden units again, 32 Gaussians at a time.
+#include "../math/awake.h"
+
 #include <algorithm>
 #include <numeric>
 #include <stdexcept>

@@ -12,11 +12,8 @@ namespace {
 // unit.
 __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t row, int64_t i) {
     RotatedParameters<float> p{};
-    load_row(a.means, row, p.mean);
-    p.time = a.times[row] * *a.clock;
-    load_row(a.scales, row, p.scales);
-    load_row(a.left_quats, row, p.left);
-    load_row(a.right_quats, row, p.right);
+    p.each(a, LoadRow{row});
+    p.time *= *a.clock;
     p.opacity = a.opacities[i];
     return p;
 }
@@ -46,15 +43,6 @@ __global__ void observe_kernel(RotatedArgs a, Observation out) {
     }
 }
 
-// Adds to the gradients of raw parameters other than the opacity.
-__device__ void add(const RotatedParameters<float>& g, const RotatedGrads& out, int64_t row) {
-    add_row(g.mean, out.means, row);
-    out.times[row] += g.time;
-    add_row(g.scales, out.scales, row);
-    add_row(g.left, out.left_quats, row);
-    add_row(g.right, out.right_quats, row);
-}
-
 __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, RotatedGrads out) {
     const int64_t i = global_thread();
     RotatedParameters<float> sum{};
@@ -80,10 +68,10 @@ __global__ void observe_backward_kernel(RotatedArgs a, ObservationGrads grads, R
             g.time *= *a.clock;
         }
         accumulate(sum, g);
-        if (a.raw_per_view) add(g, out, row);
+        if (a.raw_per_view) g.each(out, AddRow{row});
     }
     if (i < a.N) {
-        if (!a.raw_per_view) add(sum, out, i);
+        if (!a.raw_per_view) sum.each(out, AddRow{i});
         out.opacities[i] += sum.opacity;
     }
     const float lambda_t = warp_sum(sum.lambda_t);

@@ -22,6 +22,34 @@ __device__ inline void add_row(const float (&row)[COUNT], float* rows, int64_t i
     GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[i * COUNT + k] += row[k];
 }
 
+// Loads a row of an array, or some columns of it from `first` on, as `each` of raw parameters calls it.
+struct LoadRow {
+    int64_t row;
+
+    template <int COUNT>
+    __device__ void operator()(const float* rows, float (&x)[COUNT]) const { load_row(rows, row, x); }
+    __device__ void operator()(const float* rows, float& x) const { x = rows[row]; }
+    template <int COUNT>
+    __device__ void operator()(const float* rows, int width, int first, float (&x)[COUNT]) const {
+        GSB_UNROLL for (int k = 0; k < COUNT; ++k) x[k] = rows[row * width + first + k];
+    }
+    __device__ void operator()(const float* rows, int width, int first, float& x) const { x = rows[row * width + first]; }
+};
+
+// Adds to it.
+struct AddRow {
+    int64_t row;
+
+    template <int COUNT>
+    __device__ void operator()(float* rows, const float (&x)[COUNT]) const { add_row(x, rows, row); }
+    __device__ void operator()(float* rows, float x) const { rows[row] += x; }
+    template <int COUNT>
+    __device__ void operator()(float* rows, int width, int first, const float (&x)[COUNT]) const {
+        GSB_UNROLL for (int k = 0; k < COUNT; ++k) rows[row * width + first + k] += x[k];
+    }
+    __device__ void operator()(float* rows, int width, int first, float x) const { rows[row * width + first] += x; }
+};
+
 // Returns the row of the raw parameters of Gaussian i that a view sees.
 template <class Args>
 __device__ int64_t raw_row(const Args& a, int64_t view, int64_t i) {
@@ -60,6 +88,12 @@ __device__ void store_static(const Gaussian& gaussian, const float* means, int64
     store_row(mean, out.means, i);
     store_matrix(gaussian.factor, out.factors, i);
     out.opacities[i] = gaussian.opacity;
+}
+
+template <class Gaussian>
+__device__ void store_static(const Gaussian& gaussian, const float* means, int64_t row, const BetaSlice& out, int64_t i) {
+    store_static(gaussian, means, row, Observation{out.means, out.factors, out.opacities}, i);
+    out.shapes[i] = gaussian.shape;
 }
 
 __device__ inline Observed<float> load_observed(const ObservationGrads& o, int64_t i) {

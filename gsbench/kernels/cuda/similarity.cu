@@ -1,6 +1,8 @@
 // L1 and SSIM of two images with their gradient. Tiles of one channel with their border are in shared memory and are
 // filtered along x, then along y. The gradient applies the same filter to the derivatives of SSIM by its filtered
 // moments.
+#include "../math/similarity.h"
+
 #include <cmath>
 
 #include "launch.h"

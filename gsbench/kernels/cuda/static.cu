@@ -8,8 +8,7 @@ namespace {
 
 __device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t row, int64_t i) {
     StaticParameters<float> p{};
-    load_row(a.scales, row, p.scales);
-    load_row(a.quats, row, p.quat);
+    p.each(a, LoadRow{row});
     p.opacity = a.opacities[i];
     return p;
 }
@@ -35,8 +34,7 @@ __global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, Sta
         float g_factor[3][3];
         load_matrix(grads.factors, row, g_factor);
         StaticGaussian<float>(raw).vjp(g_factor, grads.opacities[row], g);
-        add_row(g.scales, out.scales, row);
-        add_row(g.quat, out.quats, row);
+        g.each(out, AddRow{row});
         g_opacity += g.opacity;
     }
     out.opacities[i] += g_opacity;

@@ -23,13 +23,7 @@ __device__ TriangularModel model_of(const TriangularArgs& a, int64_t view) {
 template <Query Q>
 __device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, int64_t row, int64_t i) {
     TriangularParameters<float, Q> p{};
-    load_row(a.means, row, p.mean);
-    if constexpr (p.DIRECTION) load_row(a.directions, row, p.direction);
-    if constexpr (p.TIME) p.time = a.times[row];
-    load_row(a.log_diagonal, row, p.log_diagonal);
-    load_row(a.shape, row, p.shape);
-    load_row(a.motion, row, p.motion);
-    if constexpr (p.COUPLED) load_row(a.coupling, row, p.coupling);
+    p.each(a, LoadRow{row});
     p.opacity = a.opacities[i];
     return p;
 }
@@ -67,18 +61,6 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
     }
 }
 
-// Adds to the gradients of raw parameters other than the opacity.
-template <Query Q>
-__device__ void add(const TriangularParameters<float, Q>& g, const TriangularGrads& out, int64_t row) {
-    add_row(g.mean, out.means, row);
-    if constexpr (g.DIRECTION) add_row(g.direction, out.directions, row);
-    if constexpr (g.TIME) out.times[row] += g.time;
-    add_row(g.log_diagonal, out.log_diagonal, row);
-    add_row(g.shape, out.shape, row);
-    add_row(g.motion, out.motion, row);
-    if constexpr (g.COUPLED) add_row(g.coupling, out.coupling, row);
-}
-
 template <Query Q, bool CONDITIONED>
 __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads, TriangularGrads out) {
     const int64_t i = global_thread();
@@ -105,10 +87,10 @@ __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads
             gaussian.vjp(given, g);
         }
         accumulate(sum, g);
-        if (a.raw_per_view) add(g, out, row);
+        if (a.raw_per_view) g.each(out, AddRow{row});
     }
     if (i < a.N) {
-        if (!a.raw_per_view) add(sum, out, i);
+        if (!a.raw_per_view) sum.each(out, AddRow{i});
         out.opacities[i] += sum.opacity;
     }
     const float lambda_d = warp_sum(sum.lambda_d), lambda_t = warp_sum(sum.lambda_t);

@@ -8,21 +8,9 @@ namespace gsb::cuda {
 namespace {
 
 template <bool TIME>
-__device__ ViewPoint view_of(const UniversalArgs& a, int64_t view) {
-    const float* center = a.center + view * 3;
-    return {{center[0], center[1], center[2]}, TIME ? a.time[view] : 0.0f};
-}
-
-template <bool TIME>
 __device__ UniversalParameters<float, TIME> parameters(const UniversalArgs& a, int64_t row, int64_t i) {
     UniversalParameters<float, TIME> p{};
-    load_row(a.means, row, p.mean);
-    load_row(a.directions, row, p.direction);
-    if constexpr (TIME) p.time = a.times[row];
-    load_row(a.scales, row, p.scales);
-    load_row(a.skew, row, p.skew);
-    load_row(a.lower, row, p.lower);
-    load_row(a.betas, row, p.betas);
+    p.each(a, LoadRow{row});
     p.opacity = a.opacities[i];
     return p;
 }
@@ -32,12 +20,11 @@ __global__ void universal_kernel(UniversalArgs a, BetaSlice out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t view = 0; view < a.V; ++view) {
-        const ViewPoint from = view_of<TIME>(a, view);
+        const ViewPoint from = view_of(a, view);
         const auto raw = parameters<TIME>(a, raw_row(a, view, i), i);
         store_observed(UniversalGaussian<float, TIME>(from, raw).observe(), out, view * a.N + i);
     }
 }
-
 
 template <bool TIME>
 __global__ void universal_backward_kernel(UniversalArgs a, BetaSliceGrads grads, UniversalGrads out) {
@@ -45,20 +32,14 @@ __global__ void universal_backward_kernel(UniversalArgs a, BetaSliceGrads grads,
     if (i >= a.N) return;
     for (int64_t view = 0; view < a.V; ++view) {
         const int64_t row = raw_row(a, view, i);
-        const ViewPoint from = view_of<TIME>(a, view);
+        const ViewPoint from = view_of(a, view);
         const auto raw = parameters<TIME>(a, row, i);
         UniversalParameters<float, TIME> g{};
         UniversalGaussian<float, TIME> gaussian(from, raw);
         gaussian.observe();
         gaussian.vjp(load_observed(grads, view * a.N + i), g);
         // A sum over the views would need more than all registers.
-        add_row(g.mean, out.means, row);
-        add_row(g.direction, out.directions, row);
-        if constexpr (TIME) out.times[row] += g.time;
-        add_row(g.scales, out.scales, row);
-        add_row(g.skew, out.skew, row);
-        add_row(g.lower, out.lower, row);
-        add_row(g.betas, out.betas, row);
+        g.each(out, AddRow{row});
         out.opacities[i] += g.opacity;
     }
 }

@@ -19,7 +19,25 @@ struct DirectParameters {
     StaticParameters<T> still;
     CoupledParameters<T, 4> motion;
     T mean[3], direction[3], time, shares[2];  // direction of any length; the last two are logits
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        still.each(a, f);
+        f(a.means, mean);
+        f(a.directions, direction);
+        f(a.times, time);
+        f(a.precision, motion.precision);
+        f(a.coupling, motion.coupling);
+        f(a.shares, shares);
+    }
 };
+
+// The gradients of a static Gaussian, from those of what is seen of it.
+template <class T>
+GSB_HD inline void still_vjp(const StaticGaussian<T>& still, const Observed<T>& g, StaticParameters<T>& out) {
+    still.vjp(g.factor, g.opacity, out);
+}
 
 template <class T>
 struct DirectGaussian {

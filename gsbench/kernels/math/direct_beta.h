@@ -12,6 +12,14 @@ inline namespace GSB_ISA {
 template <class T>
 struct StaticBetaParameters {
     T scales[3], skew[3], opacity, beta;  // sizes are softplus of scales; A_01, A_02, A_12; a logit; of the profile
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        f(a.scales, scales);
+        f(a.skew, skew);
+        f(a.betas, a.times ? 5 : 4, 0, beta);  // the first column
+    }
 };
 
 // A Gaussian of dBS that does not depend on time or direction: its factor (I + A) S, its opacity and its exponent.
@@ -39,11 +47,28 @@ struct StaticBetaGaussian {
     }
 };
 
+template <class T>
+GSB_HD inline void still_vjp(const StaticBetaGaussian<T>& still, const ObservedBeta<T>& g, StaticBetaParameters<T>& out) {
+    still.vjp(g.factor, g.opacity, g.shape, out);
+}
+
 template <class T, int K>
 struct DirectBetaParameters {
     StaticBetaParameters<T> still;
     CoupledParameters<T, K> motion;
     T mean[3], direction[3], time, betas[K];  // the last are of the opacity factors
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        still.each(a, f);
+        f(a.means, mean);
+        f(a.directions, direction);
+        if constexpr (K > 3) f(a.times, time);
+        f(a.precision, motion.precision);
+        f(a.coupling, motion.coupling);
+        f(a.betas, 1 + K, 1, betas);
+    }
 };
 
 template <class T, int K>

@@ -11,6 +11,16 @@ template <class T>
 struct FreeTimeParameters {
     StaticParameters<T> still;
     T mean[3], time, duration, velocity[3];  // duration: a logarithm
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        still.each(a, f);
+        f(a.means, mean);
+        f(a.times, time);
+        f(a.durations, duration);
+        f(a.velocities, velocity);
+    }
 };
 
 template <class T>

@@ -11,6 +11,8 @@
 // constant.
 #pragma once
 
+#include <cstdint>
+
 #include "profiles.h"
 
 namespace gsb {
@@ -41,6 +43,21 @@ struct CameraOf {
 };
 using Camera = CameraOf<float>;
 static_assert(Camera::LEAST_ALPHA == ALPHA_MIN);
+
+// Reads camera number c from the arguments of a kernel.
+template <class Number = float, class Args>
+GSB_HD inline CameraOf<Number> camera_of(const Args& a, int64_t c) {
+    const float *view = a.viewmats + c * 16, *K = a.Ks + c * 9;
+    CameraOf<Number> camera;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) camera.rotation[i][j] = view[i * 4 + j];
+        camera.translation[i] = view[i * 4 + 3];
+    }
+    camera.fx = K[0], camera.cx = K[2], camera.fy = K[4], camera.cy = K[5];
+    camera.width = static_cast<Number>(a.width), camera.height = static_cast<Number>(a.height);
+    camera.near = a.near, camera.far = a.far, camera.eps2d = a.eps2d, camera.antialias = a.antialias;
+    return camera;
+}
 
 template <class T>
 struct Splat {

@@ -13,6 +13,16 @@ template <class T>
 struct RotatedParameters {
     T mean[3], time, scales[4], left[4], right[4], opacity;  // log scales; the last a logit
     T lambda_t;                                              // in gradients only
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        f(a.means, mean);
+        f(a.times, time);
+        f(a.scales, scales);
+        f(a.left_quats, left);
+        f(a.right_quats, right);
+    }
 };
 
 // The 4D rotation is R = M_left(l) M_right(r) (4DGS eq. 7). Entry (i, j) of either matrix is entry (i xor j) of its

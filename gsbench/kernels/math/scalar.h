@@ -1,4 +1,9 @@
 // The functions that math/ needs for its number type T, here for `float`; cpu/simd.h has them for SIMD vectors.
+//
+// math/ has the mathematics of one Gaussian and of one pixel: each function with its derivative, for all backends. T is
+// `float` on CUDA, with one Gaussian or pixel per thread, or a SIMD vector of sixteen floats on the CPU. Derivatives
+// (`vjp`) are vector-Jacobian products: from the gradients of a function's outputs, they return or add the gradients of
+// its inputs. Names of gradients start with g_.
 #pragma once
 
 #include <cmath>

@@ -10,6 +10,13 @@ inline namespace GSB_ISA {
 template <class T>
 struct SharpTimeParameters : FreeTimeParameters<T> {
     T plateau;  // a logarithm
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        FreeTimeParameters<T>::each(a, f);
+        f(a.plateaus, plateau);
+    }
 };
 
 template <class T>

@@ -7,6 +7,8 @@
 // A factor that is triangular in the row order (q, p) already has this form. Any other factor needs K reflections.
 #pragma once
 
+#include <cstdint>
+
 #include "scalar.h"
 
 namespace gsb {
@@ -16,6 +18,17 @@ inline namespace GSB_ISA {
 struct ViewPoint {
     float center[3], time;
 };
+
+// Returns those of a view from the arguments of a slice; a time that the model does not have is 0.
+template <class Args>
+GSB_HD inline ViewPoint view_of(const Args& a, int64_t view = 0) {
+    ViewPoint out{};
+    if constexpr (requires { a.center; }) {
+        GSB_UNROLL for (int k = 0; k < 3; ++k) out.center[k] = a.center[view * 3 + k];
+    }
+    if (a.time) out.time = a.time[view];
+    return out;
+}
 
 // The reduced factor [T_qq 0; T_pq T_pp]: K rows of q, then three rows of p.
 template <class T, int K>

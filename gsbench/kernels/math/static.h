@@ -10,6 +10,13 @@ inline namespace GSB_ISA {
 template <class T>
 struct StaticParameters {
     T scales[3], quat[4], opacity;  // logs; wxyz of any length; a logit
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        f(a.scales, scales);
+        f(a.quats, quat);
+    }
 };
 
 template <class T>

@@ -43,6 +43,18 @@ struct TriangularParameters {
     T shape[3], motion[3 * K], coupling[COUPLED ? K * (K - 1) / 2 : 1];  // row by row: `entry` says which is which
     T opacity;                                                           // a logit
     T lambda_d, lambda_t;                                                // in gradients only
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        f(a.means, mean);
+        if constexpr (DIRECTION) f(a.directions, direction);
+        if constexpr (TIME) f(a.times, time);
+        f(a.log_diagonal, log_diagonal);
+        f(a.shape, shape);
+        f(a.motion, motion);
+        if constexpr (COUPLED) f(a.coupling, coupling);
+    }
 };
 
 template <class T, Query Q, template <class, int> class Reduction = Reflections>

@@ -168,6 +168,18 @@ struct UniversalParameters {
     T mean[3], direction[3], time;
     T scales[3 + K], skew[3], lower[LOWER], betas[1 + K];
     T opacity;  // a logit
+
+    // Calls f(array, parameter) for all but the opacity, with the arrays of the parameters or of their gradients.
+    template <class Arrays, class F>
+    GSB_HD void each(const Arrays& a, F f) {
+        f(a.means, mean);
+        f(a.directions, direction);
+        if constexpr (TIME) f(a.times, time);
+        f(a.scales, scales);
+        f(a.skew, skew);
+        f(a.lower, lower);
+        f(a.betas, betas);
+    }
 };
 
 template <class T, bool TIME>
