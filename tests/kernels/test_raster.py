@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import Place
 from numerics.brute import Picture, render
 from raster.cases import CASES, assert_beta_vector, camera, case, gaussians
 from torch import Tensor

@@ -96,10 +96,7 @@ struct RotatedGaussian {
         opacity = sigmoid(raw.opacity);
 
         Observed<T> out;
-        const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, white);
-        out.mean[0] = moved.x;
-        out.mean[1] = moved.y;
-        out.mean[2] = moved.z;
+        move_mean(t, raw.mean, white, out.mean);
         for (int i = 0; i < 3; ++i) {
             for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
         }
@@ -120,7 +117,7 @@ struct RotatedGaussian {
         const T g_exponent = zero - g.opacity * opacity * opacity_factor;
         out.lambda_t = g_exponent * white[0] * white[0] * 0.5f;
         T g_white[1] = {g_exponent * white[0] * lambda_t};
-        moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        move_mean_vjp(t, white, g.mean, g_white, g_t);
         g_white[0] = select(opacity_factor > zero, g_white[0], zero);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta
         out.time = zero - g_white[0];

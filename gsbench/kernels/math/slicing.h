@@ -72,23 +72,21 @@ GSB_HD inline void whiten_vjp(const Reduced<T, K>& t, const T (&white)[K], T (&g
 }
 
 template <class T, int K>
-GSB_HD inline Vec3<T> moved_mean(const Reduced<T, K>& t, const Vec3<T>& mean, const T (&white)[K]) {
-    T moved[3] = {mean.x, mean.y, mean.z};
+GSB_HD inline void move_mean(const Reduced<T, K>& t, const T (&mean)[3], const T (&white)[K], T (&moved)[3]) {
     GSB_UNROLL for (int i = 0; i < 3; ++i) {
+        moved[i] = mean[i];
         GSB_UNROLL for (int j = 0; j < K; ++j) moved[i] = moved[i] + t.pq[i][j] * white[j];
     }
-    return {moved[0], moved[1], moved[2]};
 }
 
-// The derivative of `moved_mean`: adds to g_white and g_t. The gradient of `mean` is g itself.
+// The derivative of `move_mean`: adds to g_white and g_t. The gradient of `mean` is g itself.
 template <class T, int K>
-GSB_HD inline void moved_mean_vjp(const Reduced<T, K>& t, const T (&white)[K], const Vec3<T>& g, T (&g_white)[K],
-                                  Reduced<T, K>& g_t) {
-    const T rows[3] = {g.x, g.y, g.z};
+GSB_HD inline void move_mean_vjp(const Reduced<T, K>& t, const T (&white)[K], const T (&g)[3], T (&g_white)[K],
+                                 Reduced<T, K>& g_t) {
     GSB_UNROLL for (int i = 0; i < 3; ++i) {
         GSB_UNROLL for (int j = 0; j < K; ++j) {
-            g_white[j] = g_white[j] + t.pq[i][j] * rows[i];
-            g_t.pq[i][j] = g_t.pq[i][j] + rows[i] * white[j];
+            g_white[j] = g_white[j] + t.pq[i][j] * g[i];
+            g_t.pq[i][j] = g_t.pq[i][j] + g[i] * white[j];
         }
     }
 }

@@ -122,10 +122,7 @@ struct TriangularGaussian {
         opacity = sigmoid(raw.opacity);
 
         Observed<T> out;
-        const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, white);
-        out.mean[0] = moved.x;
-        out.mean[1] = moved.y;
-        out.mean[2] = moved.z;
+        move_mean(t, raw.mean, white, out.mean);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) out.factor[i][j] = t.pp[i][j];
         }
@@ -149,7 +146,7 @@ struct TriangularGaussian {
         GSB_UNROLL for (int i = 0; i < K; ++i) {
             g_white[i] = i < TIME_ROW ? g_exponent * white[i] * (2.0f * model.half * model.lambda_d) : zero;
         }
-        moved_mean_vjp(t, white, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        move_mean_vjp(t, white, g.mean, g_white, g_t);
         const auto seen = opacity_factor > zero;
         GSB_UNROLL for (int i = 0; i < K; ++i) g_white[i] = select(seen, g_white[i], zero);
         whiten_vjp(t, white, g_white, g_t);  // now that of delta

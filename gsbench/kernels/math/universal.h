@@ -222,10 +222,7 @@ struct UniversalGaussian {
         opacity = sigmoid(raw.opacity);
 
         ObservedBeta<T> out;
-        const Vec3<T> moved = moved_mean(t, {raw.mean[0], raw.mean[1], raw.mean[2]}, shift);
-        out.mean[0] = moved.x;
-        out.mean[1] = moved.y;
-        out.mean[2] = moved.z;
+        move_mean(t, raw.mean, shift, out.mean);
         GSB_UNROLL for (int i = 0; i < 3; ++i) {
             GSB_UNROLL for (int j = 0; j < 3; ++j) rows[i][j] = t.pp[i][j];
             GSB_UNROLL for (int j = 0; j < K; ++j) rows[i][3 + j] = t.pq[i][j] * root[j];
@@ -251,7 +248,7 @@ struct UniversalGaussian {
             shift[i] = beta.weights[i] * white[i];
             g_white[i] = zero;  // at first the gradient of the shift
         }
-        moved_mean_vjp(t, shift, {g.mean[0], g.mean[1], g.mean[2]}, g_white, g_t);
+        move_mean_vjp(t, shift, g.mean, g_white, g_t);
         out.opacity = g.opacity * fading.factor * opacity * (one - opacity);
         const T shape = size_of(raw.betas[0]) * 4.0f;
         out.betas[0] = size_vjp(raw.betas[0], shape, g.shape);
