@@ -53,12 +53,8 @@ class Forked:
     def __init__(self, folder: Path, module: str, *arguments: str) -> None:
         self.files = folder / "out", folder / "err"
         self.returncode: int | None = None
-        asked = {
-            "argv": [module, *arguments],
-            "environment": os.environ | ENVIRONMENT,
-            "files": [*map(str, self.files)],
-        }
-        self.pid = _ask(asked)
+        environment, files = os.environ | ENVIRONMENT, [*map(str, self.files)]
+        self.pid = _ask({"argv": [module, *arguments], "environment": environment, "files": files})
         assert self.pid is not None
 
     @property
@@ -91,16 +87,9 @@ class Forked:
 def _ask(asked: dict[str, Any]) -> int | None:
     """Ask the process that forks, which is started first if there is none."""
     if not _servers:
-        _servers.append(
-            subprocess.Popen(
-                [sys.executable, __file__],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                text=True,
-                cwd=ROOT,
-                env=os.environ | ENVIRONMENT,
-            )
-        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        environment = os.environ | ENVIRONMENT
+        _servers.append(subprocess.Popen([sys.executable, __file__], cwd=ROOT, env=environment, **pipes))
     (server,) = _servers
     assert server.stdin is not None
     assert server.stdout is not None

@@ -201,14 +201,8 @@ def test_what_is_measured_trains_nothing_again(square, tmp_path):
     assert gsbench(*arguments).returncode == 0
     (path,) = record.find(tmp_path)
     before = record.read(path)
-    more = (
-        "protocol.quantise=true",
-        "protocol.pictures=0",
-        "protocol.renders=31",
-        "data.published=there",
-        "train.checkpoint_minutes=1",
-    )
-    done = gsbench(*arguments, *more)
+    more = "protocol.quantise=true protocol.pictures=0 protocol.renders=31 data.published=there"
+    done = gsbench(*arguments, *more.split(), "train.checkpoint_minutes=1")
     assert "measured again" in done.stderr
     assert "continues from step 30" in done.stderr
     assert record.find(tmp_path) == [path]

@@ -227,12 +227,8 @@ WRONG: list[tuple[str, tuple[Any, ...], Any]] = [  # part of a checkpoint, where
 def test_any_value_in_a_config_or_a_scene_is_one_line(folder):
     """Catches a division by recipe_iterations=0, and every other value that no run of gsbench has written."""
     whole, draw = checkpoint.read(folder / checkpoint.FILE_NAME), random.Random(2)
-    cases = [
-        (part, path, draw.choice(VALUES))
-        for part in ("config", "scene")
-        for path in leaves(getattr(whole, part))
-        if path
-    ]
+    paths = [(part, path) for part in ("config", "scene") for path in leaves(getattr(whole, part)) if path]
+    cases = [(*each, draw.choice(VALUES)) for each in paths]
     refused = {}
     for part, path, value in [*WRONG, *draw.sample(cases, SAMPLE)]:
         state = replaced(getattr(whole, part), path, lambda _, value=value: value)

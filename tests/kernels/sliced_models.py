@@ -66,11 +66,8 @@ def _raw_of(model: GaussianModel, name: str, options: dict[str, Any]) -> Raw:
     N, k = 45, {"7dgs": 4, "6dgs": 3, "7dgs_nodir": 1, "ubs": 4, "ubs_static": 3}.get(name, 0)
     raw = {"means": normal(N, 3), "opacities": normal(N, size=2)}
     if isinstance(model, CholeskyModel):
-        raw |= {
-            "log_diagonal": normal(N, k + 3, size=0.3, mean=-0.5),
-            "shape": normal(N, 3, size=0.5),
-            "motion": normal(N, 3 * k, size=0.5),
-        }
+        raw |= {"log_diagonal": normal(N, k + 3, size=0.3, mean=-0.5)}
+        raw |= {"shape": normal(N, 3, size=0.5), "motion": normal(N, 3 * k, size=0.5)}
         if name != "7dgs_nodir":
             raw |= {"directions": normal(N, 3), "coupling": normal(N, k * (k - 1) // 2, size=0.5)}
         if options.get("scheme") != "cholesky":  # which keeps no digits of these

@@ -26,15 +26,9 @@ def shown(inputs: list[Tensor], opacities: Tensor, degree: int, waves: int, orde
     """Colours by the kernels, on the device of the inputs, [N, 3]."""
     to = inputs[0].device
     timed = {"times": inputs[3], "time": TIME.to(to)} if waves > 1 else {}
-    return show_colors(
-        *inputs[:3],
-        opacities.to(to),
-        center=CENTER.to(to),
-        degree=degree,
-        waves=waves,
-        orders=None if orders is None else orders.to(to),
-        **timed,
-    )[0]
+    orders = None if orders is None else orders.to(to)
+    by_name = {"center": CENTER.to(to), "degree": degree, "waves": waves, "orders": orders}
+    return show_colors(*inputs[:3], opacities.to(to), **by_name, **timed)[0]
 
 
 def exactly(inputs: list[Tensor], degree: int, waves: int, kept: Tensor | float = 1.0) -> Tensor:

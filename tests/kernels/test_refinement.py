@@ -171,19 +171,9 @@ def test_arrays_that_do_not_fit_are_refused(place):
             refine(values, ones(rows, 3), ones(rows), ones(10, 64), ones(10), *ten)
     with pytest.raises(InputError, match="intervals and time together"):
         refine(values, ones(128, 3), ones(128), ones(10, 64), ones(10), *ten, intervals=ones(4, 2))
-    several = single.new_empty(2, 0)
+    several, timed = single.new_empty(2, 0), {"time": single[0], "intervals": ones(4, 2)}
     with pytest.raises(InputError, match="refine: expected"):
-        refine(
-            values,
-            ones(128, 3),
-            ones(128),
-            ones(10, 64),
-            ones(10),
-            ten[0],
-            several,
-            time=single[0],
-            intervals=ones(4, 2),
-        )
+        refine(values, ones(128, 3), ones(128), ones(10, 64), ones(10), ten[0], several, **timed)
     if place.name != "cuda":
         with pytest.raises(InputError, match="refine: expected one view on cpu, got 2 in one call"):
             refine(values, ones(128, 3), ones(128), ones(10, 64), ones(10), ten[0], several)

@@ -57,10 +57,8 @@ def test_retry_passes_over_what_cannot_be_launched(tmp_path, capsys, monkeypatch
         "/usr": ["+exp=mini", "scene=suzanne", "+launch=parallel", "launch.at_once=0", "seed=3"],
     }
     for number, (cwd, words) in enumerate(asked.items()):
-        plan.write(
-            Plan("local", [words], cwd=cwd, born=None, started=0.0),
-            experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000",
-        )
+        folder = experiment / plan.FOLDER / f"2026-11-22_00-00-0{number}.000000"
+        plan.write(Plan("local", [words], cwd=cwd, born=None, started=0.0), folder)
     assert sweep_main(["retry", str(experiment)]) == 1  # they are lost as before
     errors = [line for line in capsys.readouterr().err.splitlines() if "cannot be launched again" in line]
     reasons = (f"'{gone}'", "Did you mean 'iterations'", "at input '['", "launch.at_once: expected at least 1")
@@ -101,11 +99,8 @@ def test_a_sweep_ends_with_its_own_runs(tmp_path, monkeypatch):
     is left of a sweep whose runs were all refused as they began."""
     words = ["+exp=mini", "scene=suzanne", "model=3dgs", f"results={tmp_path}"]
     ends = {"0": Ended(reason="step 0: nan"), "1": Ended("mini/record.json"), "2": Ended(reason="no", is_refused=True)}
-    monkeypatch.setattr(
-        launcher,
-        "do_planned",
-        lambda config, folder, number: plan.write_ended(folder, number, ends[str(config.config.seed)]),
-    )
+    end = lambda run, folder, number: plan.write_ended(folder, number, ends[str(run.config.seed)])  # noqa: E731
+    monkeypatch.setattr(launcher, "do_planned", end)
     monkeypatch.setattr(
         status, "_kept", lambda _, run: run and run.ended.record and RecordStatus(tmp_path, "ok", None, 20.0, 0.0)
     )

@@ -19,12 +19,8 @@ from gsbench.train import checkpoint
 
 def words(data: Path, results: Path, iterations: int) -> list[str]:
     """A sweep of three seeds, two at a time."""
-    return [
-        "-m",
-        *overrides(data, results, f"train.iterations={iterations}", "train.densify.stop=1", "model=3dgs", "seed=0,1,2"),
-        "+launch=parallel",
-        "launch.at_once=2",
-    ]
+    of_runs = (f"train.iterations={iterations}", "train.densify.stop=1", "model=3dgs", "seed=0,1,2")
+    return ["-m", *overrides(data, results, *of_runs, "+launch=parallel", "launch.at_once=2")]
 
 
 def workers(results: Path) -> list[int]:

@@ -457,11 +457,8 @@ def test_a_slice_is_exported(variant, tmp_path):
     drawn = sliced.opacities >= 1 / 255
     torch.testing.assert_close(trained.means, sliced.means[drawn].detach())
     torch.testing.assert_close(torch.sigmoid(trained.logits), sliced.opacities[drawn].detach())
-    factors = (
-        sliced.factors
-        if sliced.beta_exponents is None
-        else sliced.factors / reach(sliced.beta_exponents)[:, None, None]
-    )
+    b = sliced.beta_exponents
+    factors = sliced.factors if b is None else sliced.factors / reach(b)[:, None, None]
     volumes = torch.linalg.det(factors[drawn].detach()).abs()
     torch.testing.assert_close(trained.log_scales.sum(1).exp(), volumes, rtol=1e-3, atol=1e-6)
     if has_harmonics(model):

@@ -116,10 +116,8 @@ def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -
         more = {"steps": trainings.LONG_STEPS} if long and case.name == "learning_rates_times_30" else {}
         steps.append(_judged(audit, case, trainings.judge, fastest, **more))
     drifts = other.submit(_drifts, fastest, long)
-    counts = {
-        order: million if long or order == DEFAULT_ORDER else min(million, NOT_DEFAULT)
-        for order in population.FACTOR_ORDERS
-    }
+    few = million if long else min(million, NOT_DEFAULT)
+    counts = {order: million if order == DEFAULT_ORDER else few for order in population.FACTOR_ORDERS}
     return [
         *steps,
         *_hard_slices(audit, counts | dict.fromkeys(population.MOVING, min(million, MOVING))),

@@ -65,15 +65,8 @@ def render(
     touched, slack = torch.zeros(C, N, height * width, dtype=torch.bool), means.new_zeros(C, height * width)
     for c in range(C):
         moved = None if offsets2d is None else offsets2d[c]
-        splats = _project(
-            **_of_camera(gaussians, c),
-            viewmat=viewmats[c],
-            K=Ks[c],
-            width=width,
-            height=height,
-            offsets=moved,
-            **options,
-        )
+        place = {"viewmat": viewmats[c], "K": Ks[c], "width": width, "height": height}
+        splats = _project(**_of_camera(gaussians, c), **place, offsets=moved, **options)
         for at, pixels in _pixels(width, height, N):
             image[c, at], alpha[c, at], some, slack[c, at] = _blend(splats, pixels, background)
             touched[c, splats.order[:, None], at] = some

@@ -186,16 +186,8 @@ def verify(hard: Hard, order: str, count: int = VERIFIED) -> float:
 
 
 def _oracle(order: str) -> oracle.Function:
-    layout = {
-        "log_diagonal": 7,
-        "shape": 3,
-        "motion": 12,
-        "coupling": 6,
-        "means": 3,
-        "directions": 3,
-        "times": 1,
-        "opacities": 1,
-    }
+    layout = {"log_diagonal": 7, "shape": 3, "motion": 12, "coupling": 6}
+    layout |= {"means": 3, "directions": 3, "times": 1, "opacities": 1}
     names = "".join(x * (1 if x == "t" else 3) for x in FACTOR_ORDERS[order])
     log_lambda = {"direction": NEVER, "time": NEVER}
     places = CholeskyLayout(names).places
@@ -220,15 +212,8 @@ def judge(hard: Hard, exact: PopulationTruth, order: str, scheme: str, backend: 
 
 def all_seen(order: str, scheme: str, backend: str) -> CholeskyModel:
     """Make a 7DGS model in which opacity does not depend on time and direction (the factors f_temp and f_dir are 1)."""
-    model = build(
-        "7dgs",
-        lambda_d=1.0,
-        lambda_t=1.0,
-        factor_order=order,
-        scheme=scheme,
-        off_diagonal="raw",
-        backend=BACKENDS[backend],
-    )
+    form = {"factor_order": order, "scheme": scheme, "off_diagonal": "raw", "backend": BACKENDS[backend]}
+    model = build("7dgs", lambda_d=1.0, lambda_t=1.0, **form)
     for name in ("direction", "time"):
         model.log_lambda[name] = nn.Parameter(torch.tensor(NEVER))
     return model.to(device_of(backend))
@@ -267,21 +252,8 @@ def moving_slices(name: str, N: int, backends: list[str]) -> tuple[list[Cell], f
         errors = slices.compare(*slices.differentiate(model, raw, observed, exact.weights), exact)
         ms = 1e3 * (time.perf_counter() - start)
         forward, gradient = (percentile(x.numpy()) for x in (errors.forward, errors.gradient))
-        cells.append(
-            Cell(
-                "population",
-                "hard_slices",
-                name,
-                ONE_SCHEME,
-                backend,
-                forward,
-                gradient,
-                errors.bad.double().mean().item(),
-                ms,
-                Bound(),
-                f"{N} slices",
-            )
-        )
+        at, bad = ("population", "hard_slices", name, ONE_SCHEME, backend), errors.bad.double().mean().item()
+        cells.append(Cell(*at, forward, gradient, bad, ms, Bound(), f"{N} slices"))
     return cells, verify_moving(observed)
 
 

@@ -139,15 +139,8 @@ def single_against_double(
 ) -> Training:
     """Train 150 steps of the embedded scene suzanne at 40 x 40 pixels in float32 and in float64, and compare PSNR.
     Rounding may decide which Gaussians are split. The error is the difference in dB. `--long` trains 300 steps."""
-    config = compose(
-        model,
-        steps,
-        "scene=suzanne",
-        "scene.downscale=4",
-        f"seed={run_seed}",
-        "train.batch_size=1",
-        f"train.densify.every={steps // 3}",
-    )
+    words = ("scene=suzanne", "scene.downscale=4", "train.batch_size=1", f"train.densify.every={steps // 3}")
+    config = compose(model, steps, *words, f"seed={run_seed}")
     points = random_points(DRIFT_POINTS, 1.0, generator(run_seed))
     return Training(model, config, replace(load_scene(config), points=points))
 
@@ -203,19 +196,8 @@ def drift(case: Case, backend: str, seeds: Sequence[int] = SEEDS, **more: Any) -
                 )
             drifts.append((abs(fmean(singles) - fmean(exacts)), bound))
         error, bound = max(drifts, key=lambda pair: math.inf if math.isnan(pair[0]) else pair[0] / pair[1])
-        yield Cell(
-            case.area,
-            case.name,
-            name,
-            "-",
-            backend,
-            error,
-            float("nan"),
-            bad,
-            ms,
-            replace(case.bound, forward=bound),
-            "; ".join(notes),
-        )
+        at, limit = (case.area, case.name, name, "-", backend), replace(case.bound, forward=bound)
+        yield Cell(*at, error, float("nan"), bad, ms, limit, "; ".join(notes))
 
 
 def _by_chance(a: Sequence[float], b: Sequence[float], p: float) -> float:

@@ -25,12 +25,8 @@ def gaussians(g: torch.Generator, N: int, size: float = 0.15, D: int = 3, spread
 def camera(width: int, height: int, eye: tuple[float, float, float] = (0.5, -0.4, -4.0)) -> Arguments:
     """One camera at `eye` that looks at the origin, with a picture about as wide as [-1, 1]^3 seems from there."""
     focal = 2.0 * min(width, height)
-    return {
-        "viewmats": look_at(eye)[None],
-        "Ks": intrinsics(focal, focal, width / 2, height / 2)[None],
-        "width": width,
-        "height": height,
-    }
+    views = {"viewmats": look_at(eye)[None], "Ks": intrinsics(focal, focal, width / 2, height / 2)[None]}
+    return views | {"width": width, "height": height}
 
 
 def look_at(eye: tuple[float, float, float]) -> Tensor:

@@ -165,10 +165,8 @@ def test_gaussians_are_counted_for_every_camera(monkeypatch):
     """Catches more splats than int32 numbers because there are several cameras: 40 Gaussians in 2 are 80."""
     single = scene(torch.float32) | {"backend": "cpu"}
     monkeypatch.setattr(native, "MAX_PAIRS", 79)
-    refused(
-        single | {name: single[name].repeat(2, 1, 1) for name in ("viewmats", "Ks")},
-        "at most 79 Gaussians times cameras, got 80",
-    )
+    two = {name: single[name].repeat(2, 1, 1) for name in ("viewmats", "Ks")}
+    refused(single | two, "at most 79 Gaussians times cameras, got 80")
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

@@ -67,14 +67,8 @@ def test_files_as_programs_write_them(form, degree, more, kind, before, path):
     read = read_trained(write(path, table, *before, **form))
     K = (degree + 1) ** 2
     rest = [f"f_rest_{channel * (K - 1) + k}" for k in range(K - 1) for channel in range(3)]
-    fields = {
-        "means": NEEDED[:3],
-        "dc": NEEDED[3:6],
-        "logits": NEEDED[6:7],
-        "log_scales": NEEDED[7:10],
-        "quats": NEEDED[10:],
-        "rest": rest,
-    }
+    fields = {"means": NEEDED[:3], "dc": NEEDED[3:6], "logits": NEEDED[6:7], "log_scales": NEEDED[7:10]}
+    fields |= {"quats": NEEDED[10:], "rest": rest}
     for field, names in fields.items():
         expected = torch.tensor(np.stack([table[name] for name in names], 1) if names else np.zeros((N, 0)))
         torch.testing.assert_close(getattr(read, field).reshape(N, -1), expected.float())

@@ -32,13 +32,8 @@ from gsbench.run.progress import read as read_progress
 ROOT = Path(__file__).resolve().parents[2]
 SCENES, MODELS, SEEDS = ("moving-matte", "suzanne"), ("3dgs", "7dgs"), ("0", "1")
 # Runs of some ten seconds; a job that is killed loses at most one or two of them.
-TINY = (
-    "+exp=mini",
-    "scene.downscale=4",
-    "data.initial_points=1000",
-    "train.curve_points=5",
-    "train.checkpoint_minutes=0.02",
-)
+TINY = ("+exp=mini", "scene.downscale=4", "data.initial_points=1000", "train.curve_points=5")
+TINY += ("train.checkpoint_minutes=0.02",)
 STEPS = 1500
 SHORT = (*TINY, f"train.iterations={STEPS}")
 ALL = (*SHORT, f"scene={','.join(SCENES)}", f"model={','.join(MODELS)}", f"seed={','.join(SEEDS)}")

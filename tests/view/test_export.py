@@ -269,14 +269,12 @@ def test_a_video_is_large_enough_to_be_looked_at(size, expected, folder, monkeyp
     replace_run(monkeypatch, replace(run, scene=replace(run.scene, width=size[0], height=size[1])))
     written: dict[str, set[tuple[int, int]]] = {}
     monkeypatch.setattr(video, "frames", lambda _, shots, __: iter(shots))
+
+    def note(images: Any, path: Path, *_: object) -> None:
+        written[str(path)] = {(camera.width, camera.height) for camera, _ in images}
+
     for name in ("write_video", "write_images"):
-        monkeypatch.setattr(
-            video,
-            name,
-            lambda images, path, *_: written.update(
-                {str(path): {(camera.width, camera.height) for camera, _ in images}}
-            ),
-        )
+        monkeypatch.setattr(video, name, note)
     monkeypatch.setattr("gsbench.export.closing", nullcontext)
     assert exports(folder, "--video", "a.mp4", "--images", "a", *FOUR)
     assert written == {"a.mp4": {expected}, "a": {size}}
