@@ -192,13 +192,8 @@ def test_seconds_of_another_machine_are_nowhere():
             gates=[dataclasses.replace(g, frame_ms_before=7777.0, frame_ms=7777.0) for g in r.on_demand.gates],
             screen=dataclasses.replace(r.on_demand.screen, seconds=7777.0),
         )
-        slow = {
-            "train_s": 77777.0,
-            "stage_s": {"slice": 77777.0},
-            "render_ms": RenderTimes(7777.0, 7777.0, 7777.0),
-            "train_cpu_s": 77777.0,
-            "load": 777.0,
-        }
+        slow = {"train_s": 77777.0, "stage_s": {"slice": 77777.0}, "train_cpu_s": 77777.0, "load": 777.0}
+        slow |= {"render_ms": RenderTimes(7777.0, 7777.0, 7777.0)}
         curve = [Point(p.iteration, 77777.0, p.psnr_val) for p in r.curve]
         return but(r, provenance={"device": "another CPU"}, cost=slow, curve=curve, on_demand=chosen)
 

@@ -4,7 +4,6 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -448,11 +447,7 @@ def test_images_txt_without_second_lines_is_refused(taken, which):
         scenes.load(taken)
 
 
-READERS: dict[str, Callable[[colmap.ModelFile], Any]] = {
-    "cameras": colmap.read_cameras,
-    "images": colmap.read_images,
-    "points3D": colmap.read_points,
-}
+READERS = {"cameras": colmap.read_cameras, "images": colmap.read_images, "points3D": colmap.read_points}
 BINARY = Capture("OPENCV", WIDTH, HEIGHT, (20.0, 21.0, 8.0, 6.0, 0.1, 0, 0, 0), NAMES, circle(COUNT)).binary()
 
 

@@ -242,14 +242,8 @@ def test_the_share_of_gaussians_that_a_camera_sees():
     )
     sizes = torch.tensor([0.1, 0.1, 0.1, 0.5, 0.1, 0.001, 0.1])
     logits = torch.tensor([0.0, 0, 0, 0, -7, 0, 0])
-    flat = TrainedGaussians(
-        means,
-        sizes.log()[:, None].repeat(1, 3) - torch.tensor([0.0, 9, 9]),
-        torch.ones(7, 4),
-        logits,
-        torch.zeros(7, 3),
-        torch.zeros(7, 0, 3),
-    )
+    log_scales = sizes.log()[:, None].repeat(1, 3) - torch.tensor([0.0, 9, 9])
+    flat = TrainedGaussians(means, log_scales, torch.ones(7, 4), logits, torch.zeros(7, 3), torch.zeros(7, 0, 3))
     assert share_seen(flat, [ahead], 1) == pytest.approx(2 / 7)
     assert share_seen(flat, [ahead, aside], 1) == pytest.approx(3 / 7)
     assert share_seen(flat, [ahead, aside], 0.1) == pytest.approx(2 / 7)  # enough

@@ -121,10 +121,8 @@ def test_wrong_poses_do_not_decide(count, tmp_path):
     """Catches a mean and a maximum over cameras: some of 16 poses lie 10,000 units away and look elsewhere."""
     viewmats = circle(COUNT)
     viewmats[3 : 3 + count, :3, 3] += np.array([5e3, 8e3, 1e3]) * np.arange(1, 1 + count)[:, None]
-    plain, wrong = (
-        load_scene(write_capture(tmp_path / "a")),
-        load_scene(write_capture(tmp_path / "b", viewmats=viewmats)),
-    )
+    plain = load_scene(write_capture(tmp_path / "a"))
+    wrong = load_scene(write_capture(tmp_path / "b", viewmats=viewmats))
     assert wrong.placement == plain.placement
     assert wrong.extent == pytest.approx(plain.extent, rel=0.1)
     assert any(f"{count} of 14 training cameras lie far from the others" in note for note in wrong.notes)

@@ -19,12 +19,8 @@ def fixed(names: Callable[[int, int], str], seed: int = 0) -> tuple[list[str], n
     """Names and poses of a rig of fixed cameras in random order, and the true times."""
     listed = [(camera, frame) for camera in range(CAMERAS) for frame in range(FRAMES)]
     listed = [listed[i] for i in np.random.default_rng(seed).permutation(len(listed))]
-    poses = circle(CAMERAS)
-    return (
-        [names(*single) for single in listed],
-        np.stack([poses[camera] for camera, _ in listed]),
-        [f / (FRAMES - 1) for _, f in listed],
-    )
+    poses = circle(CAMERAS)[[camera for camera, _ in listed]]
+    return [names(*single) for single in listed], poses, [f / (FRAMES - 1) for _, f in listed]
 
 
 def nudged(viewmats: np.ndarray) -> np.ndarray:

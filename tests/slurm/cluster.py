@@ -195,19 +195,12 @@ class Cluster:
 
     def _database(self) -> None:
         data, sock = self.folder / "sql", self.folder / "sql.socket"
-        self.run(
-            "mariadb-install-db",
-            "--no-defaults",
-            "--user=root",
-            f"--datadir={data}",
-            "--auth-root-authentication-method=socket",
-        )
+        words = ("--no-defaults", "--user=root", f"--datadir={data}")
+        self.run("mariadb-install-db", *words, "--auth-root-authentication-method=socket")
         self.start(
             "mariadbd",
             "mariadbd",
-            "--no-defaults",
-            "--user=root",
-            f"--datadir={data}",
+            *words,
             f"--socket={sock}",
             "--bind-address=127.0.0.1",
             f"--port={self.sql['sql_port']}",

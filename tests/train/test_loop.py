@@ -99,11 +99,8 @@ def test_the_seconds_of_a_training_are_the_wall_clock_of_its_steps(monkeypatch):
         fitted.train_step, fitted.psnr = step, lambda _: after(100.0, 20.0)
         if saved:
             fitted.load_state_dict(saved[-1])
-        fitted.run(
-            lambda state: after(1000.0, saved.append(state)),
-            "square",
-            lambda fitted=fitted: after(1e4, fitted.step != 3),
-        )
+        goes_on = lambda fitted=fitted: after(1e4, fitted.step != 3)  # noqa: E731
+        fitted.run(lambda state: after(1000.0, saved.append(state)), "square", goes_on)
     assert fitted.step == 10
     assert fitted.stages.seconds == pytest.approx({"loss": 20.0, "other": 10.0})
     assert [(p.iteration, p.seconds) for p in fitted.curve.points] == [(n, 3.0 * n) for n in (2, 4, 6, 8, 10)]
