@@ -21,6 +21,8 @@ TIMES = "metadata.json"
 CAMERAS = "camera"
 IMAGES = "rgb/2x"  # the size of published numbers; `downscale` counts from there
 _MOST_TIMES = 1 << 20
+_KNOWN_OF_IMAGE = {"warp_id", "camera_id", "appearance_id"}  # of metadata.json; appearance_id repeats warp_id
+_UNREAD = ("points.npy", "scene.json")  # the points and the bounds of a release's own training
 
 Vector = tuple[float, float, float]
 
@@ -68,7 +70,7 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
             f"{len(splits.train_ids)} and {len(splits.val_ids)} images, {len({*names})} different"
         )
     digests = {SPLITS: digest}
-    warps, digests[TIMES] = _read_warps(root / TIMES, names)
+    warps, digests[TIMES], of_image = _read_warps(root / TIMES, names)
     if not (last := max(warps.values())):
         raise InputError(f"{root / TIMES}: warp_id: expected images of several times, all are 0")
     listed, unread = [], set[str]()
@@ -91,25 +93,28 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
         fingerprint=files.fingerprint(digests),
         notes=(
             *files.unread(SPLITS, others),
+            *files.unread(TIMES, of_image - _KNOWN_OF_IMAGE),
             *files.unread(f"{CAMERAS}/*.json", unread),
             *([f"{rest} images of {SPLITS} are in no split"] if (rest := len({*splits.ids} - {*names})) else []),
+            *(f"{file} is not read" for file in _UNREAD if (root / file).exists()),
             *loaded.notes,
         ),
     )
 
 
-def _read_warps(source: Path, names: Sequence[str]) -> tuple[dict[str, int], str]:
-    """Return the number of the time of each image, and the SHA-256 of metadata.json."""
+def _read_warps(source: Path, names: Sequence[str]) -> tuple[dict[str, int], str, set[str]]:
+    """Return the number of the time of each image, the SHA-256 of metadata.json, and the keys that its images have."""
     data = read_file(source, str(source), MAX_JSON)
     content = parse_json(data, str(source))
-    warps = {}
+    warps, keys = {}, set[str]()
     for name in names:
         item = content.get(name) if isinstance(content, dict) else None
         warp = item.get("warp_id") if isinstance(item, dict) else None
         if type(warp) is not int or not 0 <= warp < _MOST_TIMES:
             raise InputError(f"{source}: {name[:80]!a}: expected an object with warp_id, the number of its time")
         warps[name] = warp
-    return warps, files.digest(data)
+        keys |= {*(item or ())}
+    return warps, files.digest(data), keys
 
 
 def camera_of(content: CameraFile, where: str) -> tuple[Tensor, Lens]:  # [4, 4] float64

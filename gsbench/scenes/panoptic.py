@@ -112,6 +112,8 @@ def _read_split(root: Path, source: Path) -> _Split:
             _check_pinhole(lens.K, f"{source}: k[{time}][{camera}]")
             moment = time / max(1, times - 1)
             listed.append(Shot(path, mask, stem, f"{path} ({where})", moment, torch.from_numpy(pose), lens))
+    if len({shot.path for shot in listed}) < len(listed):
+        raise InputError(f"{source}: fn: expected each image once, some appear twice: look for a copied line")
     numbers = {number for row in meta.cam_id for number in row}
     return _Split(listed, numbers, times, digest, files.unread(source.name, others))
 

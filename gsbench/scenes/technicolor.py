@@ -136,6 +136,8 @@ def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> li
             continue
         scenes.add(name["scene"])
         frame, camera = int(name["frame"]), int(name["camera"])
+        if camera >= cameras:
+            raise InputError(f"{root / CAMERAS}: expected a row of camera {camera} of {path.name}, got {cameras} rows")
         if frames is None or frames[0] <= frame <= frames[1]:
             by_number[frame, camera] = files.find_inside(root, path.name, str(root))
     if len(scenes) > 1:

@@ -94,6 +94,11 @@ def test_cameras_times_and_splits(root):
         torch.testing.assert_close(view.camera.viewmat, torch.from_numpy(circle(4)[i]).float(), atol=1e-5, rtol=0)
         torch.testing.assert_close(view.camera.K, torch.tensor([[20.0, 0, 16.5], [0, 22, 11.5], [0, 0, 1]]))
     assert "dataset.json: keys that are not read: 'count'" in scene.notes
+    times = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({name: {**of, "time_id": 3} for name, of in times.items()}))
+    (root / "points.npy").touch()
+    notes = {"metadata.json: keys that are not read: 'time_id'", "points.npy is not read"}
+    assert {*scenes.load(root).notes} - {*scene.notes} == notes
 
 
 def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:

@@ -111,6 +111,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (edit(lambda content: content.pop("k")), r"train_meta\.json: .*missing required field k"),
     (edit(lambda content: content["fn"][1].pop()), "one image and number for each camera at each time"),
     (edit(lambda content: content.update(fn=[])), "one image and number"),
+    (edit(lambda content: content.update(fn=content["fn"][:1] * 3)), "fn: expected each image once"),
     (edit(lambda content: content["k"].pop()), r"k: expected numbers of shape \[3, 4, 3, 3\]"),
     (edit(lambda content: content["w2c"][1][2].pop()), r"w2c: expected numbers of shape"),
     (edit(lambda content: content["w2c"][1][2][0].__setitem__(0, 3.0)), r"w2c\[1\]\[2\]: expected a rigid world-to"),

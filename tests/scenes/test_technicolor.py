@@ -114,6 +114,7 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (table(lambda text: text.replace("1.0 0.0 0.0 0.0", "2.0 0.0 0.0 0.0")), "unit quaternion"),
     (table(lambda text: text.replace("10.0 ", "nan ")), "f: expected a number"),
     (table(lambda text: text.replace("10.0 ", "-1 ")), "positive f"),
+    (table(lambda text: text.replace(f"{row(15)}\n", "")), "expected a row of camera 15 of .* got 15 rows"),
     (table(lambda text: "\n".join(text.splitlines()[:9])), "more than 10 cameras"),
     (table(lambda text: text.replace("2.5 ", "")), "expected 12 numbers"),
     (table(lambda _: ""), "expected a header"),
