@@ -113,6 +113,7 @@ def time_left(folder: Path, at_once: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return seconds as text in whole seconds or minutes, or in hours."""
+    """Return seconds as text in whole seconds or minutes, or in hours; below zero, of another clock, as 0 s."""
+    seconds = max(0.0, seconds)
     minutes = seconds / 60
     return f"{seconds:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"

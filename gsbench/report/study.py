@@ -179,9 +179,11 @@ def _csv(rows: list[Row], columns: list[str]) -> bytes:
 def _rows(data: bytes, path: Path) -> list[Row]:
     """Return the rows of a CSV file, in which every row has all cells."""
     try:
-        columns, *rows = csv.reader(io.StringIO(data.decode(), newline=""), strict=True)
+        columns, *rows = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         if len(set(columns)) < len(columns):
             raise ValueError("two columns have one name")
+        if "run" not in columns:
+            raise ValueError("no column is named run: are cells separated by commas?")
         return [dict(zip(columns, row, strict=True)) for row in rows]
     except (ValueError, csv.Error) as error:  # also bad UTF-8, and a row with another number of cells
         raise InputError(f"{path}: expected a CSV table: {error}") from None

@@ -95,6 +95,7 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
         # a progress
         (None, {"progress_of": HERE}, "running", None),
         (None, {"progress_of": GONE}, "lost", "step 100 of 400"),
+        (None, {"progress_of": GONE | {"updated": time.time() + 1e6}}, "lost", "last seen 0 s ago"),
         (None, {"progress_of": OTHER}, "running", None),
         (None, {"progress_of": OTHER | {"updated": time.time() - 660}}, "lost", "step 100 of 400"),
         (Queue({"7_0": "PENDING Resources"}), {"plan_of": JOB, "progress_of": IN_JOB}, "queued", "Resources"),

@@ -86,6 +86,7 @@ def packed(name: str, text: bytes) -> Callable[[Path], object]:
         (packed(study.CURVES_FILE, b"0" * (study.MAX_TABLE + 1)), "expected one whole gzip file of at most"),
         (edited("\n1,", "\n0,"), "run: expected another number in each row"),
         (edited("run,", "seed,"), "two columns have one name"),
+        (edited(",", ";"), "no column is named run: are cells separated by commas?"),
         (edited("\n0,", "\n0,1,"), "expected a CSV table"),
         (edited(",ok,", ",fine,"), "run 0: status"),
         (edited("psnr_db", "psnr_dB"), "run 0: the file: unknown key 'psnr_dB'"),
