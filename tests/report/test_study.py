@@ -120,3 +120,12 @@ def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_p
         with pytest.raises(InputError, match="expected finished runs of clean commits"):
             published(bad)
     assert {path: path.read_bytes() for path in to.iterdir()} == before
+
+
+def test_a_study_that_a_spreadsheet_saved_is_read(tmp_path):
+    """Catches a byte order mark in front of the first column's name, and other ends of lines."""
+    study.write(hard(), tmp_path)
+    runs = tmp_path / study.RUNS_FILE
+    before = study.read(tmp_path)
+    runs.write_bytes(b"\xef\xbb\xbf" + runs.read_bytes().replace(b"\n", b"\r\n"))
+    assert study.read(tmp_path) == before
