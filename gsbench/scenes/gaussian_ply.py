@@ -94,6 +94,12 @@ def read_trained(path: Path) -> TrainedGaussians:
         raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
     by_channel = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
+    if 0 <= read["logits"].min() < read["logits"].max() <= 1:
+        print(
+            f"{path}: all values of opacity lie in [0, 1]: are they opacities? A PLY of 3DGS has their logits, and the "
+            f"logarithms of scales",
+            file=sys.stderr,
+        )
     if FILTER in names:
         _fuse(read, _table(vertices, (FILTER,), path), path)
     higher = by_channel.view(len(vertices), 3, count // 3).mT.contiguous()  # [N, K - 1, 3]

@@ -1,6 +1,8 @@
 """Draw initial points at random or read them from a PLY file, and compute distances to their neighbours."""
 
 import math
+import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +25,7 @@ FAR = 4.0  # distance from the middle, beyond which a point lies far outside; th
 NEIGHBOURS = 3  # whose distances are the initial scale
 ROUNDS = 50  # largest number of rounds in which points in a frustum are drawn
 
+_READ_OR_HARMLESS = re.compile(r"n?[xyz]|red|green|blue|alpha|time|f_(dc|rest)_\d+|opacity|scale_\d|rot_\d")
 _LARGEST = float(np.finfo(np.float32).max)
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS, create_from_pcd: clamp_min(distCUDA2, 1e-7), so that log(scale) stays finite
 
@@ -100,11 +103,14 @@ def read_ply(path: Path) -> Points:
     """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
     Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1]. A
-    property `time` in [0, 1] gives the points times: the union of the clouds of several frames has one.
+    property `time` in [0, 1] gives the points times: the union of the clouds of several frames has one. Other columns
+    are named on stderr.
     """
     vertices = read_vertices(path)
     means = columns(vertices, ("x", "y", "z"), path, _LARGEST)
     names = vertices.dtype.names or ()
+    if others := [name for name in names if not _READ_OR_HARMLESS.fullmatch(name)]:
+        print(f"{path}: columns of its points that are not read: {', '.join(others):.120}", file=sys.stderr)
     if "red" in names:
         colors = columns(vertices, ("red", "green", "blue"), path, _LARGEST)
         kind = vertices.dtype["red"]

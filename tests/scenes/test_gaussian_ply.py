@@ -150,6 +150,13 @@ def test_columns_that_change_no_image_are_named_in_one_line(path, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(("least", "asked"), [(0.0, True), (-0.1, False)])
+def test_opacities_in_place_of_logits_are_asked_for(least, asked, path, capsys):
+    """Catches a PLY of activated values, whose Gaussians are all half transparent and larger than a unit."""
+    read_trained(write(path, rows(opacity=np.linspace(least, 1, N))))
+    assert ("are they opacities?" in capsys.readouterr().err) is asked
+
+
 @pytest.mark.parametrize("network", ["deformation.pth", "../../deform/iteration_7/deform.pth"])
 def test_a_deformation_network_beside_the_file_is_named(network, tmp_path, capsys):
     """Catches canonical Gaussians of 4DGaussians or Deformable 3DGS that are taken for those of the trained scene."""

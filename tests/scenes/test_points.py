@@ -72,8 +72,11 @@ def test_ply_of_3dgs(tmp_path):
     torch.testing.assert_close(colors[1], torch.tensor([0.5 + 0.28209479177387814, 1.0, 0.5]))
 
 
-def test_ply_of_several_frames(tmp_path):
-    """Catches times that are read as positions, in another type, or where a cloud has none."""
+def test_ply_of_several_frames(tmp_path, capsys):
+    """Catches times that are read as positions, in another type, where a cloud has none, or dropped in silence."""
+    path = save(tmp_path, ply(np.zeros(3, [*VERTEX, ("nx", "f4"), ("t", "f4")])))
+    read_ply(path)
+    assert capsys.readouterr().err == f"{path}: columns of its points that are not read: t\n"
     vertices = np.zeros(3, [*VERTEX, ("time", "f4")])
     vertices["time"] = 0.0, 0.25, 1.0
     times = read_ply(save(tmp_path, ply(vertices))).times
