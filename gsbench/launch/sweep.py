@@ -47,10 +47,8 @@ def launch(configs: Sequence[RunConfig], config_dir: Path | None) -> Outcome:
         raise InputError(
             f"results: expected a folder that can be written, got '{first.results}': {error.strerror}"
         ) from None
-    print(
-        f"{len(runs)} runs; their status: python -m gsbench.launch status {shlex.quote(_short(experiment))}",
-        file=sys.stderr,
-    )
+    short = experiment.relative_to(Path.cwd()) if experiment.is_relative_to(Path.cwd()) else experiment
+    print(f"{len(runs)} runs; their status: python -m gsbench.launch status {shlex.quote(str(short))}", file=sys.stderr)
     try:
         if planned.launcher == "slurm":
             slurm.launch(configs, planned, folder)
@@ -69,10 +67,6 @@ def launch(configs: Sequence[RunConfig], config_dir: Path | None) -> Outcome:
     wanted = set(map(identity, runs))
     states = [run for run in status(read(experiment)) if identity(run.overrides) in wanted]
     return Outcome([run for run in states if run.state in (*BROKEN, "planned")], False, experiment)
-
-
-def _short(path: Path) -> str:
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
 def retry(experiment: Experiment, more: Sequence[str]) -> int:

@@ -110,11 +110,19 @@ def _report(results: Results, columns: Sequence[str], options: argparse.Namespac
 
 
 def _content(results: Results) -> dict[str, object]:
-    """Return all sections, the facts of every run, and why records were left out, as plain values for JSON."""
+    """Return all sections, the facts of every run, and why records were left out, as plain values for JSON.
+
+    Numbers are not rounded; `as_json` writes those that are missing as null.
+    """
     skipped = ("gallery", "runs")  # images, and a table that `runs` below replaces
-    sections = [section for chapter in results.chapters() for section in built(chapter) if section.key not in skipped]
+    sections = [
+        {"key": s.key, "title": s.title, "text": s.text, "notes": s.notes, "rows": s.table.to_dict("records")}
+        for chapter in results.chapters()
+        for s in built(chapter)
+        if s.key not in skipped
+    ]
     runs = results.runs.drop(columns=["path", "record"]).to_dict("records")
-    return {"sections": text.plain(sections), "runs": runs, "left_out": list(results.faults)}
+    return {"sections": sections, "runs": runs, "left_out": list(results.faults)}
 
 
 def _paper_tables(results: Results, options: argparse.Namespace) -> None:

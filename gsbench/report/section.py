@@ -146,12 +146,6 @@ def number(value: float, digits: int, *, signed: bool = False) -> str:
     return zero if shown.lstrip("+-") == zero else shown
 
 
-def span(values: pd.Series, digits: int) -> str:
-    """Return the least and the largest number, such as "0.8 to 1.2", or one of them if they look alike."""
-    ends = (number(float(value), digits) for value in (values.min(), values.max()))
-    return " to ".join(dict.fromkeys(ends))
-
-
 def text(value: Any) -> str:
     """Return a value that is no number on one short line; what is missing is empty."""
     if isinstance(value, bool):

@@ -192,7 +192,8 @@ class RunLog:
         lines = [earlier_lines.get(point, _line(point)) for point in points]
         self.written = len(points)
         with contextlib.suppress(OSError):  # a full disk ends the run at its checkpoint, which says so
-            write_atomically(self.path, "".join(map(_text, lines)).encode(), lasting=False)
+            text = "".join(f"{json.dumps(line)}\n" for line in lines)
+            write_atomically(self.path, text.encode(), lasting=False)
         continued = trainer.step if spec.config.resume else 0
         subject = Subject(spec.folder, spec.name, spec.config.experiment, dict(flat(spec.plain)), continued)
         self.tracker: Tracker | None = None  # None also after its first error
@@ -207,7 +208,7 @@ class RunLog:
         for point in self.trainer.curve.points[self.written :]:
             line = _line(point, self.trainer.finite_check.loss, len(self.trainer.model))
             with contextlib.suppress(OSError), self.path.open("a") as file:
-                file.write(_text(line))
+                file.write(f"{json.dumps(line)}\n")
             self._send_line(line)
             self.written += 1
 
@@ -253,10 +254,6 @@ def _line(point: Point, loss: float | None = None, gaussians: int | None = None)
         "loss": loss if loss is not None and math.isfinite(loss) else None,
         "gaussians": gaussians,
     }
-
-
-def _text(line: Line) -> str:
-    return json.dumps(line) + "\n"
 
 
 def _read_curve(path: Path) -> dict[Point, Line]:

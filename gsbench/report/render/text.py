@@ -1,4 +1,4 @@
-"""Show sections in a terminal, as Markdown, as LaTeX and as plain values for JSON: one function each."""
+"""Show sections in a terminal, as Markdown and as LaTeX, and tables as CSV: one function each."""
 
 import re
 import textwrap
@@ -145,14 +145,6 @@ def _cell(text: str, rank: int) -> str:
 def tex(text: str) -> str:
     """Escape the special characters of LaTeX, so that a text is shown unchanged and runs no command."""
     return "".join(TEX.get(c, c) for c in printable(text))
-
-
-def plain(sections: Sequence[Section]) -> list[dict[str, Any]]:
-    """Return sections as plain values, the numbers not rounded; `as_json` writes a number that is missing as null."""
-    return [
-        {"key": s.key, "title": s.title, "text": s.text, "notes": s.notes, "rows": s.table.to_dict("records")}
-        for s in sections
-    ]
 
 
 def csv(frame: pd.DataFrame) -> str:

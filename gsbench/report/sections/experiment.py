@@ -133,7 +133,10 @@ def _notes(chapter: Results) -> Iterator[str]:
         titles.setdefault(f"{why}{scenes}", []).append(column.title if column else metric)
     yield from (printable(f"{', '.join(metrics)}: {reason}") for reason, metrics in titles.items())
     for (scene, label), runs in ok[ok.rendered_elsewhere].groupby(["scene", "label"]):
-        yield printable(f"{scene}, {label}: {of_renders(runs.record.iloc[0].rendered_elsewhere)}")
+        renders: Renders = runs.record.iloc[0].rendered_elsewhere
+        reduced = f", reduced from {renders.resized_from}" if renders.resized_from else ""
+        matched = f"{renders.kind}, matched to the views by {renders.matched}{reduced}"
+        yield printable(f"{scene}, {label}: rendered elsewhere; {matched}")
     for scene, runs in ok.groupby("scene"):
         regions = {name: region for record in runs.record if record for name, region in record.regions.items()}
         for name, region in sorted(regions.items()):
@@ -142,9 +145,3 @@ def _notes(chapter: Results) -> Iterator[str]:
             yield printable(
                 f"{scene}: {metric} is over {share} % of the pixels of {region.views} views, from {region.source}"
             )
-
-
-def of_renders(renders: Renders) -> str:
-    """Say of which files the images of another program were, and how they were matched to the views."""
-    reduced = f", reduced from {renders.resized_from}" if renders.resized_from else ""
-    return f"rendered elsewhere; {renders.kind}, matched to the views by {renders.matched}{reduced}"

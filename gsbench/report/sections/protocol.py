@@ -9,7 +9,7 @@ from gsbench.errors import printable
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.record import Record
 from gsbench.report.frame import Results, without
-from gsbench.report.section import Section, number, section, span
+from gsbench.report.section import Section, number, section
 
 WARNING = "WARNING"
 # What a record means that lacks a setting.
@@ -105,7 +105,8 @@ def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
     for name, values, digits in facts:
         recorded = pd.Series(values, runs.index, dtype=float).dropna()
         if len(recorded):
-            yield [name, span(recorded, digits), _scenes(runs.loc[recorded.index], runs), len(recorded)]
+            ends = dict.fromkeys(number(value, digits) for value in (recorded.min(), recorded.max()))
+            yield [name, " to ".join(ends), _scenes(runs.loc[recorded.index], runs), len(recorded)]
 
 
 def _scenes(some: pd.DataFrame, runs: pd.DataFrame) -> str:
