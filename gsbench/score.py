@@ -24,6 +24,7 @@ from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
 from gsbench.measure import record as records
 from gsbench.measure.flicker import films_of, grey_of, tof
 from gsbench.measure.images import write_png
+from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import SSIM_LEAST_SIDE, capped_psnr
 from gsbench.measure.record import Cost, Record
 from gsbench.measure.renders import HOW_TO, CheckedRenders, check_renders
@@ -33,7 +34,7 @@ from gsbench.process.memory import is_out_of_memory
 from gsbench.run import drift
 from gsbench.run.execution import summary
 from gsbench.run.identity import RunSpec, identify
-from gsbench.run.measuring import measure_images, protocol_of, provenance_of
+from gsbench.run.measuring import measure_images, protocol_of
 from gsbench.run.settings import AUTO
 from gsbench.run.setup import check_folder, check_machine, evaluated_views, load_scene
 from gsbench.scenes import View
@@ -108,7 +109,7 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
         seed=config.seed,
         effects=None,
         protocol=protocol_of(config, scene) | _departures(renders),
-        provenance=provenance_of({key: spec.plain[key] for key in RECORDED}, scene, config.device),
+        provenance=provenance({key: spec.plain[key] for key in RECORDED}, scene, config.device),
         metrics=measured.metrics | dict.fromkeys(drift.NAMES),
         missing=measured.missing | dict.fromkeys(drift.NAMES, "needs the Gaussians, not their images"),
         per_view=measured.per_view,

@@ -3,50 +3,44 @@
 import functools
 import platform
 import subprocess
-from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from gsbench import kernels
 from gsbench.config_roles import config_hash
 from gsbench.measure.machine import hardware
 from gsbench.measure.record import Provenance
 from gsbench.version import __version__
 
+if TYPE_CHECKING:
+    from gsbench.scenes import Scene
+
 PACKAGES = ("torch", "numpy", "scikit-image", "lpips", "opencv-contrib-python-headless")
 
 
-def provenance(
-    *,
-    config: dict[str, Any],
-    data_hash: str,
-    data_notes: Sequence[str] = (),
-    threads: int,
-    device: str | None = None,
-    instruction_set: str | None = None,
-) -> Provenance:
-    """Return the provenance of a run that ends now, without importing the packages whose versions are recorded.
+def provenance(config: dict[str, Any], scene: "Scene | None", device: str) -> Provenance:
+    """Return the provenance of a run that ends now.
 
     Args:
         config: all settings of the run with references resolved, as plain JSON.
-        data_hash: the fingerprint of the scene.
-        data_notes: what was decided where the scene's files leave a choice.
-        threads: of torch and of the kernels.
-        device: the name of the GPU; None if the run used the CPU.
-        instruction_set: that of the CPU kernels; None if they are not built.
+        scene: the scene; None if it could not be loaded.
+        device: "cpu" or a GPU of this machine, such as "cuda".
     """
-    here = hardware(instruction_set)
+    import torch
+
+    here = hardware(kernels.instruction_set())
     return Provenance(
         git_commit=running_commit(),
         versions=versions(),
-        device=device or here.processor,
-        threads=threads,
+        device=torch.cuda.get_device_name(device) if device.startswith("cuda") else here.processor,
+        threads=torch.get_num_threads(),
         config=config,
         config_hash=config_hash(config),
-        data_hash=data_hash,
-        data_notes=[*data_notes],
+        data_hash=scene.fingerprint if scene else "not loaded",
+        data_notes=[*scene.notes] if scene else [],
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         hardware=here,
     )

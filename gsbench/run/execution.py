@@ -21,6 +21,7 @@ from gsbench.measure.atomic import remove_leftovers
 from gsbench.measure.curve import FALL, Curve
 from gsbench.measure.exact_views import sentence
 from gsbench.measure.images import Pixels, write_png
+from gsbench.measure.provenance import provenance
 from gsbench.measure.record import Effects, Record, Status
 from gsbench.measure.speed import reset_peak_memory
 from gsbench.models import GaussianModel
@@ -187,7 +188,7 @@ class Execution:
                 "backend": self.model.backend.name if self.model else config.raster.backend,
             },
             # Without a model, the device may be one that is not here.
-            provenance=measuring.provenance_of(spec.plain, scene, config.device if self.model is not None else "cpu"),
+            provenance=provenance(spec.plain, scene, config.device if self.model is not None else "cpu"),
             variant=spec.variant,
             overrides=spec.overrides,
         )
@@ -369,7 +370,7 @@ def finished(spec: RunSpec, scene: Scene) -> Record | None:
 def _where(spec: RunSpec, record: Record) -> str:
     """Return the date and the machine of a record as text."""
     machine = record.provenance.machine
-    is_here = machine == measuring.provenance_of(spec.plain, None, spec.config.device).machine
+    is_here = machine == provenance(spec.plain, None, spec.config.device).machine
     return f"{record.provenance.time.partition('T')[0]:.20} on {'this machine' if is_here else machine}"
 
 

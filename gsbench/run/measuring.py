@@ -9,19 +9,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
-from gsbench import kernels
 from gsbench.config import Config
-from gsbench.config_roles import Plain
 from gsbench.errors import one_line
 from gsbench.gates import picture
 from gsbench.measure.flicker import FlickerScores
 from gsbench.measure.images import Pixels, strip
-from gsbench.measure.provenance import provenance
 from gsbench.measure.quality import evaluate, evenly
-from gsbench.measure.record import Cost, Provenance, Region, ViewScore
+from gsbench.measure.record import Cost, Region, ViewScore
 from gsbench.measure.regions import RegionScores
 from gsbench.measure.speed import RenderTimes, peak_memory, synchroniser, time_in_turns
 from gsbench.models.render import GraphedFrames
@@ -94,18 +90,6 @@ def protocol_of(config: Config, scene: Scene | None) -> dict[str, Any]:
         **{key: value for key in ("resize", "val_every") if (value := getattr(config.scene, key)) is not None},
         **({"repaired": ", ".join(scene.repaired)} if scene and scene.repaired else {}),
     }
-
-
-def provenance_of(plain: Plain, scene: Scene | None, device: str) -> Provenance:
-    """Return the provenance of a run that ends now on a device, such as "cuda"; `scene` is None as in `protocol_of`."""
-    return provenance(
-        config=plain,
-        data_hash=scene.fingerprint if scene else "not loaded",
-        data_notes=scene.notes if scene else (),
-        threads=torch.get_num_threads(),
-        instruction_set=kernels.instruction_set(),
-        device=torch.cuda.get_device_name(device) if device.startswith("cuda") else None,
-    )
 
 
 def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> tuple[Measured, Cost, dict[str, str]]:

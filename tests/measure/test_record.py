@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import torch
 from forked import ended, python
 from hostile.mutations import damage_file
 from hypothesis import HealthCheck, given, settings
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 from report.records import make
 from tiny_run import ROOT
 
+from gsbench import kernels
 from gsbench.errors import InputError, one_line
 from gsbench.launch import status as launched
 from gsbench.measure import machine
@@ -233,11 +235,13 @@ def test_paths_say_what_a_run_is_and_cannot_leave_the_root(tmp_path):
         files.run_path(tmp_path, "mini", "suzanne", "7dgs", -1)
 
 
-def test_provenance_names_the_machine_and_hashes_the_config(tmp_path):
+def test_provenance_names_the_machine_and_hashes_the_config(tmp_path, monkeypatch):
     """Would catch a hash that depends on the order of keys, an unwritable field, and a lost instruction set."""
-    first = provenance(config={"a": 1, "b": [2]}, data_hash="d", threads=2, instruction_set="v3")
-    two = provenance(config={"b": [2], "a": 1}, data_hash="d", threads=2, device="a GPU")
-    other = provenance(config={"a": 1, "b": [3]}, data_hash="d", threads=2)
+    monkeypatch.setattr(torch.cuda, "get_device_name", {"cuda:1": "a GPU"}.get)
+    monkeypatch.setattr(kernels, "instruction_set", lambda: "v3")
+    first = provenance({"a": 1, "b": [2]}, None, "cpu")
+    two = provenance({"b": [2], "a": 1}, None, "cuda:1")
+    other = provenance({"a": 1, "b": [3]}, None, "cpu")
     assert first.config_hash == two.config_hash != other.config_hash
     assert first.device
     assert two.device == "a GPU"
@@ -271,9 +275,9 @@ def test_git_ignores_what_this_machine_measured_and_nothing_that_is_published():
 
 def test_a_record_has_the_commit_of_the_code_that_ran(monkeypatch):
     """Would catch a commit that was made during a long training, and that its record says instead."""
-    first = provenance(config={}, data_hash="", threads=1).git_commit
+    first = provenance({}, None, "cpu").git_commit
     monkeypatch.setattr("gsbench.measure.provenance.git_commit", lambda: "made since")
-    assert provenance(config={}, data_hash="", threads=1).git_commit == first
+    assert provenance({}, None, "cpu").git_commit == first
 
 
 def test_records_and_tables_do_not_import_torch():
