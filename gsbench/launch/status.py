@@ -2,7 +2,6 @@
 
 import os
 import re
-import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -16,7 +15,7 @@ from gsbench.measure.record import CHECKPOINT, PUBLISHED
 from gsbench.measure.record import FILE_NAME as RECORD
 from gsbench.report import plausible
 from gsbench.run import progress
-from gsbench.run.progress import SILENT, Progress, born, is_alive
+from gsbench.run.progress import SILENT, Progress, is_alive
 
 STATES = ("done", "running", "queued", "planned", "stopped", "not started", "failed", "lost")
 GOING = ("running", "queued", "planned")
@@ -203,9 +202,7 @@ def _can_start(run: PlannedRun, queue: Queue) -> bool:
     """Return whether the command that planned a run can still start it."""
     if run.job is not None:  # only Slurm can still start it
         return queue.silent is not None
-    if run.plan.host == socket.gethostname():
-        return run.plan.born is not None and born(run.plan.pid) == run.plan.born
-    return time.time() - run.plan.started < SILENT
+    return is_alive(Progress([], run.plan.host, run.plan.pid, run.plan.born, updated=run.plan.started))
 
 
 def _explained(experiment: Experiment, run: Identity, state: RunStatus, ends: dict[str, str]) -> RunStatus:
