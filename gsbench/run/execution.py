@@ -141,8 +141,7 @@ class Execution:
     def measure(self, trainer: Trainer) -> Record:
         """Measure image quality, speed and size of the trained model, and return the record."""
         results = {name: value for hook in trainer.hooks for name, value in hook.results().items()}
-        with_effect_sets = "on_demand" in results
-        measured, cost, frames = measuring.measure(trainer, self.chosen.config, with_effect_sets=with_effect_sets)
+        measured, cost, frames = measuring.measure(trainer, with_effect_sets="on_demand" in results)
         self._images = measured.images
         record = self.describe("ok", None)
         fields = {name: value for name, value in results.items() if hasattr(record, name)}  # `parts` has the others

@@ -92,13 +92,13 @@ def protocol_of(config: Config, scene: Scene | None) -> dict[str, Any]:
     }
 
 
-def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> tuple[Measured, Cost, dict[str, str]]:
+def measure(trainer: Trainer, *, with_effect_sets: bool) -> tuple[Measured, Cost, dict[str, str]]:
     """Measure a trained model on the evaluated views: images, cost, and the note of `frames`, which the record has too.
 
     `with_effect_sets` also draws what each Gaussian depends on.
     """
     views = trainer.views
-    measured = measure_images(views, map(trainer.render, views), trainer.scene.background, config)
+    measured = measure_images(views, map(trainer.render, views), trainer.scene.background, trainer.config)
     times, note = time_frames(trainer, views)
     cost = Cost(
         train_s=sum(trainer.stages.seconds.values()),
@@ -107,11 +107,11 @@ def measure(trainer: Trainer, config: Config, *, with_effect_sets: bool) -> tupl
         fps=times.fps,
         num_gaussians=len(trainer.model),
         bytes=trainer.model.stored_bytes(),
-        peak_memory=peak_memory(config.device),
+        peak_memory=peak_memory(trainer.config.device),
         train_cpu_s=trainer.effort.cpu_s,
         load=trainer.effort.load,
     )
-    metrics, missing = with_best(measured, trainer, config)
+    metrics, missing = with_best(measured, trainer)
     metrics["psnr_train"] = trainer.psnr(evenly(trainer.scene.train, len(views)))
     renderer = trainer.renderer
     metrics["psnr_float32"], why = psnr_float32(trainer.model, trainer.views, renderer.background, renderer.antialias)
@@ -165,7 +165,7 @@ def frames(trainer: Trainer, first: View) -> tuple[Callable[[View], Tensor], dic
     return lambda view: graphed(view.camera, view.time), {"frames": "replayed"}
 
 
-def with_best(measured: Measured, trainer: Trainer, config: Config) -> tuple[dict[str, float | None], dict[str, str]]:
+def with_best(measured: Measured, trainer: Trainer) -> tuple[dict[str, float | None], dict[str, str]]:
     """Return the metrics of the last iteration, with the PSNR at the iteration that was best on val added.
 
     With `protocol.best_on_test`, the highest PSNR on the evaluated split during training is added too.
@@ -173,12 +173,12 @@ def with_best(measured: Measured, trainer: Trainer, config: Config) -> tuple[dic
     metrics, missing = dict(measured.metrics), dict(measured.missing)
     best = trainer.hook(Best).scores
     metrics["psnr_best_on_val"] = best.eval_at_best_val
-    if config.scene.eval_split == "val":
+    if trainer.config.scene.eval_split == "val":
         metrics["psnr_best_on_val"] = None
         missing["psnr_best_on_val"] = "measured on val, so no other split is left to choose an iteration by"
     elif metrics["psnr_best_on_val"] is None:
         has_val = bool(trainer.scene.val)
         missing["psnr_best_on_val"] = "PSNR on val is not a number" if has_val else "the scene has no val split"
-    if config.protocol.best_on_test:
+    if trainer.config.protocol.best_on_test:
         metrics["psnr_best_on_test"] = best.eval
     return metrics, missing
