@@ -4,8 +4,6 @@ python docs/site/charts.py
 """
 
 import dataclasses
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ import vl_convert
 
 from gsbench.report.blocks import DNERF_VARIANT, MODELS, only
 from gsbench.report.render import charts
-from gsbench.report.render.palette import THEMES, styles
+from gsbench.report.render.palette import styles
 from gsbench.report.sections.budgets import frontier
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,8 +65,8 @@ def draw_networks() -> None:
 def write(spec: dict[str, Any], name: str) -> None:
     """Draw a Vega-Lite chart in the light theme to docs/images/."""
     spec["background"] = spec["config"]["background"] = "white"
-    plain = re.sub(r"var\(--([\w-]+)\)", lambda match: THEMES[match[1]][0], json.dumps(spec))
-    (ROOT / "docs" / "images" / f"{name}.png").write_bytes(vl_convert.vegalite_to_png(plain, scale=2))
+    picture = vl_convert.vegalite_to_png(charts.in_light_theme(spec), scale=2)
+    (ROOT / "docs" / "images" / f"{name}.png").write_bytes(picture)
 
 
 if __name__ == "__main__":

@@ -82,14 +82,18 @@ def write(figure: Figure, look: Look, stem: Path) -> list[Path]:
     scenes = list(dict.fromkeys(figure.table.scene)) if "scene" in figure.table else [""]
     paths = []
     for scene in scenes:
-        plain = json.dumps(spec(figure, look, scene=scene, width=WIDTH, legend=True))
-        light = re.sub(r"var\(--([\w-]+)\)", lambda match: THEMES[match[1]][0], plain)
+        light = in_light_theme(spec(figure, look, scene=scene, width=WIDTH, legend=True))
         name = "-".join(re.findall("[a-z0-9]+", f"{stem.name} {scene}".lower()))
         path = stem.with_name(name[:LONGEST_NAME])
         write_atomically(path.with_suffix(".svg"), vl_convert.vegalite_to_svg(light).encode())
         write_atomically(path.with_suffix(".pdf"), vl_convert.vegalite_to_pdf(light))
         paths += [path.with_suffix(".pdf"), path.with_suffix(".svg")]
     return paths
+
+
+def in_light_theme(chart: dict[str, Any]) -> str:
+    """Return the Vega-Lite JSON of a figure as text, with colours in place of the style sheet's variables."""
+    return re.sub(r"var\(--([\w-]+)\)", lambda match: THEMES[match[1]][0], json.dumps(chart))
 
 
 def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerChart:
