@@ -99,12 +99,13 @@ class ImageFinder:
             return path if suffix else path.with_name(f"{path.name}{_SUFFIXES[0]}")
         # The suffix in another case comes before other suffixes.
         best = min(names, key=lambda other: (other.lower() != path.name.lower(), _order(other), other))
-        if suffix and (read := os.path.splitext(best)[1]) != suffix:
-            self._replaced[f"{read} for {suffix}"] += 1
+        read = os.path.splitext(best)[1]
+        if read != suffix and (suffix or len(names) > 1):
+            self._replaced[f"{read} for {suffix or 'a name of several files'}"] += 1
         return path.with_name(best)
 
     def notes(self) -> list[str]:
-        """Return a sentence on images whose suffix is not the one that the data set says, if there are any."""
+        """Return a sentence on images whose suffix the data set does not say, or says otherwise, if there are any."""
         if not self._replaced:
             return []
         return [f"images of another suffix are read: {', '.join(f'{n} {of}' for of, n in self._replaced.items())}"]

@@ -44,6 +44,8 @@ def test_the_image_that_is_named_comes_first(tiny):
     }
     names = {path: [finder.find(name, "where").name for name in asked] for path, asked in expected.items()}
     assert names == {path: [path] * len(asked) for path, asked in expected.items()}
+    read = "1 .jpg for .JPG, 1 .PNG for .png, 3 .PNG for a name of several files"
+    assert finder.notes() == [f"images of another suffix are read: {read}"]
 
 
 def test_names_that_macos_spells_otherwise(tiny):
