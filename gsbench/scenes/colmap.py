@@ -93,9 +93,10 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
     folder, notes = largest_model(root / "sparse")
     model = cameras, posed, points = [read_part(folder, part) for part in ("cameras", "images", "points3D")]
     texts = [text.name for part in model if (text := part.path.with_suffix(".txt")) != part.path and text.exists()]
-    notes += (
-        [f"{', '.join(texts)} in {folder.relative_to(root)} are not read, as there are .bin files"] if texts else []
-    )
+    if texts:
+        notes.append(f"{', '.join(texts)} in {folder.relative_to(root)} are not read, as there are .bin files")
+    if (folder / "test.txt").exists():  # of the code of 3DGS
+        notes.append(f"test.txt in {folder.relative_to(root)} is not read: every {HELD_OUT}th image is a test view")
     listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
     loaded = shots.read(listed, rendition)

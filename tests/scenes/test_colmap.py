@@ -395,10 +395,13 @@ def test_the_largest_model_is_read(taken, models, words):
 
 
 def test_a_text_file_beside_a_binary_one_is_told(taken):
-    """Catches an edited images.txt that images.bin hides."""
+    """Catches an edited images.txt that images.bin hides, and a list of test images that is not followed."""
+    (taken / "sparse/0/test.txt").touch()
     Capture("PINHOLE", WIDTH, HEIGHT, (20.0, 21.0, 3.25, 9.5), NAMES, circle(COUNT)).write(taken, "bin")
     (taken / "sparse/0/cameras.txt").unlink()
-    assert "images.txt, points3D.txt in sparse/0 are not read, as there are .bin files" in scenes.load(taken).notes
+    notes = scenes.load(taken).notes
+    assert "images.txt, points3D.txt in sparse/0 are not read, as there are .bin files" in notes
+    assert "test.txt in sparse/0 is not read: every 8th image is a test view" in notes
 
 
 def test_a_principal_point_that_hides_all_points_is_asked_for(taken):
