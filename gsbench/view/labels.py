@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsbench.errors import InputError
 from gsbench.measure import record
 from gsbench.measure.images import Pixels
+from gsbench.report import plausible
 from gsbench.run.load import LoadedRun
 from gsbench.run.settings import label_of
 
@@ -64,7 +65,7 @@ def _psnr(run: LoadedRun) -> str:
     if not path.exists():  # the run was interrupted
         return f"no PSNR on {split} yet"
     try:
-        psnr = (record.read(path).metrics or {}).get("psnr")
+        psnr = (plausible.read(path).metrics or {}).get("psnr")
     except InputError:
         return f"{record.FILE_NAME} is not valid"
     return f"no PSNR on {split}" if psnr is None else f"{psnr:.2f} dB PSNR on {split}"

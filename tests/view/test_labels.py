@@ -71,8 +71,11 @@ def test_a_label_says_what_was_measured(run, tmp_path):
     plain["metrics"]["psnr"], plain["missing"]["psnr"] = None, "not a number"
     copy.write_text(json.dumps(plain))
     assert measurements(interrupted)[0] == "no PSNR on test"
-    copy.write_text("{}")
-    assert measurements(interrupted)[0] == "record.json is not valid"
+    plain["metrics"]["psnr"] = 99.0  # not the mean of its views
+    del plain["missing"]["psnr"]
+    for text in ("{}", json.dumps(plain)):
+        copy.write_text(text)
+        assert measurements(interrupted)[0] == "record.json is not valid"
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
