@@ -79,6 +79,10 @@ def test_wrong_images_are_refused_in_a_line(spoil, words, views, tmp_path):
         (np.float32(255) * FLOATS, "expected values in [0, 1], their mean is 128"),
         (FLOATS - np.linspace(0, 1.5, 3, dtype=np.float32), "their least -1: scale them"),
         (FLOATS * np.float32([1, 1, np.nan]), "their mean is nan"),
+        (
+            np.pad(FLOATS, ((0, 0), (0, 0), (0, 1)), constant_values=np.nan),
+            "expected values in [0, 1], their mean is 0.5",
+        ),
         (BYTES, "expected floats [H, W, 3] or [H, W, 4], got uint8"),
         (FLOATS[..., 0], "expected floats [H, W, 3]"),
         (np.array([{}]), "expected an array of numpy"),
