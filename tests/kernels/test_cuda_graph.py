@@ -115,19 +115,9 @@ def test_too_little_room_is_counted(N, room, device):
     at, fitted = camera(device), large("4dgs", device)
     with torch.no_grad():
         means, factors, opacities, colors, _ = fitted.slice(CameraTime.at(at.center, 0.4))
-        drawing = enqueue(
-            RasterInputs(
-                means[:N],
-                factors[:N],
-                opacities[:N],
-                colors[None, :N],
-                at.viewmat[None],
-                at.K[None],
-                torch.tensor(BACKGROUND, device=device),
-            ),
-            Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False),
-            room,
-        )
+        gaussians = (means[:N], factors[:N], opacities[:N], colors[None, :N])
+        inputs = RasterInputs(*gaussians, at.viewmat[None], at.K[None], torch.tensor(BACKGROUND, device=device))
+        drawing = enqueue(inputs, Viewport(at.width, at.height, NEAR, FAR, EPS2D, antialias=False), room)
     pairs, flags = drawing.needed.tolist()
     assert flags == 0
     bad = ~drawing.image.isfinite()

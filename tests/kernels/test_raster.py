@@ -234,19 +234,9 @@ def test_gradients_at_the_rim_are_those_of_the_held_profile():
     for backend in ("cpu", "reference"):
         factor = torch.diag(torch.tensor([1.0, 1, 0]))[None].requires_grad_()
         exponents = torch.tensor([0.2], requires_grad=True)
-        out = rasterize(
-            torch.tensor([[0.0, 0, 1]]),
-            factor,
-            torch.ones(1),
-            torch.ones(1, 1),
-            torch.eye(4).repeat(4, 1, 1),
-            Ks,
-            1,
-            1,
-            eps2d=0.0,
-            beta_exponents=exponents,
-            backend=backend,
-        )
+        gaussian = (torch.tensor([[0.0, 0, 1]]), factor, torch.ones(1), torch.ones(1, 1))
+        view = (torch.eye(4).repeat(4, 1, 1), Ks, 1, 1)
+        out = rasterize(*gaussian, *view, eps2d=0.0, beta_exponents=exponents, backend=backend)
         slopes = [torch.autograd.grad(x, (factor, exponents), retain_graph=True) for x in out.alpha.flatten()]
         gradients.append((out.alpha.detach().flatten(), *map(torch.stack, zip(*slopes, strict=True))))
     for got, want in zip(*gradients, strict=True):

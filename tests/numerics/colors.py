@@ -81,18 +81,10 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
             gradient = torch.cat([gradient[:, :4], gradient[:, 4:] @ along[:, None]], 1)
             bad = ~(got.isfinite().all(1) & gradient.isfinite().all(1))
             ms = fastest(partial(differentiate, inputs, backend, weight, COPIES))
-            yield Cell(
-                case.area,
-                case.name,
-                model,
-                "-",
-                backend,
-                worst((got - color).abs() / color.max().clamp(min=1)),
-                worst((gradient - slope).norm(dim=1) / slope.norm(dim=1)),
-                float(bad.double().mean()),
-                ms,
-                case.bound,
-            )
+            forward = worst((got - color).abs() / color.max().clamp(min=1))
+            backward = worst((gradient - slope).norm(dim=1) / slope.norm(dim=1))
+            bad_share = float(bad.double().mean())
+            yield Cell(case.area, case.name, model, "-", backend, forward, backward, bad_share, ms, case.bound)
 
 
 def truth(inputs: ColorInputs, weight: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:

@@ -283,19 +283,10 @@ def judge(case: Case, backends: list[str]) -> Iterator[Cell]:
         errors = [compare(a, exact, backend) for a, exact in zip(pictures, truths, strict=True)]
         forward, gradient, bad = (torch.tensor(x, dtype=torch.float64) for x in zip(*errors, strict=True))
         drawn = sum(int((exact[1] > 0).any()) for exact in truths)
-        yield Cell(
-            case.area,
-            case.name,
-            "-",
-            "-",
-            backend,
-            worst(forward),
-            worst(gradient) if truths[0][3] else float("nan"),
-            float(bad.mean()),
-            fastest(partial(_all, pictures, backend)),
-            case.bound,
-            f"{drawn} of {len(pictures)} images not empty",
-        )
+        slope = worst(gradient) if truths[0][3] else float("nan")
+        measured = (worst(forward), slope, float(bad.mean()), fastest(partial(_all, pictures, backend)))
+        note = f"{drawn} of {len(pictures)} images not empty"
+        yield Cell(case.area, case.name, "-", "-", backend, *measured, case.bound, note)
 
 
 def _all(pictures: list[Arguments], backend: str) -> None:

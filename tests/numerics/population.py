@@ -87,21 +87,9 @@ def hard_slices(order: str, N: int, backends: list[str]) -> tuple[list[Cell], fl
             start = time.perf_counter()
             errors = judge(hard.rows(slice(count)), exact, order, scheme, backend)
             ms = 1e3 * (time.perf_counter() - start)
-            cells.append(
-                Cell(
-                    "population",
-                    f"hard_slices_{order}",
-                    "7dgs",
-                    scheme,
-                    backend,
-                    percentile(errors.cov),
-                    percentile(errors.gradient),
-                    float(errors.bad.mean()),
-                    ms,
-                    Bound(),
-                    f"{count} slices",
-                )
-            )
+            at = ("population", f"hard_slices_{order}", "7dgs", scheme, backend)
+            measured = (percentile(errors.cov), percentile(errors.gradient), float(errors.bad.mean()), ms)
+            cells.append(Cell(*at, *measured, Bound(), f"{count} slices"))
     return cells, verify(hard, order)
 
 

@@ -502,19 +502,9 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES, cop
                 gaussians, raw = load(observed, scheme, backend, copies)
                 weights = exact.weights.repeat(copies, 1)
                 ms = fastest(functools.partial(differentiate, gaussians, raw, observed, weights))
-                yield Cell(
-                    case.area,
-                    case.name,
-                    model,
-                    scheme,
-                    backend,
-                    worst(errors.forward),
-                    worst(errors.gradient),
-                    bad.double().mean().item(),
-                    ms,
-                    case.bound,
-                    f"{int(errors.drawn.sum())} of {COUNT} drawn",
-                )
+                at = (case.area, case.name, model, scheme, backend)
+                measured = (worst(errors.forward), worst(errors.gradient), bad.double().mean().item(), ms)
+                yield Cell(*at, *measured, case.bound, f"{int(errors.drawn.sum())} of {COUNT} drawn")
 
 
 def truth(observed: Observed) -> SliceTruth:

@@ -89,16 +89,9 @@ def seen_by_no_view(g: Generator, severity: float, model: str) -> Training:
 @case("training", "7dgs", **ENDS)
 def reset_into_refinement(g: Generator, severity: float, model: str) -> Training:
     """Reset opacities just before AGR (neural refinement) starts, with 100 times the usual learning rate of AGR."""
-    config = compose(
-        model,
-        2 * STEPS,
-        "train.recipe_iterations=300",
-        "train.densify.start=20",
-        "train.densify.reset_every=100",
-        "train.densify.stop=500",
-        "train.refine_from=100",
-        "train.batch_size=1",
-    )
+    densify = ("train.densify.start=20", "train.densify.reset_every=100", "train.densify.stop=500")
+    rest = ("train.recipe_iterations=300", "train.refine_from=100", "train.batch_size=1")
+    config = compose(model, 2 * STEPS, *densify, *rest)
     config.model.lr["refinement"].start *= 100**severity
     return Training(model, config, moving_square())
 

@@ -212,19 +212,10 @@ def assert_beta_vector(backend: str, dtype: torch.dtype, tolerance: float) -> No
         A, B, C, shape = (torch.tensor(x, dtype=dtype, requires_grad=True) for x in (0.02, 0.005, 0.03, 2.5))
         covariance = torch.linalg.inv(torch.stack([A, B, B, C]).view(2, 2))  # pixels^2
         factor = torch.nn.functional.pad(torch.linalg.cholesky(covariance), (0, 1, 0, 1))
-        drawn = rasterize(
-            torch.tensor([[0.0, 0, 1]], dtype=dtype, requires_grad=True),
-            factor[None],
-            torch.tensor([0.7], dtype=dtype),
-            torch.ones(1, 1, dtype=dtype),
-            torch.eye(4, dtype=dtype)[None],
-            intrinsics(1, 1, 5.5, 2.5)[None].to(dtype),
-            8,
-            8,
-            eps2d=0.0,
-            backend=backend,
-            beta_exponents=shape[None],
-        )
+        mean, opacity = torch.tensor([[0.0, 0, 1]], dtype=dtype, requires_grad=True), torch.tensor([0.7], dtype=dtype)
+        gaussian = (mean, factor[None], opacity, torch.ones(1, 1, dtype=dtype))
+        view = (torch.eye(4, dtype=dtype)[None], intrinsics(1, 1, 5.5, 2.5)[None].to(dtype), 8, 8)
+        drawn = rasterize(*gaussian, *view, eps2d=0.0, backend=backend, beta_exponents=shape[None])
     alpha, means2d = drawn.alpha[0, 4, 2, 0], drawn.info.means2d  # the mean minus the centre of this pixel is (3, -2)
     slopes = torch.autograd.grad(alpha, (A, B, means2d, shape))
     got = [alpha, slopes[0], slopes[1], slopes[2][0, 0, 0], slopes[3], (drawn.info.half_sizes[0, 0, 0] - 0.01) ** 2]
