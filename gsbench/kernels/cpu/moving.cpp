@@ -12,8 +12,6 @@ namespace gsb {
 inline namespace GSB_ISA {
 namespace {
 
-constexpr int64_t FEW = 512;  // Gaussians that are not worth a second thread
-
 template <class T>
 using Beta3 = DirectBetaGaussian<T, 3>;  // without time
 template <class T>
@@ -34,33 +32,27 @@ template <template <class> class Model, class Args, class Slice>
 void slice(const Args& a, const Slice& out) {
     using Gaussian = Model<Vec>;
     const ViewPoint view = view_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > FEW)
-    for (int64_t i = 0; i < a.conditioned; i += LANES) {
-        const int n = lanes_from(i, a.conditioned);
+    each_sixteen(0, a.conditioned, a.threads, [&](int64_t i, int n) {
         typename Gaussian::Parameters raw;
         raw.each(a, LoadRows{i, n});
         raw.still.opacity = load_first(a.opacities + i, n);
         store(Gaussian(raw, view).observe(), out, i, n);
-    }
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > FEW)
-    for (int64_t i = a.conditioned; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
+    });
+    each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
         typename Gaussian::StillParameters raw;
         raw.each(a, LoadRows{i, n});
         raw.opacity = load_first(a.opacities + i, n);
         copy_rows(a.means, out.means, 3, i, i + n);
         store_still(typename Gaussian::Still(raw), out, i, n);
-    }
+    });
 }
 
 template <template <class> class Model, class Args, class Given, class Grads>
 void slice_backward(const Args& a, const Given& grads, const Grads& out) {
     using Gaussian = Model<Vec>;
     const ViewPoint view = view_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > FEW)
-    for (int64_t i = 0; i < a.conditioned; i += LANES) {
-        const int n = lanes_from(i, a.conditioned);
-        if (is_zero(grads, i, n)) continue;
+    each_sixteen(0, a.conditioned, a.threads, [&](int64_t i, int n) {
+        if (is_zero(grads, i, n)) return;
         typename Gaussian::Parameters raw, g;
         typename Gaussian::Seen given;
         raw.each(a, LoadRows{i, n});
@@ -69,11 +61,9 @@ void slice_backward(const Args& a, const Given& grads, const Grads& out) {
         Gaussian(raw, view).vjp(given, g);
         g.each(out, AddRows{i, n});
         add_first(g.still.opacity, out.opacities + i, n);
-    }
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > FEW)
-    for (int64_t i = a.conditioned; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
-        if (is_zero(grads, i, n)) continue;
+    });
+    each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
+        if (is_zero(grads, i, n)) return;
         typename Gaussian::StillParameters raw, g;
         typename Gaussian::Seen given;
         raw.each(a, LoadRows{i, n});
@@ -83,7 +73,7 @@ void slice_backward(const Args& a, const Given& grads, const Grads& out) {
         g.each(out, AddRows{i, n});
         add_first(g.opacity, out.opacities + i, n);
         add_row(given.mean, out.means, i, n);
-    }
+    });
 }
 
 }  // namespace

@@ -3,6 +3,7 @@
 
 #include "../math/beta_slice.h"
 
+#include "buffer.h"
 #include "rows.h"
 
 namespace gsb {
@@ -38,6 +39,26 @@ GSB_HD inline void load(const BetaSliceGrads& given, int64_t i, int n, ObservedB
 GSB_HD inline bool is_zero(const BetaSliceGrads& given, int64_t i, int n) {
     return is_zero(ObservationGrads{given.means, given.factors, given.opacities}, i, n) &&
            all_zero(given.shapes, 1, i, n);
+}
+
+// As each_sixteen(0, end, ...), calls f(i, n, sums), which adds to COUNT sums. Their `totals` do not depend on the number
+// of threads, because each task has its own sums.
+template <int COUNT, class F>
+void sum_sixteens(int64_t end, int threads, double (&totals)[COUNT], F f) {
+    const int64_t tasks = (end + FEW - 1) / FEW;
+    Buffer<float> parts(static_cast<size_t>(tasks * COUNT));
+#pragma omp parallel for num_threads(threads) schedule(static) if (tasks > 1)
+    for (int64_t task = 0; task < tasks; ++task) {
+        const int64_t last = (task + 1) * FEW < end ? (task + 1) * FEW : end;
+        Vec sums[COUNT];
+        for (Vec& x : sums) x = Vec(0.0f);
+        for (int64_t i = task * FEW; i < last; i += LANES) f(i, lanes_from(i, last), sums);
+        for (int k = 0; k < COUNT; ++k) parts[static_cast<size_t>(task * COUNT + k)] = sum(sums[k]);
+    }
+    for (int k = 0; k < COUNT; ++k) {
+        totals[k] = 0.0;
+        for (int64_t task = 0; task < tasks; ++task) totals[k] += parts[static_cast<size_t>(task * COUNT + k)];
+    }
 }
 
 }  // namespace GSB_ISA

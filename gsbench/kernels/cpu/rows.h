@@ -128,6 +128,15 @@ GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {
     return true;
 }
 
+constexpr int64_t FEW = 512;  // rows that are not worth a second thread
+
+// Calls f(i, n) for each group of rows i to i + n - 1 of [first, end): sixteen, or what is left of them.
+template <class F>
+void each_sixteen(int64_t first, int64_t end, int threads, F f) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (end - first > FEW)
+    for (int64_t i = first; i < end; i += LANES) f(i, lanes_from(i, end));
+}
+
 // Copies the rows [first, end). An array without rows has no address, which memcpy and memset do not accept.
 GSB_HD inline void copy_rows(const float* from, float* to, int width, int64_t first, int64_t end) {
     if (first == end) return;

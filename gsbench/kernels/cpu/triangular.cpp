@@ -3,15 +3,12 @@
 #include "../math/static_triangular.h"
 #include "../math/triangular.h"
 
-#include "buffer.h"
 #include "isa.h"
 #include "observation.h"
 
 namespace gsb {
 inline namespace GSB_ISA {
 namespace {
-
-constexpr int64_t CHUNK = 512;  // Gaussians a task; the gradients of lambda are summed by chunks
 
 TriangularModel model_of(const TriangularArgs& a) {
     return {a.conditioned_first, a.form, a.half, a.directions ? expf(*a.log_lambda_d) : 0.0f,
@@ -21,47 +18,34 @@ TriangularModel model_of(const TriangularArgs& a) {
 template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.conditioned > CHUNK)
-    for (int64_t i = 0; i < a.conditioned; i += LANES) {
-        const int n = lanes_from(i, a.conditioned);
+    each_sixteen(0, a.conditioned, a.threads, [&](int64_t i, int n) {
         TriangularParameters<Vec, Q> raw;
         raw.each(a, LoadRows{i, n});
         raw.opacity = load_first(a.opacities + i, n);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
         store(gaussian.observe(), out, i, n);
-    }
+    });
 }
 
 template <Query Q, template <class, int> class Reduction>
 void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const TriangularModel model = model_of(a);
-    const int64_t chunks = (a.conditioned + CHUNK - 1) / CHUNK;
-    Buffer<float> lambdas(static_cast<size_t>(chunks) * 2);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (chunks > 1)
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-        const int64_t end = (chunk + 1) * CHUNK < a.conditioned ? (chunk + 1) * CHUNK : a.conditioned;
-        Vec lambda_d(0.0f), lambda_t(0.0f);
-        for (int64_t i = chunk * CHUNK; i < end; i += LANES) {
-            const int n = lanes_from(i, end);
-            if (is_zero(grads, i, n)) continue;
-            TriangularParameters<Vec, Q> raw, g;
-            Observed<Vec> given;
-            raw.each(a, LoadRows{i, n});
-            raw.opacity = load_first(a.opacities + i, n);
-            load(grads, i, n, given);
-            TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
-            gaussian.observe();
-            gaussian.vjp(given, g);
-            g.each(out, AddRows{i, n});
-            add_first(g.opacity, out.opacities + i, n);
-            lambda_d += g.lambda_d;  // lanes past the end were given zero
-            lambda_t += g.lambda_t;
-        }
-        lambdas[static_cast<size_t>(chunk) * 2] = sum(lambda_d);
-        lambdas[static_cast<size_t>(chunk) * 2 + 1] = sum(lambda_t);
-    }
-    double totals[2] = {};
-    for (size_t k = 0; k < static_cast<size_t>(chunks) * 2; ++k) totals[k % 2] += lambdas[k];
+    double totals[2];
+    sum_sixteens(a.conditioned, a.threads, totals, [&](int64_t i, int n, Vec (&lambdas)[2]) {
+        if (is_zero(grads, i, n)) return;
+        TriangularParameters<Vec, Q> raw, g;
+        Observed<Vec> given;
+        raw.each(a, LoadRows{i, n});
+        raw.opacity = load_first(a.opacities + i, n);
+        load(grads, i, n, given);
+        TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
+        gaussian.observe();
+        gaussian.vjp(given, g);
+        g.each(out, AddRows{i, n});
+        add_first(g.opacity, out.opacities + i, n);
+        lambdas[0] += g.lambda_d;  // lanes past the end were given zero
+        lambdas[1] += g.lambda_t;
+    });
     if (a.directions) *out.log_lambda_d = static_cast<float>(totals[0]) * model.lambda_d;
     if (a.times) *out.log_lambda_t = static_cast<float>(totals[1]) * model.lambda_t;
 }
@@ -79,48 +63,33 @@ struct StaticRows {
         gather_row(a.shape, i, n, p.shape);
         p.opacity = load_first(a.opacities + i, n);
     }
-
-    // Calls f(first, end) for tasks of at most CHUNK rows.
-    template <class F>
-    void each_chunk(F f) const {
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N - a.conditioned > CHUNK)
-        for (int64_t first = a.conditioned; first < a.N; first += CHUNK) {
-            f(first, first + CHUNK < a.N ? first + CHUNK : a.N);
-        }
-    }
 };
 
 void slice_static_rows(const TriangularArgs& a, const Observation& out) {
     const StaticRows rows(a);
-    rows.each_chunk([&](int64_t first, int64_t end) {
-        copy_rows(a.means, out.means, 3, first, end);
-        for (int64_t i = first; i < end; i += LANES) {
-            const int n = lanes_from(i, end);
-            StaticTriangularParameters<Vec> raw;
-            rows.load(i, n, raw);
-            const StaticTriangularGaussian<Vec> seen(raw, a.form);
-            scatter_matrix(seen.factor, out.factors, i, n);
-            store_first(seen.opacity, out.opacities + i, n);
-        }
+    each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
+        StaticTriangularParameters<Vec> raw;
+        rows.load(i, n, raw);
+        const StaticTriangularGaussian<Vec> seen(raw, a.form);
+        copy_rows(a.means, out.means, 3, i, i + n);
+        scatter_matrix(seen.factor, out.factors, i, n);
+        store_first(seen.opacity, out.opacities + i, n);
     });
 }
 
 void slice_static_rows_backward(const TriangularArgs& a, const ObservationGrads& grads, const TriangularGrads& out) {
     const StaticRows rows(a);
-    rows.each_chunk([&](int64_t first, int64_t end) {
-        for (int64_t i = first; i < end; i += LANES) {
-            const int n = lanes_from(i, end);
-            if (is_zero(grads, i, n)) continue;
-            StaticTriangularParameters<Vec> raw, g;
-            Observed<Vec> given;
-            rows.load(i, n, raw);
-            load(grads, i, n, given);
-            StaticTriangularGaussian<Vec>(raw, a.form).vjp(given.factor, given.opacity, g);
-            add_row(given.mean, out.means, i, n);
-            add_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
-            add_row(g.shape, out.shape, i, n);
-            add_first(g.opacity, out.opacities + i, n);
-        }
+    each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
+        if (is_zero(grads, i, n)) return;
+        StaticTriangularParameters<Vec> raw, g;
+        Observed<Vec> given;
+        rows.load(i, n, raw);
+        load(grads, i, n, given);
+        StaticTriangularGaussian<Vec>(raw, a.form).vjp(given.factor, given.opacity, g);
+        add_row(given.mean, out.means, i, n);
+        add_columns(g.log_diagonal, out.log_diagonal, rows.width, rows.space, i, n);
+        add_row(g.shape, out.shape, i, n);
+        add_first(g.opacity, out.opacities + i, n);
     });
 }
 

@@ -11,24 +11,20 @@ namespace {
 template <bool TIME>
 void observe(const UniversalArgs& a, const BetaSlice& out) {
     const ViewPoint view = view_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 512)
-    for (int64_t i = 0; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
+    each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
         UniversalParameters<Vec, TIME> raw;
         raw.each(a, LoadRows{i, n});
         raw.opacity = load_first(a.opacities + i, n);
         UniversalGaussian<Vec, TIME> gaussian(view, raw);
         store(gaussian.observe(), out, i, n);
-    }
+    });
 }
 
 template <bool TIME>
 void observe_backward(const UniversalArgs& a, const BetaSliceGrads& grads, const UniversalGrads& out) {
     const ViewPoint view = view_of(a);
-#pragma omp parallel for num_threads(a.threads) schedule(static) if (a.N > 512)
-    for (int64_t i = 0; i < a.N; i += LANES) {
-        const int n = lanes_from(i, a.N);
-        if (is_zero(grads, i, n)) continue;
+    each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
+        if (is_zero(grads, i, n)) return;
         UniversalParameters<Vec, TIME> raw, g;
         ObservedBeta<Vec> given;
         raw.each(a, LoadRows{i, n});
@@ -39,7 +35,7 @@ void observe_backward(const UniversalArgs& a, const BetaSliceGrads& grads, const
         gaussian.vjp(given, g);
         g.each(out, AddRows{i, n});
         add_first(g.opacity, out.opacities + i, n);
-    }
+    });
 }
 
 }  // namespace
