@@ -99,6 +99,10 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
     print(printable(_matching(renders, views)))
     check_folder(folder)
     measured = measure_images(views, renders.images(), scene.background, config)
+    # In what the images depart from those that gsbench renders: settings of which tables warn.
+    departures: dict[str, Any] = {"images": renders.facts.kind}
+    if renders.facts.resized_from is not None:
+        departures["reduced"] = f"from {renders.facts.resized_from}, mean of areas"
     record = Record(
         status="ok",
         reason=None,
@@ -108,7 +112,7 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
         dataset=config.data.dataset,
         seed=config.seed,
         effects=None,
-        protocol=protocol_of(config, scene) | _departures(renders),
+        protocol=protocol_of(config, scene) | departures,
         provenance=provenance({key: spec.plain[key] for key in RECORDED}, scene, config.device),
         metrics=measured.metrics | dict.fromkeys(drift.NAMES),
         missing=measured.missing | dict.fromkeys(drift.NAMES, "needs the Gaussians, not their images"),
@@ -183,15 +187,6 @@ def _matching(renders: CheckedRenders, views: Sequence[View]) -> str:
     text = f"{len(pairs)} images ({renders.facts.kind}), matched to the views by {renders.facts.matched}: "
     others = f"; not read: {', '.join(renders.others[:NAMED])}" if renders.others else ""
     return text + ", ".join(shown) + others
-
-
-def _departures(renders: CheckedRenders) -> dict[str, Any]:
-    """Return in what the images depart from those that gsbench renders, as settings of which tables warn."""
-    facts = renders.facts
-    departures: dict[str, Any] = {"images": facts.kind}
-    if facts.resized_from is not None:
-        departures["reduced"] = f"from {facts.resized_from}, mean of areas"
-    return departures
 
 
 def other_metrics(views: Sequence[View], renders: CheckedRenders) -> dict[str, float]:

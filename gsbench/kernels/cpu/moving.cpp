@@ -39,9 +39,7 @@ void slice(const Args& a, const Slice& out) {
         store(Gaussian(raw, view).observe(), out, i, n);
     });
     each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
-        typename Gaussian::StillParameters raw;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
+        const auto raw = load_raw<typename Gaussian::StillParameters>(a, i, n);
         copy_rows(a.means, out.means, 3, i, i + n);
         store_still(typename Gaussian::Still(raw), out, i, n);
     });
@@ -64,10 +62,9 @@ void slice_backward(const Args& a, const Given& grads, const Grads& out) {
     });
     each_sixteen(a.conditioned, a.N, a.threads, [&](int64_t i, int n) {
         if (is_zero(grads, i, n)) return;
-        typename Gaussian::StillParameters raw, g;
+        const auto raw = load_raw<typename Gaussian::StillParameters>(a, i, n);
+        typename Gaussian::StillParameters g;
         typename Gaussian::Seen given;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
         load(grads, i, n, given);
         still_vjp(typename Gaussian::Still(raw), given, g);
         g.each(out, AddRows{i, n});

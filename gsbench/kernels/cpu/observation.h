@@ -41,8 +41,8 @@ GSB_HD inline bool is_zero(const BetaSliceGrads& given, int64_t i, int n) {
            all_zero(given.shapes, 1, i, n);
 }
 
-// As each_sixteen(0, end, ...), calls f(i, n, sums), which adds to COUNT sums. Their `totals` do not depend on the number
-// of threads, because each task has its own sums.
+// Calls f(i, n, sums) as each_sixteen(0, end, threads, f) does; f adds to COUNT sums. Their totals do not depend on the
+// number of threads, because each task has its own sums.
 template <int COUNT, class F>
 void sum_sixteens(int64_t end, int threads, double (&totals)[COUNT], F f) {
     const int64_t tasks = (end + FEW - 1) / FEW;

@@ -13,9 +13,8 @@ namespace {
 // Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
 // unit.
 GSB_HD inline void load(const RotatedArgs& a, int64_t i, int n, RotatedParameters<Vec>& p) {
-    p.each(a, LoadRows{i, n});
+    p = load_raw<RotatedParameters<Vec>>(a, i, n);
     p.time = p.time * *a.clock;
-    p.opacity = load_first(a.opacities + i, n);
     if (n == LANES) return;
     const Mask real = Vec::load(INDEX) < Vec(static_cast<float>(n));  // what is no Gaussian gets harmless quaternions
     p.left[0] = select(real, p.left[0], Vec(1.0f));

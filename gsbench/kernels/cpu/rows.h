@@ -116,6 +116,15 @@ struct AddRows {
     }
 };
 
+// Loads the raw parameters of Gaussians i to i + n - 1.
+template <class Parameters, class Args>
+GSB_HD inline Parameters load_raw(const Args& a, int64_t i, int n) {
+    Parameters raw;
+    raw.each(a, LoadRows{i, n});
+    raw.opacity = load_first(a.opacities + i, n);
+    return raw;
+}
+
 // Returns whether rows i to i + n - 1 of `width` floats are all zero; if a given gradient is zero, the result is zero
 // too.
 GSB_HD inline bool all_zero(const float* rows, int width, int64_t i, int n) {

@@ -67,6 +67,13 @@ GSB_HD inline Vec round(Vec x) {
 
 GSB_HD inline Vec load_first(const float* p, int n) { return n == LANES ? Vec::load(p) : gather(p, 1, n); }
 
+// Stores the first n lanes to p[offsets[lane]], as `gather_rows` loads them.
+GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) {
+    alignas(64) float lane[LANES];
+    x.store(lane);
+    for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
+}
+
 // Computes log2 by the series of atanh on mantissas in [0.75, 1.5), with relative error 1e-7 unless the result is near
 // zero.
 GSB_HD inline Vec log2(Vec x) {

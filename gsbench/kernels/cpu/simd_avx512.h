@@ -141,11 +141,6 @@ GSB_HD inline Vec gather_rows(const float* p, const int32_t* offsets, int n) {
     if (n == LANES) return collect([&](int i) { return p[offsets[i]]; });
     return collect([&](int i) { return i < n ? p[offsets[i]] : 0.0f; });
 }
-GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) {
-    alignas(64) float lane[LANES];
-    x.store(lane);
-    for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
-}
 
 // Returns the vector whose lane i is lane from[i] of x; `from` is aligned.
 GSB_HD inline Vec permute(Vec x, const int32_t* from) {

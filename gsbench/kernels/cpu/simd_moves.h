@@ -14,13 +14,6 @@
 namespace gsb {
 inline namespace GSB_ISA {
 
-// Stores the first n lanes to p[offsets[lane]].
-GSB_HD inline void scatter_rows(Vec x, float* p, const int32_t* offsets, int n) {
-    alignas(64) float lane[LANES];
-    x.store(lane);
-    for (int i = 0; i < n; ++i) p[offsets[i]] = lane[i];
-}
-
 // Loads p[by] .. p[by + 15] with |by| < 16, from an aligned p.
 template <int by>
 GSB_HD inline Vec load_beside(const float* p) {

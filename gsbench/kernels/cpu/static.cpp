@@ -9,9 +9,7 @@ inline namespace GSB_ISA {
 
 void slice_static(const StaticArgs& a, const StaticSlice& out) {
     each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
-        StaticParameters<Vec> raw;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
+        const auto raw = load_raw<StaticParameters<Vec>>(a, i, n);
         const StaticGaussian<Vec> seen(raw);
         scatter_matrix(seen.factor, out.factors, i, n);
         store_first(seen.opacity, out.opacities + i, n);
@@ -21,10 +19,9 @@ void slice_static(const StaticArgs& a, const StaticSlice& out) {
 void slice_static_backward(const StaticArgs& a, const StaticSliceGrads& grads, const StaticGrads& out) {
     each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
         if (all_zero(grads.opacities, 1, i, n) && all_zero(grads.factors, 9, i, n)) return;
-        StaticParameters<Vec> raw, g;
+        const auto raw = load_raw<StaticParameters<Vec>>(a, i, n);
+        StaticParameters<Vec> g;
         Vec g_factor[3][3];
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
         gather_matrix(grads.factors, i, n, g_factor);
         StaticGaussian<Vec>(raw).vjp(g_factor, load_first(grads.opacities + i, n), g);
         g.each(out, AddRows{i, n});

@@ -19,9 +19,7 @@ template <Query Q, template <class, int> class Reduction>
 void observe(const TriangularArgs& a, const Observation& out) {
     const TriangularModel model = model_of(a);
     each_sixteen(0, a.conditioned, a.threads, [&](int64_t i, int n) {
-        TriangularParameters<Vec, Q> raw;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
+        const auto raw = load_raw<TriangularParameters<Vec, Q>>(a, i, n);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
         store(gaussian.observe(), out, i, n);
     });
@@ -33,10 +31,9 @@ void observe_backward(const TriangularArgs& a, const ObservationGrads& grads, co
     double totals[2];
     sum_sixteens(a.conditioned, a.threads, totals, [&](int64_t i, int n, Vec (&lambdas)[2]) {
         if (is_zero(grads, i, n)) return;
-        TriangularParameters<Vec, Q> raw, g;
+        const auto raw = load_raw<TriangularParameters<Vec, Q>>(a, i, n);
+        TriangularParameters<Vec, Q> g;
         Observed<Vec> given;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
         load(grads, i, n, given);
         TriangularGaussian<Vec, Q, Reduction> gaussian(model, raw);
         gaussian.observe();

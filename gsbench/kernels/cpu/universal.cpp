@@ -12,9 +12,7 @@ template <bool TIME>
 void observe(const UniversalArgs& a, const BetaSlice& out) {
     const ViewPoint view = view_of(a);
     each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
-        UniversalParameters<Vec, TIME> raw;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
+        const auto raw = load_raw<UniversalParameters<Vec, TIME>>(a, i, n);
         UniversalGaussian<Vec, TIME> gaussian(view, raw);
         store(gaussian.observe(), out, i, n);
     });
@@ -25,10 +23,9 @@ void observe_backward(const UniversalArgs& a, const BetaSliceGrads& grads, const
     const ViewPoint view = view_of(a);
     each_sixteen(0, a.N, a.threads, [&](int64_t i, int n) {
         if (is_zero(grads, i, n)) return;
-        UniversalParameters<Vec, TIME> raw, g;
+        const auto raw = load_raw<UniversalParameters<Vec, TIME>>(a, i, n);
+        UniversalParameters<Vec, TIME> g;
         ObservedBeta<Vec> given;
-        raw.each(a, LoadRows{i, n});
-        raw.opacity = load_first(a.opacities + i, n);
         load(grads, i, n, given);
         UniversalGaussian<Vec, TIME> gaussian(view, raw);
         gaussian.observe();

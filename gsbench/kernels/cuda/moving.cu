@@ -23,9 +23,7 @@ __global__ void slice_kernel(Args a, Slice out) {
     for (int64_t view = 0; view < a.V; ++view) {
         const int64_t row = raw_row(a, view, i), at = view * a.N + i;
         if (i >= a.conditioned) {
-            typename Gaussian::StillParameters raw{};
-            raw.each(a, LoadRow{row});
-            raw.opacity = a.opacities[i];
+            const auto raw = load_raw<typename Gaussian::StillParameters>(a, row, i);
             store_static(typename Gaussian::Still(raw), a.means, row, out, at);
             continue;
         }
@@ -47,9 +45,7 @@ __global__ void slice_backward_kernel(Args a, Given grads, Grads out) {
         const typename Gaussian::Seen given = load_observed(grads, view * a.N + i);
         typename Gaussian::Parameters g{};  // of a static row mostly zero
         if (i >= a.conditioned) {
-            typename Gaussian::StillParameters raw{};
-            raw.each(a, LoadRow{row});
-            raw.opacity = a.opacities[i];
+            const auto raw = load_raw<typename Gaussian::StillParameters>(a, row, i);
             still_vjp(typename Gaussian::Still(raw), given, g.still);
             GSB_UNROLL for (int k = 0; k < 3; ++k) g.mean[k] = given.mean[k];
         } else {

@@ -11,10 +11,8 @@ namespace {
 // Times are multiplied by `clock` (world units per sequence length), because a rotation of space and time needs one
 // unit.
 __device__ RotatedParameters<float> parameters(const RotatedArgs& a, int64_t row, int64_t i) {
-    RotatedParameters<float> p{};
-    p.each(a, LoadRow{row});
+    RotatedParameters<float> p = load_raw<RotatedParameters<float>>(a, row, i);
     p.time *= *a.clock;
-    p.opacity = a.opacities[i];
     return p;
 }
 

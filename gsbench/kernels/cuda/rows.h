@@ -56,6 +56,15 @@ __device__ int64_t raw_row(const Args& a, int64_t view, int64_t i) {
     return a.raw_per_view ? view * a.N + i : i;
 }
 
+// Loads the raw parameters of Gaussian i from row `row` of all arrays but that of the opacities, which views share.
+template <class Parameters, class Args>
+__device__ Parameters load_raw(const Args& a, int64_t row, int64_t i) {
+    Parameters raw{};
+    raw.each(a, LoadRow{row});
+    raw.opacity = a.opacities[i];
+    return raw;
+}
+
 // Adds the numbers of a structure that consists of floats.
 template <class Parameters>
 __device__ void accumulate(Parameters& sum, const Parameters& x) {

@@ -6,18 +6,11 @@
 namespace gsb::cuda {
 namespace {
 
-__device__ StaticParameters<float> parameters(const StaticArgs& a, int64_t row, int64_t i) {
-    StaticParameters<float> p{};
-    p.each(a, LoadRow{row});
-    p.opacity = a.opacities[i];
-    return p;
-}
-
 __global__ void static_kernel(StaticArgs a, StaticSlice out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t row = i; row < a.V * a.N; row += a.N) {
-        const StaticParameters<float> raw = parameters(a, row, i);
+        const auto raw = load_raw<StaticParameters<float>>(a, row, i);
         const StaticGaussian<float> seen(raw);
         store_matrix(seen.factor, out.factors, row);
         out.opacities[row] = seen.opacity;
@@ -29,7 +22,7 @@ __global__ void static_backward_kernel(StaticArgs a, StaticSliceGrads grads, Sta
     if (i >= a.N) return;
     float g_opacity = 0.0f;
     for (int64_t row = i; row < a.V * a.N; row += a.N) {
-        const StaticParameters<float> raw = parameters(a, row, i);
+        const auto raw = load_raw<StaticParameters<float>>(a, row, i);
         StaticParameters<float> g{};
         float g_factor[3][3];
         load_matrix(grads.factors, row, g_factor);

@@ -20,14 +20,6 @@ __device__ TriangularModel model_of(const TriangularArgs& a, int64_t view) {
             P::TIME ? expf(*a.log_lambda_t) : 0.0f, {center[0], center[1], center[2]}, P::TIME ? a.time[view] : 0.0f};
 }
 
-template <Query Q>
-__device__ TriangularParameters<float, Q> parameters(const TriangularArgs& a, int64_t row, int64_t i) {
-    TriangularParameters<float, Q> p{};
-    p.each(a, LoadRow{row});
-    p.opacity = a.opacities[i];
-    return p;
-}
-
 // The first row of position in log_diagonal.
 template <Query Q, bool CONDITIONED>
 constexpr int SPACE = CONDITIONED ? TriangularParameters<float, Q>::K : 0;
@@ -55,7 +47,7 @@ __global__ void observe_kernel(TriangularArgs a, Observation out) {
             continue;
         }
         const TriangularModel model = model_of<Q, CONDITIONED>(a, view);
-        const auto raw = parameters<Q>(a, row, i);
+        const auto raw = load_raw<TriangularParameters<float, Q>>(a, row, i);
         const Observed<float> seen = TriangularGaussian<float, Q>(model, raw).observe();
         store_observed(seen, out, at);
     }
@@ -81,7 +73,7 @@ __global__ void observe_backward_kernel(TriangularArgs a, ObservationGrads grads
             g.opacity = g_static.opacity;
         } else {
             const TriangularModel model = model_of<Q, CONDITIONED>(a, view);
-            const auto raw = parameters<Q>(a, row, i);
+            const auto raw = load_raw<TriangularParameters<float, Q>>(a, row, i);
             TriangularGaussian<float, Q> gaussian(model, raw);
             gaussian.observe();
             gaussian.vjp(given, g);

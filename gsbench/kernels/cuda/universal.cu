@@ -8,20 +8,12 @@ namespace gsb::cuda {
 namespace {
 
 template <bool TIME>
-__device__ UniversalParameters<float, TIME> parameters(const UniversalArgs& a, int64_t row, int64_t i) {
-    UniversalParameters<float, TIME> p{};
-    p.each(a, LoadRow{row});
-    p.opacity = a.opacities[i];
-    return p;
-}
-
-template <bool TIME>
 __global__ void universal_kernel(UniversalArgs a, BetaSlice out) {
     const int64_t i = global_thread();
     if (i >= a.N) return;
     for (int64_t view = 0; view < a.V; ++view) {
         const ViewPoint from = view_of(a, view);
-        const auto raw = parameters<TIME>(a, raw_row(a, view, i), i);
+        const auto raw = load_raw<UniversalParameters<float, TIME>>(a, raw_row(a, view, i), i);
         store_observed(UniversalGaussian<float, TIME>(from, raw).observe(), out, view * a.N + i);
     }
 }
@@ -33,7 +25,7 @@ __global__ void universal_backward_kernel(UniversalArgs a, BetaSliceGrads grads,
     for (int64_t view = 0; view < a.V; ++view) {
         const int64_t row = raw_row(a, view, i);
         const ViewPoint from = view_of(a, view);
-        const auto raw = parameters<TIME>(a, row, i);
+        const auto raw = load_raw<UniversalParameters<float, TIME>>(a, row, i);
         UniversalParameters<float, TIME> g{};
         UniversalGaussian<float, TIME> gaussian(from, raw);
         gaussian.observe();
