@@ -91,6 +91,7 @@ def test_the_help_explains_keys(capsys):
         (["+exp=mini", "scene=suzanne,pendulum"], ["scene=suzanne,pendulum: commas", "\"scene='suzanne,pendulum'\""]),
         (["results/mini"], ["'results/mini': expected KEY=VALUE"]),
         (["Küche=1"], ["'Küche=1': expected KEY=VALUE"]),
+        (["=3"], ["'=3': expected KEY=VALUE"]),
         (["model=7dgs"], ["+exp=NAME", "ablation, colmap, dnerf, frontier", "mini, n3v, panoptic, pbr"]),
         (["+exp=dnerf", "scene=trex"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
         (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),

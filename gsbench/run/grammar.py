@@ -22,8 +22,8 @@ def check_override(word: str) -> None:
     key, _, text = word.partition("=")
     kind = facts(key.lstrip("+")).kind  # the type of the key's values
     read = _read(word)
-    if isinstance(read, HydraException):
-        if isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:  # with any value, it is no override
+    if isinstance(read, HydraException) or not key:
+        if not key or isinstance(_read(f"{key}=x"), HydraException) or "=" not in word:  # never an override
             raise InputError(f"{word!r:.300}: expected KEY=VALUE, such as model=7dgs or +exp=mini")
         raise InputError(
             f"{key}: expected quotes around {text}, as some of its characters have another meaning for "
