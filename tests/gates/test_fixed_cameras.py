@@ -107,6 +107,16 @@ def test_hard_cases(scene, decisions, reason):
     assert reason in screen.reason
 
 
+@pytest.mark.parametrize(("times_noise", "changes"), [(22, True), (18, False)])
+def test_a_block_changes_by_twenty_times_its_noise(times_noise, changes):
+    """Catches another threshold: of `wave` w and `noise` n, the energies are 2 (w^2 - n^2) and 4 n^2."""
+    noise = 0.01 * np.array([1.0, -1.0])
+    wave = noise * math.sqrt(2 * times_noise + 1)
+    first, second = (np.float32(half)[:, None, None] for half in (wave + noise, wave - noise))
+    halves = np.broadcast_to(np.stack([first, second]), (2, 2, 5, 3))
+    assert (fixed_camera_test._changed_blocks(halves) == changes).all()
+
+
 @pytest.mark.parametrize("together", [False, True])
 def test_the_level_on_rigs(together, monkeypatch):
     """Catches permutations that break what cameras see together, as a flicker for all, and a black camera: 0 / 0."""
