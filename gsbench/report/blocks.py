@@ -17,25 +17,27 @@ from gsbench.report.sections.lengths import by_length
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
 MOVING = ["monocular", "rig", "array"]
-DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the study dnerf100
+DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the studies dnerf100 and networks
+UNTUNED = ["hellwarrior", "jumpingjacks", "mutant", "standup"]  # scenes of D-NeRF on which no setting was chosen
 KINDS = {
     DNERF: [DNERF],
     "monocular": ["monocular"],
     "fixed cameras": ["rig", "array"],
-    "all dynamic": MOVING,
-    "static": ["static"],
+    "untuned": ["untuned", "rig", "array"],
 }
 CHANGES = {
     "time, given direction": ("7dgs_noagr", "6dgs"),
     "direction": ("6dgs", "3dgs"),
     "direction, given time": ("7dgs_noagr", "7dgs_nodir"),
+    "AGR, given time": ("4dgs_agr", "4dgs"),
     "AGR, given time and direction": ("7dgs", "7dgs_noagr"),
     "a field": ("hexplane", "3dgs"),
     "a field instead of these": ("hexplane", "7dgs"),
     "7DGS instead of 4DGS": ("7dgs", "4dgs"),
+    "7DGS instead of 4DGS with AGR": ("7dgs", "4dgs_agr"),
     "`model=auto` instead of 7DGS": ("auto", "7dgs"),
 }
-EFFECTS = list(CHANGES)[:6]
+EFFECTS = list(CHANGES)[:7]
 PRICES = {"train_cpu_s": Column("CPU s", 1, signed=True), "frame_ms": Column("ms a frame", 2, signed=True)}
 CHOICES = {
     "hexplane": "4DGaussians, a field",
@@ -48,7 +50,6 @@ CHOICES = {
 AT_PAPER = "best_on_test=true"  # trex at the paper's resolution, batch size and iterations
 POINTS = "initial_points=100000"  # trained with as many as in the paper, before D-NeRF had 10,000
 LAMBDA_T = "lambda_t=0.05"  # trained before lambda_t started at 0.5 on D-NeRF
-PARTS = (0.5, 0.7, 1.0)  # of the training after which the best model on val is chosen
 NEAR = 0.1  # dB below the best model
 ABLATIONS = {
     "none": "nothing",
@@ -63,11 +64,9 @@ ABLATIONS = {
 OF_TREX = {
     "psnr_db": Column("PSNR, last iteration"),
     "psnr_best_on_test_db": Column("best on test"),
-    "CPU min": Column("CPU min", 1),
-    "GPU min": Column("GPU min", 1),
+    "train_cpu_s": Column("CPU min", 1),
     "gaussians": Column("Gaussians", 0),
 }
-QUANTITIES = [*(name for name in OF_TREX if not name.endswith("min")), "train_s", "train_cpu_s"]
 
 
 @cache
@@ -129,11 +128,11 @@ def gain_text(scenes: list[Values]) -> str:  # for each scene the differences [s
 
 
 def table1(published: Path) -> str:
-    """Return the means of `make table1`."""
+    """Return means of all models on the embedded scenes, those of `make table1` first."""
     quantities = ["psnr_db", "lpips_alex", "train_s", "fps", "gaussians"]
     table = means(only(published, "mini"), *quantities).xs("", level="variant")
-    models = [model for model in MODELS if model in table.index]
-    return block(table.loc[models, quantities], fps=Column("FPS", 0))
+    first = [model for model in MODELS if model in table.index]
+    return block(table.loc[[*first, *table.index.difference(first)], quantities], fps=Column("FPS", 0))
 
 
 def cost(published: Path) -> str:
@@ -173,7 +172,8 @@ def suite_kinds(published: Path) -> str:
 def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFrame:
     """Return texts of what effects (keys of CHANGES) change in PSNR, a column a kind of scene (keys of KINDS)."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
-    arrays[DNERF] = stats.grids(only(published, "dnerf100"))
+    arrays[DNERF] = _of_dnerf100(published)
+    arrays["untuned"] = {scene: arrays[DNERF][scene] for scene in UNTUNED}
     columns = {
         title: [gain_text([v for kind in KINDS[title] for v in _gains(arrays, kind, name)]) for name in names]
         for title in titles
@@ -183,17 +183,23 @@ def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFram
 
 def worth(published: Path) -> str:
     """Return what effects gain, and what they cost on D-NeRF: mean differences of runs with the same scene and seed."""
-    table = by_kind(published, EFFECTS, [DNERF, "all dynamic"])
+    table = by_kind(published, EFFECTS, [DNERF, "untuned"])
     for quantity in PRICES:
-        costs = {DNERF: stats.grids(only(published, "dnerf100"), quantity)}
+        costs = {DNERF: _of_dnerf100(published, quantity)}
         table[quantity] = [estimate(_gains(costs, DNERF, name)).mean for name in EFFECTS]
     return block(table, **PRICES)
 
 
+def _of_dnerf100(published: Path, quantity: str = "psnr_db") -> stats.Grids:
+    """Return a quantity of all models on D-NeRF at 100 x 100 pixels; `networks` has those with another network."""
+    models, networks = (stats.grids(only(published, name), quantity) for name in ("dnerf100", "networks"))
+    return {scene: networks[scene] | models[scene] for scene in models}
+
+
 def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
     """Return one of CHANGES as differences [seeds, views] of each scene of a kind."""
-    weights = minus(*CHANGES[name], DNERF_VARIANT if kind == DNERF else "")
-    return list(stats.contrast(arrays[kind], weights).values())
+    variant = DNERF_VARIANT if kind in (DNERF, "untuned") else ""
+    return list(stats.contrast(arrays[kind], minus(*CHANGES[name], variant)).values())
 
 
 def minus(a: str, b: str, variant: str) -> stats.Weights:
@@ -204,8 +210,8 @@ def minus(a: str, b: str, variant: str) -> stats.Weights:
 def choices(published: Path) -> str:
     """Return what choices of a model lose in PSNR to the best model, over scenes with val and test of two studies."""
     runs = {
-        "suite": [_val_on_the_way(study(published / "suite")[kind]) for kind in MOVING],
-        DNERF: [_val_on_the_way(_of_dnerf(only(published, name))) for name in ("dnerf100", "compare100")],
+        "suite": [_with_val(study(published / "suite")[kind]) for kind in MOVING],
+        DNERF: [_with_val(_of_dnerf(only(published, name))) for name in ("dnerf100", "compare100")],
     }
     lost = {title: _lost(pd.concat(tables)) for title, tables in runs.items()}
     table = pd.DataFrame(index=lost[DNERF].columns.rename("choice"))
@@ -225,27 +231,21 @@ def _of_dnerf(chapter: Results) -> Results:
 
 def _lost(runs: pd.DataFrame) -> pd.DataFrame:
     """Return PSNR of CHOICES (columns) minus that of the model with the best PSNR on test, for each scene (rows)."""
-    unusable = (runs["val 1.0"].isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()  # no val
+    unusable = (runs.val.isna() | (runs.protocol_eval_split == "val")).groupby(runs.scene).any()  # no val
     runs = runs[~runs.scene.map(unusable)]
     psnr = runs.pivot(index=["scene", "seed"], columns="name", values="psnr_db")
     fixed = [name for name in psnr if not name.startswith("auto")]
     best = psnr[fixed].max(axis=1)
     lost = {text: psnr[name] - best for name, text in CHOICES.items() if name in psnr}
-    for part in PARTS:
-        val = runs[runs.name.isin(fixed)].pivot(index=["scene", "seed"], columns="name", values=f"val {part}")
-        chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
-        lost[f"the best on val after {100 * part:.0f} %"] = chosen - best
+    val = runs[runs.name.isin(fixed)].pivot(index=["scene", "seed"], columns="name", values="val")
+    chosen = pd.Series([psnr.at[key, model] for key, model in val.idxmax(axis=1).items()], val.index)
+    lost["the best on val"] = chosen - best
     return pd.DataFrame(lost).groupby("scene").mean()
 
 
-def _val_on_the_way(chapter: Results) -> pd.DataFrame:
-    """Return runs with their name, and PSNR on val after each of PARTS of the curve, whose points are evenly spaced."""
-    curves = chapter.curves.assign(number=chapter.curves.groupby("run").cumcount() + 1)
-    count = curves.groupby("run").run.transform("size")
-    runs = chapter.runs.assign(name=names_of(chapter.runs))
-    for part in PARTS:
-        at = curves[curves.number == (part * count).round()].set_index("run").psnr_val_db
-        runs[f"val {part}"] = at.reindex(runs.index)
+def _with_val(chapter: Results) -> pd.DataFrame:
+    """Return runs with their name and their last PSNR on val."""
+    runs = chapter.runs.assign(name=names_of(chapter.runs), val=chapter.curves.groupby("run").psnr_val_db.last())
     return runs[runs.name.isin([*MODELS, *CHOICES])]
 
 
@@ -283,9 +283,17 @@ def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str
     return block(table, **{name: Column(name) for name in table})
 
 
-def dnerf100(published: Path) -> str:
-    """Return PSNR of models on the eight scenes of D-NeRF at 100 x 100 pixels, and on average."""
-    return block(_by_scene(only(published, "dnerf100").runs, MODELS))
+def dnerf_sizes(published: Path) -> str:
+    """Return SSIM and Gaussians of the trainings of `dnerf` and in the paper, on average."""
+    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
+    rows = rows[(rows.table == "paper") & (rows.recipe == POINTS) & (rows.scene == paper.AVERAGE)].set_index("model")
+    columns = {
+        "ssim": Column("SSIM", 3),
+        "ssim paper": Column("SSIM, paper", 3),
+        "gaussians": Column("Gaussians", 0),
+        "gaussians paper": Column("Gaussians, paper", 0),
+    }
+    return block(rows[list(columns)].astype(float), **columns)
 
 
 def dnerf200(published: Path) -> str:
@@ -303,19 +311,16 @@ def _by_scene(runs: pd.DataFrame, models: list[str]) -> pd.DataFrame:
     return shown(stats.ranked_rows(pd.concat([psnr, psnr.mean().to_frame("mean").T]).rename_axis("scene")))
 
 
-def dnerf100_rivals(published: Path) -> str:
-    """Return what 7DGS, its successors and its rivals reach and cost on D-NeRF at 100 x 100 pixels, the best first."""
+def dnerf100(published: Path) -> str:
+    """Return what all models reach and cost on D-NeRF at 100 x 100 pixels, on average, the best first."""
     runs = only(published, "dnerf100").runs
     columns = {
         "psnr_db": Column("PSNR", 2),
         "train_cpu_s": Column("CPU s", 0),
-        "frame_ms": Column("ms a frame", 2),
         "gaussians": Column("Gaussians", 0),
     }
     table = runs.groupby(["model", "scene"])[list(columns)].mean().groupby("model").mean()
-    models = ["4dgs", "7dgs", "auto", *paper_tables.SUCCESSORS, *paper_tables.RIVALS]
-    table = table[table.index.isin(models)].sort_values("psnr_db", ascending=False)
-    return block(table, **columns)
+    return block(table.sort_values("psnr_db", ascending=False), **columns)
 
 
 def dnerf_signs(published: Path) -> str:
@@ -336,23 +341,17 @@ def dnerf_signs(published: Path) -> str:
     return block(pd.DataFrame(rows).T.rename_axis("difference"))
 
 
-def _minutes(averages: pd.Series, device: str) -> pd.Series:
-    """Return averages with the minutes of the processor: CPU-minutes of all threads, or those of the GPU."""
-    seconds = averages.train_s if device == "GPU" else averages.train_cpu_s
-    return pd.concat([averages, pd.Series({f"{device} min": seconds / 60})])
-
-
 def trex400(published: Path) -> str:
     """Return trex as the paper trains it, with both initial lambda_t, and by other recipes."""
     results = load(published / "dnerf").finished  # no chapters, which drop times of other machines
-    averages = means(results.of(results.runs.scene == "trex"), *QUANTITIES)
+    averages = means(results.of(results.runs.scene == "trex"), *OF_TREX)
     rows: dict[str, pd.Series] = {}
     for model in ("7dgs", "7dgs_noagr", "4dgs"):
         for of_device, device in {"device=cuda,": "GPU", "": "CPU"}.items():
             for start in ("", f"{LAMBDA_T},"):
                 if (model, variant := f"{of_device}{start}{POINTS},{AT_PAPER}") in averages.index:
                     title = f"{model}, {start and 'λ_t from 0.05, '}{'H200' if device == 'GPU' else 'CPU'}"
-                    rows[title] = _minutes(averages.loc[(model, variant)], device)
+                    rows[title] = averages.loc[(model, variant)]
     others = [
         ("7dgs_noagr", "paper", f",{AT_PAPER}"),
         ("7dgs_noagr", "authors", f",{AT_PAPER}"),
@@ -362,8 +361,9 @@ def trex400(published: Path) -> str:
     ]
     for model, name, more in others:
         start = "λ_t from 0.05, " if LAMBDA_T in more else ""
-        rows[f"{model}, {start}`+recipe={name}`, CPU"] = _minutes(averages.loc[(model, f"recipe={name}{more}")], "CPU")
+        rows[f"{model}, {start}`+recipe={name}`, CPU"] = averages.loc[(model, f"recipe={name}{more}")]
     table = pd.DataFrame(rows).T.rename_axis("trex, 400 x 400").astype(float)
+    table["train_cpu_s"] = (table.train_cpu_s / 60).where([title.endswith("CPU") for title in rows])
     intervals = ["psnr_db ±", "psnr_best_on_test_db ±"]
     return block(table[["seeds", *OF_TREX, *intervals]], **OF_TREX)
 
@@ -406,7 +406,6 @@ README: dict[str, Callable[[Path], str]] = {
 _OF_RESULTS = (
     dnerf100,
     dnerf200,
-    dnerf100_rivals,
     table1,
     suite_kinds,
     choices,
@@ -417,5 +416,6 @@ _OF_RESULTS = (
 )
 RESULTS: dict[str, Callable[[Path], str]] = {
     "dnerf": lambda published: dnerf(published, ["4dgs", "7dgs_noagr", "7dgs"], LAST | BEST | OF_PAPER),
+    "dnerf_sizes": dnerf_sizes,
     **{write.__name__: write for write in _OF_RESULTS},
 }

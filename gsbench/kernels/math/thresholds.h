@@ -12,8 +12,8 @@ constexpr float LOG_SIZE_MAX = 16.0f;
 constexpr float EXPONENT_MAX = 80.0f;
 // A 4D Gaussian is culled unless its f_temp is above this (4DGS, gaussian_renderer).
 constexpr float TIME_OPACITY_FACTOR_MIN = 0.05f;
-// A Gaussian with an alpha below ALPHA_MIN is skipped, and alpha is clamped to ALPHA_MAX (3DGS, forward.cu). Blending
-// of a pixel ends before its transmittance would fall below TRANSMITTANCE_MIN.
+// A Gaussian with an alpha below ALPHA_MIN is skipped (3DGS, forward.cu), and alpha is clamped to ALPHA_MAX (gsplat;
+// 3DGS: 0.99). Blending of a pixel ends before its transmittance would fall below TRANSMITTANCE_MIN.
 constexpr float ALPHA_MIN = 1.0f / 255.0f;
 constexpr float ALPHA_MAX = 0.999f;
 constexpr float TRANSMITTANCE_MIN = 1e-4f;
