@@ -14,16 +14,17 @@ from gsbench.report.render.text import bold
 from gsbench.report.render.text import table as markdown
 from gsbench.report.section import EMPTY, Column, Section, number
 from gsbench.report.sections.lengths import by_length
+from gsbench.report.sections.protocol import TUNED
 
 MODELS = ["3dgs", "6dgs", "4dgs", "7dgs_noagr", "7dgs_nodir", "7dgs", "auto"]
 MOVING = ["monocular", "rig", "array"]
 DNERF, DNERF_VARIANT = "D-NeRF", "downscale=4,iterations=1000"  # the studies dnerf100 and networks
-UNTUNED = ["hellwarrior", "jumpingjacks", "mutant", "standup"]  # scenes of D-NeRF on which no setting was chosen
+UNTUNED = "D-NeRF, untuned"
 KINDS = {
     DNERF: [DNERF],
+    UNTUNED: [UNTUNED],
     "monocular": ["monocular"],
     "fixed cameras": ["rig", "array"],
-    "untuned": ["untuned", "rig", "array"],
 }
 CHANGES = {
     "time, given direction": ("7dgs_noagr", "6dgs"),
@@ -173,7 +174,7 @@ def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFram
     """Return texts of what effects (keys of CHANGES) change in PSNR, a column a kind of scene (keys of KINDS)."""
     arrays = {kind: stats.grids(chapter) for kind, chapter in study(published / "suite").items()}
     arrays[DNERF] = _of_dnerf100(published)
-    arrays["untuned"] = {scene: arrays[DNERF][scene] for scene in UNTUNED}
+    arrays[UNTUNED] = {scene: values for scene, values in arrays[DNERF].items() if scene not in TUNED}
     columns = {
         title: [gain_text([v for kind in KINDS[title] for v in _gains(arrays, kind, name)]) for name in names]
         for title in titles
@@ -183,7 +184,7 @@ def by_kind(published: Path, names: list[str], titles: list[str]) -> pd.DataFram
 
 def worth(published: Path) -> str:
     """Return what effects gain, and what they cost on D-NeRF: mean differences of runs with the same scene and seed."""
-    table = by_kind(published, EFFECTS, [DNERF, "untuned"])
+    table = by_kind(published, EFFECTS, [DNERF, UNTUNED])
     for quantity in PRICES:
         costs = {DNERF: _of_dnerf100(published, quantity)}
         table[quantity] = [estimate(_gains(costs, DNERF, name)).mean for name in EFFECTS]
@@ -198,7 +199,7 @@ def _of_dnerf100(published: Path, quantity: str = "psnr_db") -> stats.Grids:
 
 def _gains(arrays: dict[str, stats.Grids], kind: str, name: str) -> list[Values]:
     """Return one of CHANGES as differences [seeds, views] of each scene of a kind."""
-    variant = DNERF_VARIANT if kind in (DNERF, "untuned") else ""
+    variant = DNERF_VARIANT if kind in (DNERF, UNTUNED) else ""
     return list(stats.contrast(arrays[kind], minus(*CHANGES[name], variant)).values())
 
 

@@ -21,6 +21,7 @@ from gsbench.report.columns import CURVES, RUNS, VIEWS
 
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
+ALONE = 3.0  # load up to which a run has its GPU for itself: a training keeps one or two CPU threads busy
 NUMBERS = [column.name for column in RUNS if column.kind is float]
 
 Records = list[tuple[Path, Record]]  # with the paths of their files
@@ -197,14 +198,20 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
-    """Set times to NaN unless they are of the machine with the most finished runs.
+def shared_gpu(r: Record) -> bool:
+    """Tell whether a run on a GPU seems to have had company, which no record holds: the load says so."""
+    on_gpu = str(value_at(r.provenance.config, "device")).startswith("cuda")
+    return on_gpu and r.cost is not None and (r.cost.load or 0.0) > ALONE
 
-    `timed_on` is its name, and `is_timed` tells whether a run was on it.
+
+def of_one_machine(runs: pd.DataFrame) -> pd.DataFrame:
+    """Set times to NaN unless they are of the machine with the most finished runs, which no other run shared.
+
+    `timed_on` is its name, and `is_timed` tells which times count.
     """
     counted = runs[runs.status == "ok"] if (runs.status == "ok").any() else runs
     machine = str(counted.machine.value_counts(sort=False).idxmax())  # of equals the first
-    is_timed = runs.machine == machine
+    is_timed = (runs.machine == machine) & ~runs.record.map(shared_gpu).astype(bool)
     return runs.assign(**{name: runs[name].where(is_timed) for name in TIMES}, timed_on=machine, is_timed=is_timed)
 
 

@@ -49,7 +49,7 @@ TEXT_1 = (
     "“paper”: Table 1 of the 7DGS paper (ICCV 2025). Its PSNR is the best on test seen during training, which leaks: "
     "like stands beside like in the column psnr_best_on_test (leaks). Its times are of a V100, so no difference is "
     "taken. It does not name the network of its LPIPS. ± is half the width of the 95 % interval over seeds. Minutes "
-    "and FPS are of the machine of most runs; a time of another one is left out."
+    "and FPS are of the machine of most runs; a time of another one, or of runs that shared a GPU, is left out."
 )
 TEXT_OTHER = (
     "Measured otherwise than in the paper, or on scenes rendered for gsbench in place of the paper's, so the paper's "

@@ -56,6 +56,13 @@ def test_times_are_of_the_machine_of_most_finished_runs():
     assert set(timed.timed_on) == {make().provenance.machine}
 
 
+def test_runs_that_share_a_gpu_have_no_times():
+    """Would catch frames a second of 18 trainings on one GPU, of which the last has it for itself."""
+    conditions = enumerate([("cpu", 17.0), ("cuda:0", 1.2), ("cuda:0", 17.0)])
+    runs = [but(make(seed=s), cost={"load": load}, provenance={"config": {"device": d}}) for s, (d, load) in conditions]
+    assert of_one_machine(results(*runs).runs).frame_ms.notna().tolist() == [True, True, False]
+
+
 def test_settings_that_most_models_share_name_the_comparison():
     """Would catch an ablation that stands for its model, or an average over a scene that a model lacks."""
     variants = make("4dgs", variant="ablation=a"), make("7dgs", variant="iterations=9")

@@ -25,6 +25,8 @@ TUNED = frozenset(
         "static-glossy",
         "static-matte",
         "suzanne",  # conf/exp/tuning.yaml
+        "hook",
+        "pendulum",
         "lego",
         "static-lego",
         "trex",
@@ -37,7 +39,8 @@ TUNED = frozenset(
 TEXT = (
     "PSNR is over all pixels and channels of a view, after the final iteration, averaged over views; SSIM is that of "
     "scikit-image (Gaussian window, data_range 1). FPS is 1000 / the median milliseconds of a frame, with slicing and "
-    "AGR. Minutes of training are without evaluation. Times of other machines than that of most runs are left out."
+    "AGR. Minutes of training are without evaluation. Times of other machines than that of most runs, and of runs that "
+    "shared a GPU, are left out."
 )
 DIFFER = " WARNING: runs that are compared differ in this."
 
@@ -96,7 +99,7 @@ def _facts(runs: pd.DataFrame) -> Iterator[list[object]]:
     early = [r.stop.kept if r.stop and r.stop.kept < r.stop.iteration else None for r in runs.record]
     chosen = [r.length_choice.kept if r.length_choice else None for r in runs.record]
     facts = (
-        ("load of the machine, with the run itself", runs.load.where(runs.is_timed), 1),
+        ("load of the machine, with the run itself", runs.load.where(runs.machine == runs.timed_on), 1),
         ("most that float32 changes PSNR of a view, dB", runs.psnr_float32_db, 6),
         ("measured at the best iteration on val (train.patience)", early, 0),
         ("iterations of averaged parameters (train.average_from)", runs.averaged.where(runs.averaged > 0), 0),
@@ -135,12 +138,12 @@ def runs(chapter: Results, tests: pd.DataFrame) -> Section:
     all_runs = chapter.runs
     table = all_runs[["status", "psnr_db", "train_s", "train_cpu_s", "load", "frame_ms", "model_mb", "iterations"]]
     table = table.assign(
-        load=all_runs.load.where(all_runs.is_timed),
+        load=all_runs.load.where(all_runs.machine == all_runs.timed_on),
         commit=[_short("commit", value or "not recorded") for value in all_runs.git_commit],
         command=all_runs.record.map(command),
         reason=all_runs.reason,
     )
-    text = "A time is empty if the run was on another machine than most."
+    text = "A time is empty if the run was on another machine than most, or shared its GPU."
     table.insert(0, "run", [record.path.as_posix() for record in all_runs.record])
     if "contributor" in all_runs:
         table.insert(1, "contributor", all_runs.contributor)
