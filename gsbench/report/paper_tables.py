@@ -379,10 +379,10 @@ def _with_paper(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def seeds(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
-    """Count the finished seeds of each model (rows) on each scene (columns), with the experiment's recipe."""
-    plain = runs[(runs.status == "ok") & (runs.recipe == "")]
+    """Count the finished seeds of each model (rows) on each scene (columns), with the recipe that has most."""
     scenes = list(paper.PROTOCOLS[dataset].scenes)
-    counts = plain.groupby(["model", "scene"]).seed.nunique().unstack().reindex(index=list(MODELS), columns=scenes)
+    by_recipe = runs[runs.status == "ok"].groupby(["model", "scene", "recipe"]).seed.nunique()
+    counts = by_recipe.groupby(["model", "scene"]).max().unstack().reindex(index=list(MODELS), columns=scenes)
     return counts.fillna(0).astype(int).rename_axis(index="model", columns=None).reset_index()
 
 
