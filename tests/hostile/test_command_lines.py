@@ -18,7 +18,7 @@ from gsbench.measure import record
         (["+model.options.agr="], 1, "set agr"),
         (["+model.options.backend=cpu"], 1, "set raster.backend"),
         (["+model.options.x="], 1, "model '3dgs' has no option 'x'"),
-        (["=1"], 2, "Got int"),
+        (["=1"], 2, "expected KEY=VALUE"),
         (["hydra=null"], 2, "NoneType"),
         (["--resolve"], 2, "--resolve"),
         (["--shell-completion"], 2, "install"),
