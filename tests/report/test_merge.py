@@ -117,6 +117,14 @@ def test_a_run_that_two_publish_counts_once_and_other_numbers_are_told(tmp_path)
     assert row["settings of the second"] == "train.iterations 9 instead of 1000"
 
 
+def test_trainings_of_each_variant_are_compared(tmp_path):
+    """Catches a second variant that is not looked at where the first is the same training."""
+    alice = [make("3dgs"), make("3dgs", variant="ablation=schur")]
+    bob = [but(alice[0], provenance=OTHER_COMMIT), but(alice[1], provenance={"config": {"train": {"iterations": 9}}})]
+    *_, trainings = contributors.sections(merge.read(published(tmp_path, alice=alice, bob=bob)))
+    assert trainings.table.model.tolist() == ["3dgs ablation=schur"]
+
+
 @pytest.mark.parametrize(
     ("bad", "reason"),
     [

@@ -204,6 +204,11 @@ def test_seconds_of_another_machine_are_nowhere():
         assert "777" not in " ".join(section.notes)
 
 
+def test_runs_that_keep_all_effects_have_no_table_of_removed_ones():
+    """Catches an empty table on the page of an experiment."""
+    assert "on_demand" not in sections(run("7dgs"))
+
+
 def test_the_candidates_of_a_choice_on_val_have_their_prices():
     """Catches a price of another candidate or machine, and a field that is more accurate at hidden costs."""
     choices = {
