@@ -13,7 +13,7 @@ cmake -S . -B $build -DCMAKE_BUILD_TYPE=RelWithDebInfo -DGSB_LEVELS=native -DGSB
 cmake --build $build
 rm -rf $build/site
 mkdir -p $build/site
-cp -r gsbench $build/site/
+cp -r gsbench conf $build/site/
 rm -f $build/site/gsbench/kernels/_cuda*.so
 cp --remove-destination $build/_native*.so $build/site/gsbench/kernels/
 # An editable install finds gsbench by a hook that goes before every path: without it, and the kernels that are asked for.
