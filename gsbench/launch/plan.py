@@ -83,6 +83,11 @@ def forget(folder: Path) -> None:
         folder.parent.rmdir()
 
 
+def log_of(folder: Path, number: int | str) -> Path:
+    """Return the path of the log of a Slurm job: of a run by its number, or a pattern of sbatch."""
+    return folder / f"{number}.log"
+
+
 def write_ended(folder: Path, number: int, ended: Ended) -> None:
     """Write the outcome of run `number` of the sweep whose plan is in `folder`."""
     write_atomically(folder / ENDED / f"{number}.json", as_json(ended).encode())

@@ -83,7 +83,7 @@ def launch(configs: Sequence["RunConfig"], planned: Plan, folder: Path) -> None:
         "mem": settings.memory,
         "signal": f"USR2@{settings.signal_seconds}",
         "array": f"0-{len(configs) - 1}" + (f"%{settings.at_once}" if settings.at_once > 0 else ""),
-        "output": folder / "%a.log",
+        "output": plan.log_of(folder, "%a"),
         "open-mode": "append",
         "requeue": True,  # when its node fails
         **settings.sbatch,

@@ -214,7 +214,7 @@ def _explained(experiment: Experiment, run: Identity, state: RunStatus, ends: di
         phrases.append(f"job {state.job} ended: {ends.get(state.job, 'Slurm no longer knows how')}")
     planned = experiment.planned.get(run)
     if planned and planned.job == state.job:
-        log = planned.folder / f"{planned.number}.log"  # as slurm.launch names it
+        log = plan.log_of(planned.folder, planned.number)
         phrases.append(f"its log ends: {cause_in(log)}; {log}")
     return replace(state, reason="; ".join(phrases))
 

@@ -266,13 +266,18 @@ def lengths(published: Path) -> str:
 LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
 
 
+def _at_paper(published: Path) -> pd.DataFrame:
+    """Return the rows of Table 1 that were trained on D-NeRF at the paper's protocol, and the paper's numbers."""
+    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
+    return rows[(rows.table == "paper") & (rows.recipe == POINTS)]
+
+
 def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str:
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average; `quantities` are of LAST, BEST, OF_PAPER.
 
     Each model has a column for each quantity. Scenes that lack one of them are left out.
     """
-    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
-    rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)].set_index("scene")
+    rows = _at_paper(published).set_index("scene")
     by_column = {
         f"{model}{title}": rows[rows.model == model][f"psnr_{quantity}"]
         for model in models
@@ -286,8 +291,8 @@ def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str
 
 def dnerf_sizes(published: Path) -> str:
     """Return SSIM and Gaussians of the trainings of `dnerf` and in the paper, on average."""
-    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
-    rows = rows[(rows.table == "paper") & (rows.recipe == POINTS) & (rows.scene == paper.AVERAGE)].set_index("model")
+    rows = _at_paper(published)
+    rows = rows[rows.scene == paper.AVERAGE].set_index("model")
     columns = {
         "ssim": Column("SSIM", 3),
         "ssim paper": Column("SSIM, paper", 3),

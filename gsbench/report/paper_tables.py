@@ -144,7 +144,7 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     "other data" those on data that stand in for the paper's.
     """
     for dataset in paper.PROTOCOLS:
-        yield "paper", dataset, runs[(runs.departs == "") & (runs.dataset == dataset)]
+        yield "paper", dataset, _at_paper(runs, dataset)
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
     pools = [pool for _, pool in runs[runs.departs != ""].groupby("pool")]
     for pool in sorted(pools, key=lambda pool: -_effort(pool)):  # equal ones stay in order of their names
@@ -154,6 +154,11 @@ def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
         for (paper_dataset, dataset), pool in nearest.items():
             if (kind == "other protocol") == (paper_dataset == dataset):
                 yield kind, dataset, pool
+
+
+def _at_paper(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
+    """Return the runs on a data set at the paper's protocol."""
+    return runs[(runs.departs == "") & (runs.dataset == dataset)]
 
 
 def _effort(runs: pd.DataFrame) -> int:
@@ -212,8 +217,8 @@ def table2(results: Results) -> pd.DataFrame:
 
 def _measured(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
     """Return the measured rows of Table 2 for a data set, those of `OWED` also without numbers."""
-    scenes = paper.PROTOCOLS[dataset].scenes
-    finished = runs[(runs.departs == "") & (runs.dataset == dataset) & (runs.status == "ok")]
+    scenes, runs = paper.PROTOCOLS[dataset].scenes, _at_paper(runs, dataset)
+    finished = runs[runs.status == "ok"]
     rows = pd.DataFrame({"model": [], "experiment": []}, dtype=object)
     if len(finished):
         rows = stats.means(_once(of_one_machine(finished)), RECIPE, TABLE_2)
