@@ -1,8 +1,7 @@
 """Declare a differentiable operation by its kernels; checks, calls and the gradient follow from the declaration.
 
 An operation is a pair of compiled kernels, forward and backward. An active tape, which is a list of kernel calls
-(`gsbench.kernels.tape`), records each call for the backward pass. Without a tape torch's autograd records the call,
-and what looks at each operator (torch.compile, dispatch modes) sees the registered `torch.ops.gsbench.NAME`.
+(`gsbench.kernels.tape`), records each call for the backward pass. Without a tape torch's autograd records the call.
 """
 
 import threading
@@ -15,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 from gsbench.errors import InputError
 from gsbench.kernels.library import Slots, allocate, library_of
@@ -28,7 +26,6 @@ Shape = tuple[int | str, ...]
 Upstream = Sequence[Tensor | None]  # the gradient of the loss by each output of an operation; None: zero
 Sums = dict[int, Tensor]  # by the number of an input, the tensor to which its gradient is added
 
-_SCHEMA = {int: "int", float: "float", bool: "bool"}
 _KINDS: dict[type, tuple[type, ...]] = {int: (int,), float: (float, int), bool: (bool,)}  # accepted Python types
 _NOTHING = torch.Size([0])
 _MAY_BE_NULL = frozenset({"given.depths", "given.alpha"})  # gradients of outputs of which a null address means zero
@@ -143,7 +140,6 @@ class Operation:
         self._kinds += [_KINDS[kind] for kind in self.numbers.values()]
         self._known: dict[tuple[Any, ...], Slots] = {}  # results of `match` by numbers, shapes and types
         self._backward_kernel = f"{name}_backward"
-        self._traced = _register(self)
 
     def __call__(self, *arguments: Any, **by_name: Any) -> Tensors:
         """Run the kernel with tensors and then numbers, in the order of the declaration or by name.
@@ -165,18 +161,12 @@ class Operation:
     def record(self, tensors: Tensors, numbers: tuple[Any, ...], results: Results | None = None) -> Tensors:
         """Return the outputs of a call, recorded for the backward pass.
 
-        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`. torch.compile,
-        and dispatch modes where there are gradients, get the registered operator, which runs the kernel in any case.
+        The forward kernel runs unless another kernel has computed the `results` of `allocate_results`.
         """
         if (recording := getattr(active, "tape", None)) is not None:
             return recording.record(self, tensors, numbers, results)
-        differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
-        if torch.compiler.is_compiling() or (differentiated and _get_current_dispatch_mode() is not None):
-            traced: Tensors = self._traced(tensors, *numbers)
-            return traced
-        if differentiated:
-            return list(_Eager.apply(self, numbers, results, *tensors))
-        # Nothing is to be differentiated. The kernel runs at once, in a dispatch mode too: `Recording` notes its call.
+        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+            return list(_Differentiated.apply(self, numbers, results, *tensors))
         return (results or self.run(tensors, numbers))[0]
 
     def _in_order(self, arguments: tuple[Any, ...], by_name: dict[str, Any]) -> tuple[Any, ...]:
@@ -352,14 +342,9 @@ class Operation:
         """Return whether input number `i` is optional and left out."""
         return i in self._optional and x.shape == _NOTHING
 
-    def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        """Return uninitialised outputs of the right shapes, for torch.compile."""
-        slots = self._match(tensors, numbers)
-        return [tensors[0].new_empty(_filled(shape, slots)) for _, shape in self._out]
 
-
-class _Eager(torch.autograd.Function):
-    """A call of an operation that autograd records, in half the time that the registered operator takes."""
+class _Differentiated(torch.autograd.Function):
+    """A call of an operation that autograd records."""
 
     @staticmethod
     def forward(
@@ -380,7 +365,6 @@ class _Eager(torch.autograd.Function):
         operation, wanted = ctx.operation, ctx.needs_input_grad[3:]
         slots = operation.prepare(tensors, ctx.numbers, outputs)  # autograd saves only tensors, no addresses
         gradients = operation.backward(tensors, slots, outputs, upstream, wanted, {})
-        # Zeros are made only for inputs that need a gradient; the registered operator makes them for all.
         return (
             *[None] * 3,  # for operation, numbers and results
             *[
@@ -431,56 +415,3 @@ def first_rows(name: str, count: int, x: Tensor) -> int:
 def in_rows(tensors: Tensors) -> Tensors:
     """Return the tensors as contiguous ones, with torch's lazy negation applied."""
     return [x if x.is_contiguous() and not x.is_neg() else x.resolve_neg().contiguous() for x in tensors]
-
-
-def _apart(results: Tensors, inputs: Sequence[Tensor | None]) -> Tensors:
-    """Return `results`, copying each one that shares memory with an input or another result.
-
-    torch requires that the outputs of a custom operation share no memory.
-    """
-    taken, apart = {x.untyped_storage().data_ptr() for x in inputs if x is not None}, []
-    for x in results:
-        apart.append(x.clone() if x.untyped_storage().data_ptr() in taken else x)
-        taken.add(apart[-1].untyped_storage().data_ptr())
-    return apart
-
-
-def _register(operation: Operation) -> Callable[..., Any]:
-    """Register the operation as `torch.ops.gsbench.NAME` for autograd and torch.compile, and return it."""
-    name, numbers = operation.name, operation.numbers
-    declared = "".join(f", {_SCHEMA[kind]} {key}" for key, kind in numbers.items())
-    schema, count = f"(Tensor[] tensors{declared}) -> Tensor[]", len(numbers)
-
-    def forward(tensors: Tensors, *values: Any) -> Tensors:
-        return operation.run(tensors, values)[0]
-
-    def backward(tensors: Tensors, *rest: Any) -> Tensors:
-        values, (outputs, upstream, wanted) = rest[:count], rest[count:]
-        slots = operation.prepare(tensors, values, outputs)
-        gradients = operation.backward(tensors, slots, outputs, upstream, wanted, {})
-        filled = [torch.zeros_like(x) if g is None else g for x, g in zip(tensors, gradients, strict=True)]
-        return _apart(filled, upstream)
-
-    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:  # inputs: the list of tensors, then numbers
-        ctx.tensors = len(inputs[0])
-        ctx.wanted = [x.requires_grad for x in inputs[0]]
-        ctx.save_for_backward(*inputs[0], *output)
-        ctx.numbers = inputs[1:]
-
-    def gradient(ctx: Any, upstream: list[Tensor | None]) -> tuple[Any, ...]:
-        tensors, outputs = ctx.saved_tensors[: ctx.tensors], ctx.saved_tensors[ctx.tensors :]
-        gradients = backward_op(list(tensors), *ctx.numbers, list(outputs), upstream, ctx.wanted)
-        wanted = [g if asked else None for g, asked in zip(gradients, ctx.wanted, strict=True)]
-        return wanted, *(None,) * count
-
-    forward_op = torch.library.custom_op(f"gsbench::{name}", forward, mutates_args=(), schema=schema)
-    backward_op = torch.library.custom_op(
-        f"gsbench::{name}_backward",
-        backward,
-        mutates_args=(),
-        schema=f"(Tensor[] tensors{declared}, Tensor[] outputs, Tensor?[] upstream, bool[] wanted) -> Tensor[]",
-    )
-    forward_op.register_fake(lambda tensors, *values: operation.fake(tensors, values))
-    backward_op.register_fake(lambda tensors, *_: [x.new_empty(x.shape) for x in tensors])
-    forward_op.register_autograd(gradient, setup_context=keep)
-    return forward_op

@@ -219,11 +219,6 @@ class _Refine(Operation):
             "value_widths": tuple(value_widths),
         }
 
-    def fake(self, tensors: Tensors, numbers: Sequence[Any]) -> Tensors:
-        self._match(tensors, numbers)
-        inputs = _Inputs.of(tensors)
-        return [x.new_empty(_shape_of(inputs, x)) for x in inputs.values]
-
 
 def _shape_of(inputs: _Inputs, values: Tensor) -> tuple[int, ...]:
     """Return the shape of values that AGR has changed: [N, c], or [V, N, c] for several views."""

@@ -7,7 +7,6 @@ import pytest
 import torch
 from raster.cases import case
 from test_raster import assert_gradients_close, differentiate
-from test_training_step import Calls
 from torch import Tensor
 
 from gsbench.kernels import raster
@@ -75,17 +74,6 @@ def test_too_little_memory_is_enlarged(cuda_device, called):
     recording.repeat()
     assert called == ["draw"]
     assert torch.equal(image, expected.image)
-
-
-def test_what_looks_at_operators_sees_them(cuda_device):
-    """Catches images that torch.compile and dispatch modes cannot differentiate, as another call has drawn them."""
-    arguments = case("three_cameras", torch.float32, cuda_device)
-    expected, gradients = differentiate(arguments, cuda_device, EVERY_PIXEL)
-    with Calls() as calls:
-        output, actual = differentiate(arguments, cuda_device, EVERY_PIXEL)
-    assert {f"gsbench.{name}.default" for name in ("project", "blend", "project_backward")} <= calls.counted.keys()
-    assert torch.equal(output.image, expected.image)
-    assert_gradients_close(actual, gradients)
 
 
 @pytest.mark.slow
