@@ -100,9 +100,7 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
     listed, digests, time_notes = _list_shots(root, posed, read_cameras(cameras))
     initial = read_points(points)
     loaded = shots.read(listed, rendition)
-    digests |= {
-        shot.path.relative_to(root).as_posix(): digest for shot, digest in zip(listed, loaded.digests, strict=True)
-    }
+    digests |= loaded.by_path(root)
     digests |= {part.path.relative_to(root).as_posix(): files.digest(part.data) for part in model}
     train, test = hold_out(loaded.views, HELD_OUT)
     return standard_scene(
@@ -131,8 +129,8 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
                 f"{posed.path}: image {image.name[:80]!a}: expected a camera of the model, got number {image.camera}"
             )
     names, viewmats = [image.name for image in posed_images], np.stack([image.viewmat for image in posed_images])
-    places = times.places_of(viewmats, [lenses[image.camera].key for image in posed_images])
-    timed, digests = times.of_images(root, times.NamedImages(names, viewmats, places, posed.path))
+    keys = [lenses[image.camera].key for image in posed_images]
+    timed, digests = times.of_images(root, times.NamedImages(names, viewmats, keys, posed.path))
     listed_shots, finder = [], ImageFinder(root)
     for image, time in zip(posed_images, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"

@@ -140,7 +140,7 @@ def camera_of(
     if min(width, height) < 1 or width % 1 or height % 1 or not focal > shots.SMALLEST:
         raise InputError(f"{where}: expected height, width and focal length in pixels, got {height} {width} {focal}")
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return torch.from_numpy(viewmat), Lens(int(width), int(height), K, (0.0, 0.0, 0.0, 0.0))
+    return torch.from_numpy(viewmat), Lens(int(width), int(height), K, shots.PINHOLE)
 
 
 def memory_needed(

@@ -83,7 +83,7 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
         path = files.find_inside(root, f"{IMAGES}/{image}.png", where)
         listed.append(Shot(path, None, image, f"{path} ({where})", warps[image] / last, viewmat, lens))
     loaded = shots.read(listed, rendition)
-    digests |= {f"{IMAGES}/{shot.name}.png": sha256 for shot, sha256 in zip(listed, loaded.digests, strict=True)}
+    digests |= loaded.by_path(root)
     count = len(splits.train_ids)
     return standard_scene(
         name=name,

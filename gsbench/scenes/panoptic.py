@@ -70,8 +70,7 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
         notes.append(f"cameras {', '.join(map(str, shared))} of test are cameras of train too")
     loaded = shots.read([*train.shots, *test.shots], rendition)
     views = iter(loaded.views)  # first those of train
-    paths = [shot.path.relative_to(root).as_posix() for split in splits.values() for shot in split.shots]
-    digests = dict(zip(paths, loaded.digests, strict=True))
+    digests = loaded.by_path(root)
     digests |= {f"{split}_meta.json": content.digest for split, content in splits.items()}
     points = None
     if os.path.lexists(root / POINTS):
@@ -108,7 +107,7 @@ def _read_split(root: Path, source: Path) -> _Split:
             mask = files.find_inside(root, f"{MASKS}/{stem}.png", where) if has_masks else None
             pose = poses[time, camera]
             shots.check_rigid(pose, f"{source}: w2c[{time}][{camera}]", "world-to-camera")
-            lens = Lens(meta.w, meta.h, intrinsics[time, camera], (0.0, 0.0, 0.0, 0.0))
+            lens = Lens(meta.w, meta.h, intrinsics[time, camera], shots.PINHOLE)
             _check_pinhole(lens.K, f"{source}: k[{time}][{camera}]")
             moment = time / max(1, times - 1)
             listed.append(Shot(path, mask, stem, f"{path} ({where})", moment, torch.from_numpy(pose), lens))

@@ -25,6 +25,7 @@ _OUTSIDE = 2.0  # pixels that OpenCV's rectangle without blank pixels may exceed
 _WIDEST = 0.1  # focal length by the image's side, a field of view of 157 degrees, which no lens without distortion has
 SMALLEST = 1e-6  # pixels; smaller focal lengths become zero in single precision
 _RIGID_TOLERANCE = 1e-4  # D-NeRF writes single precision: its trex is orthonormal to 2.2e-6
+PINHOLE = (0.0, 0.0, 0.0, 0.0)  # the distortion of a lens that has none
 MASKS = "masks"  # the folder with the object number of each pixel, in PNG files
 
 
@@ -115,14 +116,23 @@ class Shot:
     viewmat: Tensor  # [4, 4] float64
     lens: Lens  # its size is that of the image, or another by one ratio
 
+    def path_in(self, root: Path) -> str:
+        """Return the path relative to the scene's folder."""
+        return self.path.relative_to(root).as_posix()
+
 
 @dataclass(frozen=True)
 class Shots:
-    """Hold the views of shots in their order, the SHA-256 of their image files, and what was decided about sizes."""
+    """Hold shots, their views in the same order, the SHA-256 of their image files, and what was decided about sizes."""
 
+    shots: Sequence[Shot]
     views: list[View]
     digests: list[str]
     notes: list[str]
+
+    def by_path(self, root: Path) -> dict[str, str]:
+        """Return the SHA-256 of each image file by its path relative to the scene's folder."""
+        return dict(zip([shot.path_in(root) for shot in self.shots], self.digests, strict=True))
 
 
 def check_rigid(
@@ -202,7 +212,7 @@ def read(
             f"{sum(opaque)} of {len(shots)} images have no alpha and keep their own background, the others get "
             f"{rendition.background}"
         )
-    return Shots(list(views), list(digests), notes)
+    return Shots(shots, list(views), list(digests), notes)
 
 
 def _lens_of_image(size: Size, expected: Size, shot: Shot) -> Lens:

@@ -123,7 +123,7 @@ def _camera(row: dict[str, float], size: Size) -> tuple[torch.Tensor, Lens]:
     viewmat[:3, :3] = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()  # scipy: w last
     viewmat[:3, 3] = row["tx"], row["ty"], row["tz"]
     K = np.array([[row["f"], 0, row["cu"]], [0, row["f"] * row["ar"], row["cv"]], [0, 0, 1]])
-    return torch.from_numpy(viewmat), Lens(*size, K, (0.0, 0.0, 0.0, 0.0))
+    return torch.from_numpy(viewmat), Lens(*size, K, shots.PINHOLE)
 
 
 def _list_images(root: Path, frames: tuple[int, int] | None, cameras: int) -> list[_Image]:

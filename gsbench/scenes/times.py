@@ -102,31 +102,32 @@ class _Column:
 
 @dataclass(frozen=True)
 class NamedImages:
-    """Hold what tells the times of images: their names, and which of them a fixed camera took."""
+    """Hold what tells the times of images: their names and cameras."""
 
     names: Sequence[str]  # with folders
     viewmats: NDArray[np.float64]  # [N, 4, 4] world to camera
-    places: Sequence[Hashable]  # from `places_of`
+    lenses: Sequence[Hashable]  # what is equal for equal intrinsics
     source: Path  # the file that names the images, for messages
 
     @cached_property
     def poses(self) -> NDArray[np.float64]:  # [N, 12]
-        """Rotations and relative positions of the cameras."""
-        return _relative(self.viewmats)
+        """Rotations, and positions relative to the radius of the cameras, so that a scene's unit does not matter."""
+        rotations = self.viewmats[:, :3, :3]
+        centers = -np.einsum("nji,nj->ni", rotations, self.viewmats[:, :3, 3])  # -R^T t
+        centers -= centers.mean(0)
+        radius = np.linalg.norm(centers, axis=1).max() or 1.0
+        return np.concatenate([rotations.reshape(-1, 9), centers / radius], 1)
+
+    @cached_property
+    def places(self) -> list[Hashable]:
+        """A key of each image, equal for images with the same pose and intrinsics: those of a fixed camera."""
+        poses = np.round(self.poses, _SAME_PLACE) + 0.0  # -0 becomes 0
+        return [(pose.tobytes(), lens) for pose, lens in zip(poses, self.lenses, strict=True)]
 
     @property
     def has_fixed_camera(self) -> bool:
         """Whether two images have the same pose and intrinsics."""
         return len(set(self.places)) < len(self.places)
-
-
-def places_of(
-    viewmats: NDArray[np.float64],  # [N, 4, 4] world to camera
-    lenses: Sequence[Hashable],  # what is equal for equal intrinsics
-) -> list[Hashable]:
-    """Return a key of each view that is equal for views with the same pose and intrinsics: those of a fixed camera."""
-    poses = np.round(_relative(viewmats), _SAME_PLACE) + 0.0  # -0 becomes 0
-    return [(pose.tobytes(), lens) for pose, lens in zip(poses, lenses, strict=True)]
 
 
 def of_images(root: Path, images: NamedImages) -> tuple[Times, dict[str, str]]:
@@ -461,15 +462,6 @@ def _chapters(column: _Column, changing: list[_Column], images: NamedImages) -> 
         if repeats and sum(jumps) < _CLEARLY * step * len(jumps):
             chapters.append(other)
     return chapters
-
-
-def _relative(viewmats: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 4, 4] -> [N, 12]
-    """Return rotations, and positions relative to the radius of the cameras, so that a scene's unit does not matter."""
-    rotations = viewmats[:, :3, :3]
-    centers = -np.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])  # -R^T t
-    centers -= centers.mean(0)
-    radius = np.linalg.norm(centers, axis=1).max() or 1.0
-    return np.concatenate([rotations.reshape(-1, 9), centers / radius], 1)
 
 
 def _scaled(values: Sequence[Fraction]) -> list[float]:

@@ -8,7 +8,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from gsbench.scenes.images import Rendition, Size
 from gsbench.scenes.placement import standard_scene
 from gsbench.scenes.points import read_ply
 from gsbench.scenes.scene import HELD_OUT, UP, Scene, View, hold_out
-from gsbench.scenes.shots import MASKS, Lens, Shot, Shots
+from gsbench.scenes.shots import MASKS, PINHOLE, Lens, Shot, Shots
 
 NERFSTUDIO = "transforms.json"
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -48,70 +48,12 @@ _UNDISTORT = "undistort the images, for example by `colmap image_undistorter`"
 
 
 @dataclass(frozen=True)
-class Intrinsics:
-    """Hold the checked intrinsics of a frame, in pixels of the full image; missing ones follow from its size."""
-
-    where: str  # the file, and the frame if it has intrinsics of its own, for messages
-    focal: tuple[float | None, float | None]  # along x and y
-    angle: tuple[float | None, float | None]  # fields of view along x and y in radians
-    principal: tuple[float | None, float | None]
-    size: tuple[float | None, float | None]  # width and height that the file states
-    y_of_file: bool  # whether the frame states a focal length or angle of x alone, and the file one of y
-
-    def lens(self, size: Size) -> Lens:
-        """Return the camera of an image of width x height pixels; it has another size if the file states both sides."""
-        width, height = size
-        if None not in self.size:
-            width, height = (round(side or 0) for side in self.size)  # or 0: for mypy
-        for key, stated, actual in zip("wh", self.size, (width, height), strict=True):
-            if stated is not None and stated != actual:
-                raise InputError(
-                    f"{self.where}: {key}: expected the images' own {actual}, got {stated}: scale all "
-                    "intrinsics with it, or write both w and h"
-                )
-        fx, fy = (self._focal(axis, side) for axis, side in enumerate((width, height)))
-        fx, fy = fx or fy or 0.0, fy or fx or 0.0  # at least one is stated; without the other, pixels are square
-        if self.y_of_file and abs(fx - fy) > _AGREE * fx:
-            raise InputError(
-                f"{self.where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
-                f"differs ({fy:.6g}, not {fx:.6g}): write it in the frame"
-            )
-        cx, cy = (side / 2 if at is None else at for at, side in zip(self.principal, (width, height), strict=True))
-        return Lens(width, height, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), (0.0, 0.0, 0.0, 0.0))
-
-    def _focal(self, axis: int, side: int) -> float | None:
-        """Return the focal length along an axis of an image of `side` pixels; None if the file states none."""
-        focal, angle = self.focal[axis], self.angle[axis]
-        of_angle = None if angle is None else 0.5 * side / math.tan(0.5 * angle)
-        if focal is not None and of_angle is not None and abs(of_angle - focal) > _AGREE * focal:
-            keys = _AXES[axis]
-            raise InputError(
-                f"{self.where}: {keys[0]}: expected {of_angle:.6g} as {keys[1]} says for {side} pixels, "
-                f"got {focal:.6g}: leave out the wrong one, or write w and h of its images"
-            )
-        return of_angle if focal is None else focal
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Hold a checked entry of the list `frames` of a JSON file; its image is not read yet."""
-
-    path: Path
-    mask: Path | None  # file of the object number of each pixel
-    name: str  # relative to the scene's folder: "train/r_000.png"
-    where: str  # the image's path and the field that names it, for messages
-    time: float | None
-    viewmat: Tensor  # [4, 4] float64
-    intrinsics: Intrinsics
-
-
-@dataclass(frozen=True)
-class Split:
-    """Hold the checked content of a JSON file."""
+class CameraFile:
+    """Hold the checked content of a JSON file; its images are not read yet."""
 
     source: Path
-    frames: list[Frame]
-    content: dict[str, Any]  # of the file
+    shots: list[Shot]  # with the times that the file states
+    content: dict[str, Any]
     digest: str
     notes: list[str]
 
@@ -132,24 +74,18 @@ def load_blender(root: Path, name: str, rendition: Rendition) -> Scene:
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
     each pixel (`View.regions`). Masks are measured with (`psnr_object`), not trained with.
     """
-    finder = ImageFinder(root)
-    splits = {split: _read_split(root, f"transforms_{split}.json", finder) for split in ("train", "test")}
+    reader = _Reader(root)
+    splits = {split: reader.read(f"transforms_{split}.json") for split in ("train", "test")}
     if os.path.lexists(root / "transforms_val.json"):  # a broken link is an error, not a data set without val
-        splits["val"] = _read_split(root, "transforms_val.json", finder)
-    timed, notes = _times(list(splits.values()))
-    size = shots.size_of(splits["train"].frames[0].path, splits["train"].frames[0].where)  # shots.read refuses others
-    listed = [
-        shot for split, part in zip(splits.values(), timed, strict=True) for shot in _shots_of(split.frames, part, size)
-    ]
-    loaded = shots.read(listed, rendition)
+        splits["val"] = reader.read("transforms_val.json")
+    timed, notes = _timed(root, list(splits.values()))
+    loaded = shots.read([shot for part in timed for shot in part], rendition)
     in_order = iter(loaded.views)
-    views = {name: list(islice(in_order, len(split.frames))) for name, split in splits.items()}
-    frames = [frame for split in splits.values() for frame in split.frames]
-    digests = {frame.name: digest for frame, digest in zip(frames, loaded.digests, strict=True)}
-    digests |= {split.source.name: split.digest for split in splits.values()}
+    views = {name: list(islice(in_order, len(split.shots))) for name, split in splits.items()}
+    digests = loaded.by_path(root) | {split.source.name: split.digest for split in splits.values()}
     if times.table_of(root):
         notes.append(f"{times.TABLE} is not read: the times are those of transforms_*.json")
-    notes += [*(note for split in splits.values() for note in split.notes), *finder.notes(), *loaded.notes]
+    notes += [*(note for split in splits.values() for note in split.notes), *reader.finder.notes(), *loaded.notes]
     return standard_scene(
         name=name,
         train=views["train"],
@@ -171,19 +107,17 @@ def load_nerfstudio(root: Path, name: str, rendition: Rendition) -> Scene:
     frames, otherwise from the names of the images (`gsbench.scenes.times`). The points of `ply_file_path` are the
     initial points.
     """
-    finder = ImageFinder(root)
-    split = _read_split(root, NERFSTUDIO, finder, _NERFSTUDIO_KEYS)
-    if split.frames[0].time is None or times.table_of(root):
+    reader = _Reader(root)
+    split = reader.read(NERFSTUDIO, _NERFSTUDIO_KEYS)
+    if split.shots[0].time is None or times.table_of(root):
         _check_all_or_none([split])
-        timed, digests = times.of_images(root, _named_images(split))
+        given, digests = times.of_images(root, _named_images(root, split))
+        listed, lines = _with_times(split.shots, given.values), given.notes
     else:
-        (values,), lines = _times([split])
-        timed, digests = times.Times(values, lines), {}
-    size = shots.size_of(split.frames[0].path, split.frames[0].where)
-    listed_shots = _shots_of(split.frames, timed.values, size)
-    loaded = shots.read(listed_shots, rendition)
-    digests |= dict(zip([frame.name for frame in split.frames], loaded.digests, strict=True))
-    train, val, test, how = _split_views(split, finder, loaded.views)
+        ((listed,), lines), digests = _timed(root, [split]), {}
+    loaded = shots.read(listed, rendition)
+    digests |= loaded.by_path(root)
+    train, val, test, how = _split_views(split, reader.finder, loaded.views)
     shared = _shared_views({"train": train, "val": val, "test": test}, loaded)
     points = split.content.get("ply_file_path")
     initial = None
@@ -201,82 +135,73 @@ def load_nerfstudio(root: Path, name: str, rendition: Rendition) -> Scene:
         background=rendition.background,
         points=initial,
         fingerprint=files.fingerprint(digests | {NERFSTUDIO: split.digest}),
-        notes=(how, *timed.notes, *split.notes, *finder.notes(), *loaded.notes, *shared),
+        notes=(how, *lines, *split.notes, *reader.finder.notes(), *loaded.notes, *shared),
     )
 
 
-def _read_split(
-    root: Path,  # the scene's folder, resolved
-    name: str,  # of the file, such as transforms_train.json
-    finder: ImageFinder,
-    keys: frozenset[str] = frozenset(),  # of the whole file that the caller reads; unknown others get a note
-) -> Split:
-    """Read and check a file of cameras."""
-    source = root / name
-    data = read_file(source, str(source), MAX_JSON)
-    content = parse_json(data, str(source))
-    if not isinstance(content, dict):
-        raise InputError(f"{source}: expected a JSON object with 'frames', got {_brief(content)}")
-    frames = content.get("frames")
-    if not isinstance(frames, list):
-        raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")
-    if not frames:
-        raise InputError(f"{source}: frames: expected at least one frame, got an empty list")
-    checked = [_read_frame(root, content, frame, source, index, finder) for index, frame in enumerate(frames)]
-    index_of: dict[Path, int] = {}
-    for index, frame in enumerate(checked):
-        if index_of.setdefault(frame.path, index) != index:
-            raise InputError(
-                f"{source}: frames[{index}].file_path: expected each image once, frames[{index_of[frame.path]}] has "
-                f"{frame.name[:80]!a} too: remove one of the two"
-            )
-    unread = (content.keys() - _LENS_KEYS - {"frames", *keys}) | (
-        {key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS
-    )
-    return Split(source, checked, content, files.digest(data), files.unread(name, unread))
+class _Reader:
+    """Reads the files of cameras of a scene, whose images all have the size of the first one."""
 
+    def __init__(self, root: Path) -> None:
+        """Store the scene's folder, which is resolved."""
+        self._root, self.finder = root, ImageFinder(root)
+        self._size: Size | None = None  # of the first image
 
-def _shots_of(frames: Sequence[Frame], timed: Sequence[float | None], size: Size) -> list[Shot]:
-    """Return what is needed to read the images of frames; `size` is the width and height of the first image."""
-    return [
-        Shot(
-            frame.path,
-            frame.mask,
-            files.without_suffix(frame.name),
-            frame.where,
-            time,
-            frame.viewmat,
-            frame.intrinsics.lens(size),
+    def read(
+        self,
+        name: str,  # of the file, such as transforms_train.json
+        keys: frozenset[str] = frozenset(),  # of the whole file that the caller reads; unknown others get a note
+    ) -> CameraFile:
+        """Read and check a file of cameras."""
+        source = self._root / name
+        data = read_file(source, str(source), MAX_JSON)
+        content = parse_json(data, str(source))
+        if not isinstance(content, dict):
+            raise InputError(f"{source}: expected a JSON object with 'frames', got {_brief(content)}")
+        frames = content.get("frames")
+        if not isinstance(frames, list):
+            raise InputError(f"{source}: frames: expected a list of frames, got {_brief(frames)}")
+        if not frames:
+            raise InputError(f"{source}: frames: expected at least one frame, got an empty list")
+        listed = [self._shot(content, frame, source, index) for index, frame in enumerate(frames)]
+        index_of: dict[Path, int] = {}
+        for index, shot in enumerate(listed):
+            if index_of.setdefault(shot.path, index) != index:
+                raise InputError(
+                    f"{source}: frames[{index}].file_path: expected each image once, frames[{index_of[shot.path]}] "
+                    f"has {shot.path_in(self._root)[:80]!a} too: remove one of the two"
+                )
+        unread = (content.keys() - _LENS_KEYS - {"frames", *keys}) | (
+            {key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS
         )
-        for frame, time in zip(frames, timed, strict=True)
-    ]
+        return CameraFile(source, listed, content, files.digest(data), files.unread(name, unread))
+
+    def _shot(self, content: dict[str, Any], frame: object, source: Path, index: int) -> Shot:
+        """Check entry number `index` of `frames`: image path, time, camera pose and intrinsics."""
+        where = f"{source}: frames[{index}]"
+        if not isinstance(frame, dict):
+            raise InputError(
+                f"{where}: expected an object with 'file_path' and 'transform_matrix', got {_brief(frame)}"
+            )
+        named = frame.get("file_path")
+        if not isinstance(named, str) or not named:
+            raise InputError(f"{where}.file_path: expected the image's path, got {_brief(named)}")
+        path = self.finder.find(named, f"{where}.file_path")
+        time = _number(frame["time"], f"{where}.time") if "time" in frame else None
+        viewmat = _viewmat(frame.get("transform_matrix"), f"{where}.transform_matrix")
+        named_by = f"{path} ({source.name}, frames[{index}].file_path)"
+        self._size = self._size or shots.size_of(path, named_by)
+        lens = _read_lens(content, frame, self._size, str(source), where)
+        masks, name = path.parent / MASKS, files.without_suffix(path.relative_to(self._root).as_posix())
+        mask = masks / f"{files.without_suffix(path.name)}.png" if masks.is_dir() else None
+        return Shot(path, mask, name, named_by, time, viewmat, lens)
 
 
-def _named_images(split: Split) -> times.NamedImages:
-    """Return the names of a file's frames, their poses, and which of them have the same pose and intrinsics."""
-    viewmats = np.stack([frame.viewmat.numpy() for frame in split.frames])
-    lenses = [(frame.intrinsics.focal, frame.intrinsics.angle) for frame in split.frames]
-    names = [frame.name for frame in split.frames]
-    return times.NamedImages(names, viewmats, times.places_of(viewmats, lenses), split.source)
-
-
-def _read_frame(
-    root: Path, content: dict[str, Any], frame: object, source: Path, index: int, finder: ImageFinder
-) -> Frame:
-    """Check entry number `index` of the list `frames` of a JSON file: image path, time, intrinsics and camera pose."""
-    where = f"{source}: frames[{index}]"
-    if not isinstance(frame, dict):
-        raise InputError(f"{where}: expected an object with 'file_path' and 'transform_matrix', got {_brief(frame)}")
-    name = frame.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise InputError(f"{where}.file_path: expected the image's path, got {_brief(name)}")
-    path = finder.find(name, f"{where}.file_path")
-    time = _number(frame["time"], f"{where}.time") if "time" in frame else None
-    viewmat = _viewmat(frame.get("transform_matrix"), f"{where}.transform_matrix")
-    named_by = f"{path} ({source.name}, frames[{index}].file_path)"
-    mask = path.parent / MASKS / f"{files.without_suffix(path.name)}.png" if (path.parent / MASKS).is_dir() else None
-    camera = _read_intrinsics(content, frame, str(source), where)
-    return Frame(path, mask, path.relative_to(root).as_posix(), named_by, time, viewmat, camera)
+def _named_images(root: Path, split: CameraFile) -> times.NamedImages:
+    """Return the names, poses and lenses of a file's images."""
+    names = [shot.path_in(root) for shot in split.shots]
+    viewmats = np.stack([shot.viewmat.numpy() for shot in split.shots])
+    return times.NamedImages(names, viewmats, [shot.lens.key for shot in split.shots], split.source)
 
 
 def _viewmat(
@@ -296,30 +221,34 @@ def _viewmat(
     return torch.from_numpy(viewmat)
 
 
-def _times(splits: list[Split]) -> tuple[list[list[float | None]], list[str]]:
-    """Return the times of each file's frames in [0, 1] by their field `time`, or None for all, and notes."""
+def _timed(root: Path, splits: list[CameraFile]) -> tuple[list[list[Shot]], list[str]]:
+    """Return the shots of each file with times in [0, 1] by their field `time`, or without times, and notes."""
     _check_all_or_none(splits)
-    if splits[0].frames[0].time is None:
-        return [[None] * len(split.frames) for split in splits], []
+    if splits[0].shots[0].time is None:
+        return [split.shots for split in splits], []
     # or 0.0: for mypy, as all have a time
-    fields = {str(split.source): [frame.time or 0.0 for frame in split.frames] for split in splits}
+    fields = {str(split.source): [shot.time or 0.0 for shot in split.shots] for split in splits}
     for split in splits:
-        times.check_distinct(_named_images(split), fields[str(split.source)], split.source, _OWN_TIMES)
+        times.check_distinct(_named_images(root, split), fields[str(split.source)], split.source, _OWN_TIMES)
     timed, notes = times.of_fields(fields)
-    return [timed[str(split.source)] for split in splits], notes
+    return [_with_times(split.shots, timed[str(split.source)]) for split in splits], notes
 
 
-def _check_all_or_none(splits: Sequence[Split]) -> None:
+def _with_times(listed: Sequence[Shot], timed: Sequence[float | None]) -> list[Shot]:
+    return [replace(shot, time=time) for shot, time in zip(listed, timed, strict=True)]
+
+
+def _check_all_or_none(splits: Sequence[CameraFile]) -> None:
     """Raise InputError if some frames of a data set have a time and others do not."""
-    all_frames = [(split, index, frame) for split in splits for index, frame in enumerate(split.frames)]
-    first = all_frames[0][2].time
-    for split, index, frame in all_frames:
-        if (frame.time is None) != (first is None):
-            has, other = ("no time", "has one") if frame.time is None else ("a time", "has none")
-            raise InputError(
-                f"{split.source}: frames[{index}].time: this frame has {has} and the first frame {other}: "
-                "give a time to all frames or to none"
-            )
+    first = splits[0].shots[0].time
+    for split in splits:
+        for index, shot in enumerate(split.shots):
+            if (shot.time is None) != (first is None):
+                has, other = ("no time", "has one") if shot.time is None else ("a time", "has none")
+                raise InputError(
+                    f"{split.source}: frames[{index}].time: this frame has {has} and the first frame {other}: "
+                    "give a time to all frames or to none"
+                )
 
 
 def _shared_views(views: dict[str, list[View]], loaded: Shots) -> list[str]:
@@ -342,7 +271,7 @@ def _shared_views(views: dict[str, list[View]], loaded: Shots) -> list[str]:
 
 
 def _split_views(
-    split: Split, finder: ImageFinder, views: list[View]
+    split: CameraFile, finder: ImageFinder, views: list[View]
 ) -> tuple[list[View], list[View], list[View], str]:
     """Return the views of train, val and test, and a sentence that says how they were split."""
     lists: list[Any] = [split.content.get(key) for key in _SPLITS]
@@ -354,7 +283,7 @@ def _split_views(
             )
         train, test = hold_out(sorted(views, key=lambda view: (view.time or 0.0, view.name)), HELD_OUT)
         return train, [], test, f"split: every {HELD_OUT}th view in the order of time is a test view"
-    by_path = {frame.path: view for frame, view in zip(split.frames, views, strict=True)}
+    by_path = {shot.path: view for shot, view in zip(split.shots, views, strict=True)}
     by_split: list[list[View]] = []
     for key, names in zip(_SPLITS, lists, strict=True):
         where, of_split = f"{split.source}: {key}", dict[int, View]()  # by id, as views have no hash
@@ -377,11 +306,11 @@ def _split_views(
     return train, val, test, f"split: as the file lists, {len(train)}, {len(val)} and {len(test)} of {len(views)} views"
 
 
-def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], source: str, where: str) -> Intrinsics:
-    """Read the intrinsics of a frame: focal lengths or fields of view, principal point and size.
+def _read_lens(content: Mapping[str, Any], frame: Mapping[str, Any], size: Size, source: str, where: str) -> Lens:
+    """Read the intrinsics of a frame whose image has the given size: focal lengths or fields of view, and the rest.
 
     The keys of the frame come before those of the whole file, `content`. A focal length there also replaces the file's
-    field of view along this axis, and the reverse.
+    field of view along this axis, and the reverse. The lens has another size than the image if w and h say so.
     """
     of_frame = _LENS_KEYS & frame.keys()
     # A key of the frame replaces both keys of its axis.
@@ -406,15 +335,36 @@ def _read_intrinsics(content: Mapping[str, Any], frame: Mapping[str, Any], sourc
     for _, key in _AXES:
         if key in values and not 1e-6 < values[key] < math.pi:
             raise InputError(f"{where}: {key}: expected radians between 0 and pi, got {values[key]}")
+    width, height = (round(values["w"]), round(values["h"])) if {"w", "h"} <= values.keys() else size
+    for key, actual in (("w", width), ("h", height)):
+        if (stated := values.get(key, actual)) != actual:
+            raise InputError(
+                f"{where}: {key}: expected the images' own {actual}, got {stated}: scale all "
+                "intrinsics with it, or write both w and h"
+            )
+    fx, fy = (_focal(values, axis, side, where) for axis, side in zip(_AXES, (width, height), strict=True))
+    fx, fy = fx or fy, fy or fx  # at least one is stated; without the other, pixels are square
     x_keys, y_keys = ({*axis} for axis in _AXES)
-    return Intrinsics(
-        where,
-        focal=(values.get("fl_x"), values.get("fl_y")),
-        angle=(values.get("camera_angle_x"), values.get("camera_angle_y")),
-        principal=(values.get("cx"), values.get("cy")),
-        size=(values.get("w"), values.get("h")),
-        y_of_file=bool(of_frame & x_keys and not of_frame & y_keys and y_keys & content.keys()),
-    )
+    is_y_of_file = bool(of_frame & x_keys and not of_frame & y_keys and y_keys & content.keys())
+    if is_y_of_file and abs(fx - fy) > _AGREE * fx:
+        raise InputError(
+            f"{where}: {' or '.join(_AXES[0])}: expected fl_y too, as that of the whole file "
+            f"differs ({fy:.6g}, not {fx:.6g}): write it in the frame"
+        )
+    cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
+    return Lens(width, height, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), PINHOLE)
+
+
+def _focal(values: Mapping[str, float], keys: tuple[str, str], side: int, where: str) -> float:
+    """Return the focal length along an axis of an image of `side` pixels; 0 if no key states it."""
+    focal, angle = (values.get(key, 0.0) for key in keys)
+    of_angle = 0.5 * side / math.tan(0.5 * angle) if angle else 0.0
+    if focal and angle and abs(of_angle - focal) > _AGREE * focal:
+        raise InputError(
+            f"{where}: {keys[0]}: expected {of_angle:.6g} as {keys[1]} says for {side} pixels, "
+            f"got {focal:.6g}: leave out the wrong one, or write w and h of its images"
+        )
+    return focal or of_angle
 
 
 def _check_pinhole(values: Mapping[str, Any], where: str) -> None:

@@ -31,12 +31,13 @@ def nudged(viewmats: np.ndarray) -> np.ndarray:
 
 
 def of_names(names: Sequence[str], viewmats: np.ndarray) -> times.Times:
-    places = times.places_of(viewmats, [0] * len(names))
-    return times.of_names(times.NamedImages(names, viewmats, places, SOURCE))
+    return times.of_names(times.NamedImages(names, viewmats, [0] * len(names), SOURCE))
 
 
-def of_table(data: bytes, names: Sequence[str], places: Sequence[object]) -> times.Times:
-    return times.of_table(data, Path("times.csv"), times.NamedImages(names, circle(len(names)), places, SOURCE))
+def of_table(data: bytes, names: Sequence[str], cameras: int = 1) -> times.Times:
+    """The times of images of one camera that stands still, or of one that moves."""
+    viewmats = circle(cameras) if cameras > 1 else np.tile(np.eye(4), (len(names), 1, 1))
+    return times.of_table(data, Path("times.csv"), times.NamedImages(names, viewmats, [0] * len(names), SOURCE))
 
 
 FORMS: dict[str, Callable[[int, int], str]] = {
@@ -213,8 +214,7 @@ TABLES = {
 @pytest.mark.parametrize("kind", TABLES)
 def test_tables_as_programs_write_them(kind):
     """Catches a table that is refused for what a spreadsheet adds to it."""
-    names = ["a.png", "b.png", "c.png"]
-    timed = of_table(TABLES[kind].encode(), names, names)
+    timed = of_table(TABLES[kind].encode(), ["a.png", "b.png", "c.png"])
     assert timed.values == pytest.approx([0, 1 / 3, 1])
     assert ("left out" in timed.notes[0]) == (kind == "rows of others")
     assert ("'frame, note'" in timed.notes[0]) == (kind == "another column")
@@ -233,7 +233,7 @@ def test_tables_as_programs_write_them(kind):
 def test_a_table_that_contradicts_itself_is_refused(content, words):
     """Catches two images of one camera at one time, and a row of another length."""
     with pytest.raises(InputError, match=words):
-        of_table(content.encode(), ["a", "b", "c"], [0, 0, 0])
+        of_table(content.encode(), ["a", "b", "c"])
 
 
 def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path):
@@ -243,7 +243,7 @@ def test_a_table_of_any_case_is_read_and_a_tiny_exponent_ends(tmp_path):
     timed, digests = times.of_images(tmp_path, times.NamedImages(["a", "b"], circle(2), [0, 1], SOURCE))
     assert timed.values == [0, 1]
     assert list(digests) == ["Times.CSV"]
-    timed = of_table(b"name,time\na,3\nb,3\n", ["a", "b"], [0, 1])
+    timed = of_table(b"name,time\na,3\nb,3\n", ["a", "b"], cameras=2)
     assert timed.values == [None, None]
 
 
@@ -268,7 +268,8 @@ def test_places_do_not_depend_on_the_unit():
         viewmats = np.repeat(circle(6), 2, 0)
         viewmats[:, :3, 3] *= factor
         viewmats[1::2, :3, 3] *= 1 + 1e-9
-        places = times.places_of(viewmats, [0] * 12)
+        names = [""] * 12
+        places = times.NamedImages(names, viewmats, [0] * 12, SOURCE).places
         assert len(set(places)) == 6
         assert places[::2] == places[1::2]
-        assert len(set(times.places_of(viewmats, [0, 1] * 6))) == 12
+        assert len(set(times.NamedImages(names, viewmats, [0, 1] * 6, SOURCE).places)) == 12
