@@ -5,8 +5,6 @@ A file that is damaged or of another kind raises `InputError`; `where` is its pa
 
 import io
 import os
-import struct
-import zlib
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from gsbench.errors import InputError, one_line
@@ -53,7 +51,7 @@ class Kind(NamedTuple):
 
 COLORS = Kind({2: (8, 16), 6: (8, 16), 3: (1, 2, 4, 8)}, "8- or 16-bit RGB or RGBA")  # 3: a palette of RGB
 NUMBERS = Kind({0: (8,)}, "8-bit grey, the number of the object in each pixel")
-_DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel
+_DEPTH_AT = 24  # index of the byte of a PNG that has the bits per channel; its colour type follows
 DECODING = 64  # bytes per pixel while an image is decoded and composited; measured: 48 for 8 bits, 52 for 16
 # The images of a scene are stored as floats if all together need at most this many bytes, else in 8 bits. To convert an
 # image of 800 x 800 from 8 bits takes 6 ms on one thread. With 160 x 160 it would take 0.2 ms of a step of 6 ms.
@@ -102,59 +100,37 @@ def read_image(path: Path, where: str) -> bytes:
 
 def photo_size(data: bytes, where: str) -> Size:
     """Return the width and height of a PNG, checked as by `png_size`, or of a JPEG, of which the header is checked."""
-    if not data.startswith((_JPEG, _SIGNATURE)):
+    if data.startswith(_SIGNATURE):
+        return png_size(data, where)
+    if not data.startswith(_JPEG):
         raise DamagedError(
             f"{where}: expected a PNG or a JPEG, the file begins with {data[:8]!r}: convert it, or copy it again"
         )
-    if not data.startswith(_JPEG):
-        return png_size(data, where)
-    with _jpeg(data, where) as image:
+    with _opened(data, where) as image:
         if image.mode != "RGB":
             raise InputError(f"{where}: expected a JPEG of RGB, got one of {image.mode}: convert it")
-        return _check_size(*image.size, where)
+        return _check_size(image.size, where)
 
 
 def is_turned(data: bytes) -> bool:  # of an image that was checked
     """Return whether an image has an EXIF orientation by which other programs turn or mirror it."""
-    if data.startswith(_JPEG):
-        with _jpeg(data, "EXIF") as image:
-            return image.getexif().get(_ORIENTATION, 1) != 1  # 1: stored as it is shown
-    exif = Image.Exif()
-    with suppress(Exception):  # Pillow raises many types of exceptions for a damaged chunk, of which nothing is read
-        exif.load(next((body for name, body in _chunks(data) if name == b"eXIf"), b""))
-    return exif.get(_ORIENTATION, 1) != 1
-
-
-def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the name and the content of each chunk of a checked PNG."""
-    at = len(_SIGNATURE)
-    while at < len(data):
-        length, name = struct.unpack_from(">I4s", data, at)
-        yield name, data[at + 8 : at + 8 + length]
-        at += 12 + length  # 4 bytes each of length, name and checksum
+    with suppress(InputError), _opened(data, "EXIF") as image:  # nothing is read of a damaged part
+        # The method of a PNG would decode the pixels, to find what stands behind them.
+        return Image.Image.getexif(image).get(_ORIENTATION, 1) != 1  # 1: stored as it is shown
+    return False
 
 
 def png_size(data: bytes, where: str, kind: Kind = COLORS) -> Size:
     """Return the width and height of a PNG after checking the length and checksum of all chunks, without decoding."""
     if not data.startswith(_SIGNATURE):
         raise DamagedError(f"{where}: expected a PNG, the file begins with {data[:8]!r}")
-    size = (0, 0)
-    at = len(_SIGNATURE)
-    while True:
-        header = data[at : at + 8]
-        length, name = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")  # then it has no checksum
-        body, checksum = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-        if len(checksum) < 4:
-            raise DamagedError(f"{where}: truncated PNG, it ends at byte {len(data)} before its IEND: copy it again")
-        if zlib.crc32(name + body) != int.from_bytes(checksum, "big"):
-            raise DamagedError(f"{where}: damaged PNG, wrong checksum of chunk {name!r} at byte {at}: copy it again")
-        if at == len(_SIGNATURE):
-            if name != b"IHDR" or length != 13:
-                raise DamagedError(f"{where}: damaged PNG, its first chunk is {name!r} and not IHDR: copy it again")
-            size = _check_header(body, where, kind)
-        if name == b"IEND":
-            return size
-        at += 12 + length
+    with _opened(data, where) as image:
+        size = image.size
+        image.verify()
+    depth, color = data[_DEPTH_AT : _DEPTH_AT + 2]
+    if depth not in kind.depths.get(color, ()):
+        raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits: convert it")
+    return _check_size(size, where)
 
 
 def reduced_size(size: Size, downscale: int, where: str) -> Size:
@@ -206,7 +182,7 @@ def decode_photo(data: bytes, where: str) -> Pixels:  # [H, W, 3|4] RGB or RGBA,
     """
     photo_size(data, where)
     if data.startswith(_JPEG):
-        with _jpeg(data, where) as image:  # Pillow, because OpenCV fills the missing rows of a JPEG with grey
+        with _opened(data, where) as image:  # Pillow, because OpenCV fills the missing rows of a JPEG with grey
             return np.array(image)
     pixels = _decode(data, where)
     if pixels.ndim != 3 or pixels.dtype not in (np.uint8, np.uint16):
@@ -300,15 +276,17 @@ def _composite_8_bits(
 
 
 @contextmanager
-def _jpeg(data: bytes, where: str) -> Iterator[Image.Image]:
-    """Open a JPEG within a `with` block; what Pillow raises there is raised as InputError."""
+def _opened(data: bytes, where: str) -> Iterator[Image.Image]:
+    """Open a PNG or a JPEG within a `with` block; what Pillow raises there is raised as DamagedError."""
+    form = "JPEG" if data.startswith(_JPEG) else "PNG"
     try:
-        with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
+        with Image.open(io.BytesIO(data), formats=(form,)) as image:
             yield image
     except (InputError, MemoryError):
         raise
     except Exception as error:  # Pillow raises many types of exceptions for damaged files
-        raise DamagedError(f"{where}: damaged JPEG ({one_line(error)[:80]}): copy it again") from None
+        why = "its header" if isinstance(error, UnidentifiedImageError) else one_line(error)[:80]
+        raise DamagedError(f"{where}: damaged {form} ({why}): copy it again") from None
 
 
 def _decode(data: bytes, where: str) -> NDArray[Any]:
@@ -324,21 +302,8 @@ def _decode(data: bytes, where: str) -> NDArray[Any]:
     return pixels
 
 
-def _check_header(header: bytes, where: str, kind: Kind) -> Size:
-    """Check the header chunk IHDR of a PNG and return width and height (PNG specification, section 11.2.2)."""
-    width, height, depth, color, compression, filtering, interlacing = struct.unpack(">IIBBBBB", header)
-    _check_size(width, height, where)
-    if depth not in kind.depths.get(color, ()):
-        raise InputError(f"{where}: expected {kind.words}, got PNG's colour type {color} of {depth} bits: convert it")
-    if compression or filtering or interlacing > 1:
-        raise DamagedError(f"{where}: damaged PNG, its compression, filter or interlacing is unknown: copy it again")
-    return width, height
-
-
-def _check_size(width: int, height: int, where: str) -> Size:
-    """Return the size of an image; raise InputError if it has no or too many pixels."""
-    if width == 0 or height == 0:
-        raise InputError(f"{where}: expected an image with pixels, its size is {width}x{height}: render it again")
-    if width * height > _MAX_PIXELS:
-        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {width}x{height}: resize it")
-    return width, height
+def _check_size(size: Size, where: str) -> Size:
+    """Return the size of an image; raise InputError if it has too many pixels."""
+    if size[0] * size[1] > _MAX_PIXELS:
+        raise InputError(f"{where}: expected at most {_MAX_PIXELS} pixels, its size is {size[0]}x{size[1]}: resize it")
+    return size

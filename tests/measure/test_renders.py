@@ -55,7 +55,7 @@ def moved(name: str, make: Callable[[Path], object]) -> Callable[[Path], object]
         (put("r_0.npy", npy(FLOATS)), "expected one image of a name, got r_0.npy and r_0.png"),
         (put("r_2.png", png(BYTES)), "expected an image of each evaluated view by name, got one of no view: r_2"),
         (lambda folder: (folder / "r_1.png").unlink(), "by name, got none of r_1"),
-        (put("r_0.png", png(BYTES)[:-20]), "truncated PNG"),
+        (put("r_0.png", png(BYTES)[:-20]), "damaged PNG"),
         (put("r_0.png", b"GIF89a"), "expected a PNG or a JPEG"),
         (put("r_0.png", png(BYTES[..., 0])), "got PNG's colour type 0 of 8 bits"),
         (put("r_0.png", png(BYTES.astype(np.uint16))), "16-bit PNG and 8-bit PNG: keep one kind"),

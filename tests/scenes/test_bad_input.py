@@ -73,11 +73,9 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png(
-    width: int, height: int, pixels: bytes, color: int = 6, depth: int = 8, extra: bytes = b"", interlacing: int = 0
-) -> bytes:
+def png(width: int, height: int, pixels: bytes, color: int = 6, depth: int = 8, extra: bytes = b"") -> bytes:
     """A PNG with right checksums around any header, pixels and other chunks."""
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, interlacing))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0))
     return SIGNATURE + header + extra + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
 
 
@@ -91,17 +89,17 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "png missing": (lambda root: (root / IMAGE).unlink(), IMAGE, PATH),
     "png is a folder": (lambda root: [(root / IMAGE).unlink(), (root / IMAGE).mkdir()], IMAGE, PATH),
     "png is a pipe": (pipe(IMAGE), IMAGE, PATH),
-    "png truncated": (truncate(IMAGE), IMAGE, "truncated PNG"),
+    "png truncated": (truncate(IMAGE), IMAGE, "damaged PNG (Truncated File"),
     "png empty": (write(IMAGE, b""), IMAGE, "copy it again"),
     "png is half a jpeg": (write(IMAGE, b"\xff\xd8\xff\xe0 JFIF"), IMAGE, "damaged JPEG"),
     "png is a gif": (write(IMAGE, b"GIF89a"), IMAGE, "expected a PNG or a JPEG"),
     "png without header": (write(IMAGE, SIGNATURE + chunk(b"IEND", b"")), IMAGE, "damaged PNG"),
-    "png of zero size": (write(IMAGE, png(0, 6, b"")), IMAGE, "0x6"),
-    "png of absurd size": (write(IMAGE, png(60000, 60000, b"")), IMAGE, "60000x60000"),
+    "png of zero size": (write(IMAGE, png(0, 6, b"")), IMAGE, "damaged PNG (its header)"),
+    "png of absurd size": (write(IMAGE, png(60000, 60000, b"")), IMAGE, "3600000000 pixels) exceeds"),
+    "png of 67 million pixels": (write(IMAGE, png(8192, 8193, b"")), IMAGE, "its size is 8192x8193"),
     "png with too few rows": (write(IMAGE, png(8, 6, bytes(33))), IMAGE, "cannot decode"),
     "png of 10 GB": (lambda root: os.truncate(root / IMAGE, 10**10), IMAGE, "at most"),
-    "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "3 bits"),
-    "png of interlacing 9": (write(IMAGE, png(8, 6, bytes(6 * 33), interlacing=9)), IMAGE, "interlacing is unknown"),
+    "png of 3 bits": (write(IMAGE, png(8, 6, bytes(6 * 9), color=6, depth=3)), IMAGE, "damaged PNG (its header)"),
     "png is grey": (write(IMAGE, png(8, 6, bytes(54), color=0)), IMAGE, "RGB or RGBA, got PNG's colour type 0 of 8"),
     "png of another size": (paint(IMAGE, 6, 9, 4), IMAGE, "9x6"),
     "png of another size in test": (paint("test/r_0.png", 3, 8, 4), "test/r_0.png", "8x3"),
@@ -243,7 +241,7 @@ def test_nothing_known_in_the_folder(tmp_path, name):
 GOOD_PNG = (folder() / "suzanne" / "test" / "r_000.png").read_bytes()
 
 
-@given(st.integers(0, len(GOOD_PNG) - 1), st.integers(0, 255))
+@given(st.integers(0, len(GOOD_PNG) - 5), st.integers(0, 255))  # the last 4 are the checksum of an empty chunk
 def test_a_damaged_png_is_refused(at, flip):
     """Catches a changed byte that becomes wrong pixels in a lenient decoder, and missing rows that come out black."""
     data = bytearray(GOOD_PNG)

@@ -341,7 +341,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "fewer images than the split needs": (lambda taken: small_model(taken, NAMES[:7]), "at least 8 images"),
     "image missing": (image(Path.unlink), "frame_001.png.*found none"),
     "image is a link to a device": (image(link("/dev/zero")), "expected a file, found a device"),
-    "image truncated": (image(lambda path: os.truncate(path, 40)), "truncated PNG"),
+    "image truncated": (image(lambda path: os.truncate(path, 40)), "damaged PNG"),
     "another size": (image(paint(9, 9, 3)), "expected 16x12 as its camera, or both sides resized by one .*got 9x9"),
     "jpeg cut": (jpeg(lambda path: os.truncate(path, path.stat().st_size - 40)), "damaged JPEG.*truncated"),
     "jpeg's head alone": (jpeg(lambda path: os.truncate(path, 20)), "frame_001.jpeg.*damaged JPEG"),

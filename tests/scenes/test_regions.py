@@ -90,7 +90,7 @@ DAMAGES: list[tuple[Callable[[Path], object], str]] = [
     (lambda path: write_image(path, NUMBERS[:, :7]), "expected 8x6 as the image of this mask, got 7x6"),
     (lambda path: write_image(path, np.zeros((6, 8, 3), np.uint8)), "expected 8-bit grey"),
     (lambda path: write_image(path, NUMBERS.astype(np.uint16)), "expected 8-bit grey"),
-    (lambda path: path.write_bytes(path.read_bytes()[:-20]), "truncated PNG"),
+    (lambda path: path.write_bytes(path.read_bytes()[:-20]), "damaged PNG"),
     (lambda path: path.write_bytes(b"no PNG"), "expected a PNG"),
 ]
 
