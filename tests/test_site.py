@@ -98,7 +98,7 @@ def test_the_tables_name_every_model_and_key():
     assert models == sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
     config = tables.config()
     assert "`train.densify.every=100` | least steps between two rounds (≥1)\n" in config
-    assert "`train.penalties.opacity,size,strain.weight=0.0` | factor of the term (≥0)\n" in config
+    assert "`train.penalties.opacity,size.weight=0.0` | factor of the term (≥0)\n" in config
     assert "`train.checkpoint_minutes=2.0` | time between two checkpoints (≥0 minutes)\n" in config
     assert "`scene.name` | folder in data.root; required\n" in config
 

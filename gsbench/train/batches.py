@@ -51,8 +51,7 @@ def _order(views: int, seed: int, epoch: int) -> list[int]:
 def generator(seed: int, *purpose: int) -> torch.Generator:
     """Return a random generator whose seed is a hash of the run's seed and more numbers, such as the step.
 
-    Taken are (): the first Gaussians; (epoch): the order of views; (step): density control; (step, 1): its noise; and
-    (step, DRAWS, view) with `gsbench.train.regularisers.DRAWS`: penalties.
+    Taken are (): the first Gaussians; (epoch): the order of views; (step): density control; and (step, 1): its noise.
     """
     mixed = 0
     for number in (seed, *purpose):  # a step of Knuth's linear congruential generator MMIX for each number

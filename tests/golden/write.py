@@ -41,7 +41,7 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     ),
     "4dgs": (
         *("+exp=mini", "scene=suzanne", "scene.downscale=5", "model=4dgs", *SHORT, "optim=sparse_adam", "seed=3"),
-        *("train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1"),
+        *("train.densify.kind=multiview", "train.densify.thin_to=0.8"),
         *("train.coarse=[[2,20]]", "train.cooldown_from=50", "raster.antialias=true"),
     ),
     "patience": ("model=4dgs", *SHORT, "train.patience=0.5"),  # ends with its best iteration
@@ -66,7 +66,7 @@ COMMANDS = (
     "+exp=mini scene=suzanne model=4dgs train.lengths=4",
     "+exp=mini scene=suzanne model=6dgs +ablation=schur",
     "+exp=ablation scene=suzanne model=7dgs +ablation=no_agr",
-    "+exp=mini scene=suzanne model=freetime train.penalties.strain.weight=0.5 train.penalties.strain.stop=100",
+    "+exp=mini scene=suzanne model=freetime train.penalties.size.weight=0.5 train.penalties.size.stop=100",
     "+exp=mini scene=suzanne model=ubs +recipe=mcmc train.densify.max_gaussians=5000",
     "+exp=dnerf data.root=/data scene=trex +recipe=paper protocol.best_on_test=true",
     "+exp=dnerf data.root=/data scene=trex model=4dgs scene.downscale=8 data.initial_points=20000"

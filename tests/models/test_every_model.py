@@ -48,7 +48,7 @@ from gsbench.scenes.gaussian_ply import ply_of, read_trained
 from gsbench.scenes.points import SH_C0, nearest_distances
 from gsbench.scenes.scene import Points
 from gsbench.schedule import ActiveComponents
-from gsbench.train.regularisers import MeanOpacity, MeanSize
+from gsbench.train.hooks.penalties import PENALTIES
 from gsbench.view.slice_ply import has_harmonics, trained_of
 
 WRONG: dict[Any, tuple[Any, ...]] = {
@@ -336,21 +336,20 @@ def test_a_slice_has_the_gradients_of_its_values(variant):
 
 
 @REGISTERED
-@pytest.mark.parametrize("kind", [MeanOpacity, MeanSize])
+@pytest.mark.parametrize("kind", PENALTIES)
 def test_penalties_have_the_gradients_of_their_values(name, kind):
     """Catches a penalty whose gradient is lost or wrong, such as one of detached sizes, which acts on nothing."""
     model = active(name)
-    penalty = kind(model, 0, 1)
-    penalty(QUERY, 0).backward()
+    PENALTIES[kind](model).backward()
     learns = {key for key, x in model.splats.items() if x.grad is not None and x.grad.any()}
-    assert learns == ({"opacities"} if kind is MeanOpacity else learns & set(model.geometry))
+    assert learns == ({"opacities"} if kind == "opacity" else learns & set(model.geometry))
     assert learns
     for key in learns:
         x, step = model.splats[key], 1e-6 * torch.randn(model.splats[key].shape, generator=seeded(1)).double()
         ends = []
         for sign in (1, -1):
             x.data += sign * step
-            ends.append(penalty(QUERY, 0).detach())
+            ends.append(PENALTIES[kind](model).detach())
             x.data -= sign * step
         torch.testing.assert_close((ends[0] - ends[1]) / 2, (x.grad * step).sum(), rtol=1e-6, atol=1e-15)
 

@@ -39,7 +39,6 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("auto", f"{COMPARE} scene.name=no_val", "scene.val_every=8 takes"),
         ("auto", f"{COMPARE} model.compared.moving_4dgs.lr.means.start=-1", "4dgs: model.lr.means.start: expected"),
         ("auto", f"{COMPARE} ~model.compared.moving_4dgs.lr.scales", "candidate 4dgs: model.lr: "),
-        ("auto", f"{COMPARE} train.penalties.strain.weight=1", "candidate 6dgs: "),
         ("auto", COMPARE, None),
         ("7dgs", "scene.eval_split=val", None),
         # a schedule or a penalty
@@ -56,10 +55,6 @@ PAIRS = "train.coarse: expected pairs (factor above 1"
         ("3dgs", "train.densify.kind=gradiant", "train.densify.kind 'gradiant' is not known. Did you mean 'gradient'"),
         ("3dgs", "train.penalties.opacity.stop=0", "train.penalties.opacity: expected stop above start"),
         ("3dgs", "train.penalties.size.weight=-1", "train.penalties.size.weight: expected"),
-        *(
-            (model, "train.penalties.strain.weight=0.1", "train.penalties.strain: expected a model that observes time")
-            for model in ("3dgs", "6dgs")
-        ),
         ("3dgs", "train.coarse=[[2,3000],[4,15000]]", PAIRS),
         *(
             ("3dgs", f"train.coarse={pairs}", PAIRS)

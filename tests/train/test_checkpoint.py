@@ -79,13 +79,12 @@ def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square, tmp_path):
     [
         (lambda: trainer("7dgs", *ROUNDS, "train.densify.kind=mcmc", "train.average_from=40"), 55),
         (lambda: trainer("7dgs", *ROUNDS, *MULTIVIEW, "model.min_opacity=0.09"), 25),
-        (lambda: trainer("7dgs", *ROUNDS, "train.penalties.strain.weight=1.0", "train.batch_size=2"), 25),
         (lambda: with_val({60: 50.0}, "effects.gate=off"), 67),
     ],
-    ids=["relocation and average", "several views", "neighbours", "patience"],
+    ids=["relocation and average", "several views", "patience"],
 )
 def test_a_training_continues_from_its_state(start, step):
-    """Catches random numbers, sums, scores, counts or neighbours of a rule or a hook that a checkpoint does not have,
+    """Catches random numbers, sums, scores or counts of a rule or a hook that a checkpoint does not have,
     and a checkpoint that has lost the best iteration, or how long ago it was."""
     whole, stopped = assert_resumes(start, step)
     if step == 55:

@@ -54,7 +54,7 @@ OF_MKL = (
 OPTIONS = {
     "3dgs": ("train.densify.kind=mcmc", "train.penalties.opacity.weight=0.01", "train.penalties.size.weight=0.01"),
     "4dgs": (
-        *("train.densify.kind=multiview", "train.densify.thin_to=0.8", "train.penalties.strain.weight=0.1"),
+        *("train.densify.kind=multiview", "train.densify.thin_to=0.8"),
         *("train.coarse=[[2,20]]", "optim=sparse_adam", "raster.antialias=true", "train.camera_colors=true"),
     ),
 }

@@ -9,8 +9,7 @@ from tiny_training import SIZE, moving_square, trainer
 from gsbench.kernels.backends import AUTO, REFERENCE
 from gsbench.scenes.scene import View
 from gsbench.train.batches import batch, generator
-from gsbench.train.hooks.penalties import PenaltiesConfig
-from gsbench.train.regularisers import PENALTIES
+from gsbench.train.hooks.penalties import PENALTIES, PenaltiesConfig
 from gsbench.train.step import PartResult, Sums, add_up, deal
 
 
