@@ -81,8 +81,7 @@ class Figure:
 class Section:
     """A part of a report; the table has numbers, which every renderer shows by `columns`.
 
-    A column "psnr_db ±" is shown in the cell of "psnr_db", "psnr_db rank" marks it (1: best, 2: second best), and
-    "model link" is the address of a page about the cell of "model", or "".
+    A column "psnr_db ±" is shown in the cell of "psnr_db", and "psnr_db rank" marks it (1: best, 2: second best).
     """
 
     key: str
@@ -98,8 +97,8 @@ class Section:
 
     @property
     def shown_columns(self) -> list[str]:
-        """Return the names of the columns that are shown as such, without intervals, ranks and links."""
-        return [name for name in self.table if not str(name).endswith((" ±", " rank", " link"))]
+        """Return the names of the columns that are shown as such, without intervals and ranks."""
+        return [name for name in self.table if not str(name).endswith((" ±", " rank"))]
 
     def column(self, name: str) -> Column:
         """Return how a column is shown."""

@@ -115,7 +115,7 @@ def test_every_colour_is_defined():
     variables = set(re.findall(r"var\(--([\w-]+)\)", json.dumps(drawn)))
     assert {f"stage-{i}" for i in range(len(STAGES) + 1)} <= variables <= palette.THEMES.keys()
     assert len(palette.OF_STAGES) == len((*STAGES, REST))
-    keys = {"frontier", "pairs", "effects", "quality", "curves", "on_demand", "stages"}
+    keys = {"frontier", "pairs", "effects", "curves", "on_demand", "stages"}
     assert {key.split("-")[1] for key in drawn} == keys
     assert all(len(section.table) for section in sections(*runs).values() if section.key != "gallery")
     for key, chart in drawn.items():
@@ -124,15 +124,15 @@ def test_every_colour_is_defined():
 
 
 def test_charts_hold_the_numbers_of_their_tables():
-    """Catches a figure of other numbers than those of its table, curves without the letters of events, a figure that
-    goes as one run lacks its cost, and infinity in its JSON."""
+    """Catches a figure of other numbers than those of its table, one that goes as one run lacks its cost, and infinity
+    in its JSON."""
     drawn, of = charts_of(*frontier(**SMALL)), sections(*frontier(**SMALL))
     (rows,) = drawn["g0-frontier-0"]["datasets"].values()
     means = [row["psnr_db"] for row in rows if row["kind"] == "mean"]
     assert means == pytest.approx(of["frontier"].table.psnr_db.tolist(), rel=1e-4)
     assert {row["kind"] for row in rows} == {"mean", "run"}
     (rows,) = drawn["g0-curves-0"]["datasets"].values()
-    assert any(row["letter"] for row in rows)
+    assert [row["train_s"] for row in rows] == pytest.approx(of["curves"].table.train_s.tolist(), rel=1e-4)
     figures = {key for key in charts_of(*frontier(**SMALL), elsewhere(make(), "other")) if "frontier" in key}
     assert figures == {key for key in drawn if "frontier" in key}
     (rows,) = charts_of(*three_lengths())["g0-frontier-0"]["datasets"].values()

@@ -14,7 +14,6 @@ from records import (
     every_row,
     frontier,
     lost,
-    make,
     on_demand,
     run,
     runs_of,
@@ -30,7 +29,7 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.report import frame, stats
 from gsbench.report import sections as of_report
 from gsbench.report.sections.budgets import basis, contests, is_beside_others, points
-from gsbench.report.sections.curves import events, mean_curves, profiles, round_numbers, targets
+from gsbench.report.sections.curves import mean_curves, round_numbers, targets
 from gsbench.report.sections.experiment import table
 from gsbench.report.sections.lengths import by_length
 
@@ -271,28 +270,6 @@ def test_the_papers_number_is_a_target_only_on_its_own_images(dataset, size, exp
     (trex,) = runs_of("a", "", 31.0, 10.0, (0,), "trex")
     rows = targets(chapter(but(trex, dataset=dataset, protocol=protocol)))
     assert rows.dB[rows.target.str.contains("paper")].tolist() == expected
-
-
-def test_the_profile_by_hand():
-    """Catches ratios to the wrong model: a is fastest on one target of two, within a factor of 3 on both."""
-    of = profiles(pd.DataFrame({"a": [10.0, 30.0], "b": [20.0, 10.0], "c": [math.nan, math.inf]}))
-    shares = {name: dict(zip(rows.factor, rows.share, strict=True)) for name, rows in of.groupby("series")}
-    assert (shares["a"][1.0], shares["a"][3.0], shares["b"][1.0], shares["b"][2.0]) == (50.0, 100.0, 50.0, 100.0)
-    assert set(shares["c"].values()) == {0.0}
-    assert profiles(pd.DataFrame({"a": [math.inf]})).empty
-
-
-def test_events_have_the_steps_of_the_schedule():
-    """Catches events of the schedule's default length, AGR's start for a model without it, and a crash at old keys."""
-    train = {"iterations": 1000, "recipe_iterations": 1000, "refine_from": 250}
-    train |= {"densify": {"start": 100, "stop": 500}}
-    config = {"train": train}
-    record = but(make(), provenance={"config": config})
-    steps = {letter: step for step, letters in events(record) for letter in letters}
-    assert {"A", "D"} <= steps.keys()
-    assert steps["A"] == 250
-    assert "A" not in "".join(letters for _, letters in events(but(record, effects=make("3dgs").effects)))
-    assert events(but(record, provenance={"config": {"train": {"no_such_key": 1}}})) == []
 
 
 # ---- other sections

@@ -125,29 +125,15 @@ def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerCh
 
 
 def curves(table: pd.DataFrame, look: Look) -> alt.LayerChart:
-    """Draw PSNR on val against training seconds, with a letter at each training event."""
-    base = alt.Chart(
-        table.reindex(columns=["scene", "series", "iteration", "train_s", "psnr_val_db", "letter", "event"])
-    )
+    """Draw PSNR on val against training seconds."""
+    base = alt.Chart(table[["scene", "series", "iteration", "train_s", "psnr_val_db"]])
     at = {"x": alt.X("train_s:Q", title="training seconds"), "y": _y("psnr_val_db", "PSNR on val, dB")}
     at["color"] = _colour(table, look)
-    tip = _tip(series="model", event="event", iteration="iteration", train_s="training s", psnr_val_db="PSNR val, dB")
-    points = base.transform_filter("!datum.letter")
-    letters = base.transform_filter("!!datum.letter").mark_text(dy=-9, fontSize=11, aria=False)
+    tip = _tip(series="model", iteration="iteration", train_s="training s", psnr_val_db="PSNR val, dB")
     return alt.layer(
-        points.mark_line(strokeWidth=1.5, aria=False).encode(**at),
-        points.mark_point(size=14, filled=True).encode(**at, shape=_shape(table, look), tooltip=tip),
-        letters.encode(**at, text="letter:N", tooltip=tip),
+        base.mark_line(strokeWidth=1.5, aria=False).encode(**at),
+        base.mark_point(size=14, filled=True).encode(**at, shape=_shape(table, look), tooltip=tip),
     ).properties(height=1.3 * HEIGHT)
-
-
-def profile(table: pd.DataFrame, look: Look) -> alt.Chart:
-    """Draw performance profiles: the share of targets that a model reaches within a factor of the fastest time."""
-    x = alt.X("factor:Q", title="times the fastest model's seconds", scale=alt.Scale(zero=False, nice=False))
-    y = alt.Y("share:Q", title="% of targets", scale=alt.Scale(domain=[0, 100]))
-    tip = _tip(series="model", factor="factor", share="% of targets")
-    mark = alt.Chart(table).mark_line(interpolate="step-after", point=alt.OverlayMarkDef(size=20), aria=False)
-    return mark.encode(x, y, _colour(table, look), tooltip=tip).properties(height=HEIGHT)
 
 
 def intervals(table: pd.DataFrame, look: Look, label: str, value: str) -> alt.LayerChart:
@@ -182,7 +168,6 @@ def bars(table: pd.DataFrame, look: Look, label: str, parts: list[str], title: s
 DRAWINGS: dict[str, Callable[..., Any]] = {
     "frontier": frontier,
     "curves": curves,
-    "profile": profile,
     "intervals": intervals,
     "bars": bars,
 }
@@ -222,7 +207,7 @@ def _scale(values: pd.Series) -> alt.Scale:
 
 def _tip(**titles: str) -> list[alt.Tooltip]:
     """Return the lines of a tooltip: columns with their titles, numbers with at most four digits."""
-    texts = ("series", "model", "variant", "seeds", "event", "name", "pair", "label", "part", "significant")
+    texts = ("series", "model", "variant", "seeds", "name", "pair", "label", "part", "significant")
     kinds = {
         name: {"type": "nominal"} if name in texts else {"type": "quantitative", "format": ",.4~g"} for name in titles
     }

@@ -56,7 +56,6 @@ def rendered(
     *,
     reload: int = 0,
     links: Links = (),
-    scripts_at: str = "",
 ) -> str:
     """Return the page of some articles as text.
 
@@ -67,7 +66,6 @@ def rendered(
         more: sections that are not of one experiment, such as a comparison with another folder.
         reload: seconds after which an open page reloads itself; 0 for never.
         links: other pages, named above all articles.
-        scripts_at: the address of `library` as a file, which many pages share; "" if the page has it in itself.
     """
     look = styles(name for article in articles for name in article.series)
     keyed = [(f"{article.key}-{section.key}", section) for article in articles for section in article.sections]
@@ -76,7 +74,7 @@ def rendered(
         f"{key}-{i}": charts.spec(figure, look) for key, section in keyed for i, figure in enumerate(section.figures)
     }
     views = {key: list(map(asdict, section.images)) for key, section in keyed if section.key == "gallery"}
-    scripts = [_asset("page.js")] if scripts_at else [library(), _asset("page.js")]
+    scripts = [*([_library()] if specs else []), _asset("page.js")]
     return _template().render(
         title=short(title)[:80] or "results",
         articles=articles,
@@ -91,7 +89,6 @@ def rendered(
         reload=reload,
         hashes=" ".join(map(_hash, scripts)),
         scripts=[Markup(script) for script in scripts],
-        scripts_at=scripts_at if specs else "",
         css=Markup(_asset("page.css")),
         light=_variables(0),
         dark=_variables(1),
@@ -125,7 +122,7 @@ def article(key: str, chapter: Results, sections: Sequence[Section] | None = Non
 
 
 def table(section: Section) -> dict[str, Any]:
-    """Return what the template shows as a table: rows of (text, class, link); turned if it is wide and short.
+    """Return what the template shows as a table: rows of (text, class); turned if it is wide and short.
 
     A column without any text is left out.
     """
@@ -134,16 +131,14 @@ def table(section: Section) -> dict[str, Any]:
     for name, title in zip(section.shown_columns, shown, strict=True):
         if shown[title].ne("").any():
             kind = "number" if section.is_number(name) else ""
-            links = section.table.get(f"{name} link", [""] * len(section.table))
-            cells = zip(shown[title], section.rank(name), links, strict=False)
-            marked = [(cell, f"{kind} best" if rank == 1 else kind, link) for cell, rank, link in cells]
-            columns.append([(title, kind, ""), *marked])
+            cells = zip(shown[title], section.rank(name), strict=False)
+            columns.append([(title, kind), *((cell, f"{kind} best" if rank == 1 else kind) for cell, rank in cells)])
     turned = len(columns) > TURNED > len(shown) and not section.sortable
     if columns and not turned:  # a group is named in its first row
-        texts = [text for text, _, _ in columns[0]]
+        above = [None, *(text for text, _ in columns[0])]
         columns[0] = [
-            (text, "repeated" if text == above else kind, link)
-            for (text, kind, link), above in zip(columns[0], [None, *texts], strict=False)
+            (text, "repeated" if text == before else kind)
+            for (text, kind), before in zip(columns[0], above, strict=False)
         ]
     rows = columns if turned else list(zip(*columns, strict=True))
     return {"rows": rows, "turned": turned, "more": len(section.table) - len(shown)}
@@ -175,7 +170,7 @@ def _template() -> jinja2.Template:
 
 
 @functools.cache
-def library() -> str:
+def _library() -> str:
     """Return Vega, Vega-Lite and Vega-Embed as one script, from the package vl-convert-python."""
     import vl_convert  # takes a moment
 

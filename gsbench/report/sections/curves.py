@@ -1,28 +1,19 @@
-"""PSNR on the validation views while models train: mean curves, the time to reach a quality, and training events."""
+"""PSNR on the validation views while models train: mean curves, and the time to reach a quality."""
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
-import numpy as np
 import pandas as pd
 
-from gsbench.config import TrainConfig
-from gsbench.errors import InputError
-from gsbench.measure.record import Record
-from gsbench.reading import parse
 from gsbench.report import paper
 from gsbench.report.frame import Results
 from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Column, Figure, Section, section
-from gsbench.schedule import Schedule
 
 STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
 FEWEST_TARGETS = 3  # for one scene
 WIDEST = 100.0  # dB from the lowest result, above which there is no target: more is no difference between models
 CONFIGURATION = ["scene", "series", "model", "variant"]
-EVENTS = {"A": "AGR starts", "R": "opacities are reset", "D": "densification ends"}
-MOST_RESETS = 4  # opacity resets that are marked
 
 
 def mean_curves(chapter: Results) -> pd.DataFrame:
@@ -87,7 +78,7 @@ def round_numbers(low: float, high: float) -> list[float]:
 
 @section()
 def quality(chapter: Results, tests: pd.DataFrame) -> Section | None:
-    """Make the table of the seconds to reach targets, and the figure of performance profiles."""
+    """Make the table of the seconds to reach targets."""
     table = targets(chapter)
     if table.empty:
         return None
@@ -96,89 +87,21 @@ def quality(chapter: Results, tests: pd.DataFrame) -> Section | None:
     text = (
         "Targets are round values of PSNR on val between the lowest and the highest run of a scene; on the paper's "
         "images, the paper's PSNR of 7DGS (best on test) is one too. Seconds are those after which the mean curve on "
-        "val of a model's runs, of any length, first has the target; the runs go on after that. The figure has the "
-        "performance profiles of Dolan and Moré (2002)."
+        "val of a model's runs, of any length, first has the target; the runs go on after that."
     )
-    drawn = profiles(table[[f"{name}, s" for name in models]].set_axis(models, axis=1))
-    caption = f"% of {drawn.attrs.get('targets')} targets reached within a factor of the fastest model's seconds"
-    figures = (Figure(caption, "profile", drawn),) if len(drawn) else ()
     columns = {f"{name}, s": Column(f"{name}, s", 1) for name in models} | {"dB": Column("dB", 2)}
-    return Section("quality", "Time to quality", text, table, columns, figures)
-
-
-def profiles(seconds: pd.DataFrame) -> pd.DataFrame:
-    """Return for each model the share of targets that it reaches within a factor of the fastest model's seconds.
-
-    Only targets that some model reaches count; a model without a run on a scene does not reach its targets.
-    """
-    solved = seconds[np.isfinite(seconds.min(axis=1))].fillna(math.inf)
-    if solved.empty:
-        return pd.DataFrame()
-    fastest = solved.min(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = solved.div(fastest, axis=0).mask(solved.eq(fastest, axis=0), 1.0)  # also where both are 0 s
-    end = max(2.0, 1.15 * ratios.where(np.isfinite(ratios)).max(axis=None))  # of the axis of factors
-    rows = []
-    for name, column in ratios.items():
-        factors = [1.0, *sorted(column[np.isfinite(column)]), end]
-        rows += [{"series": name, "factor": x, "share": 100 * float((column <= x).mean())} for x in factors]
-    table = pd.DataFrame(rows, columns=["series", "factor", "share"])
-    table.attrs["targets"] = len(solved)
-    return table
+    return Section("quality", "Time to quality", text, table, columns)
 
 
 @section()
 def curves(chapter: Results, tests: pd.DataFrame) -> Section | None:
     """Make the table and the figure of PSNR on val during training, with the settings that most runs share."""
-    main = chapter.of(chapter.runs.main)
-    table = mean_curves(main)
+    table = mean_curves(chapter.of(chapter.runs.main))
     if table.empty:
         return None
-    runs = main.finished.runs.drop_duplicates(CONFIGURATION).set_index(CONFIGURATION)
-    marks = [
-        dict(zip(CONFIGURATION, key, strict=True))
-        | {"letter": letters, "event": ", ".join(EVENTS[letter] for letter in letters), "iteration": step}
-        | {name: _at(curve, step, name) for name in ("train_s", "psnr_val_db")}
-        for key, curve in table.groupby(CONFIGURATION)
-        for step, letters in events(runs.loc[key].record)
-    ]
     text = (
         "Mean over seeds, of the runs whose settings most runs share. Do not read shorter trainings off these curves: "
-        f"schedules depend on length. {'; '.join(f'{letter}: {event}' for letter, event in EVENTS.items())}."
+        "schedules depend on length."
     )
-    drawn = pd.concat([table, pd.DataFrame(marks)], ignore_index=True)
-    figure = Figure("PSNR on val while training", "curves", drawn)
+    figure = Figure("PSNR on val while training", "curves", table)
     return Section("curves", "While training", text, table.drop(columns="series"), figures=(figure,))
-
-
-def _at(curve: pd.DataFrame, step: int, name: str) -> float:
-    """Return a column of a curve at a step, interpolated between the measured points around it."""
-    start = 0.0 if name == "train_s" else curve[name].iloc[0]
-    return float(np.interp(step, [0, *curve.iteration], [start, *curve[name]]))
-
-
-def events(record: Record) -> list[tuple[int, str]]:
-    """Return the steps of training events, such as an opacity reset, with the letters of EVENTS.
-
-    The list is empty if the settings in the record cannot be read.
-    """
-    try:
-        steps = _steps(record)
-    except (InputError, KeyError, TypeError, AttributeError, ArithmeticError):
-        return []  # a record of another version of gsbench, with other config keys
-    letters: dict[int, str] = {}
-    for step, letter in sorted(steps):
-        letters[step] = letters.get(step, "") + letter
-    return sorted(letters.items())
-
-
-def _steps(record: Record) -> list[tuple[int, str]]:
-    train = parse(TrainConfig, record.provenance.config["train"], "config")
-    if record.length_choice:
-        train = replace(train, iterations=record.length_choice.kept)
-    agr = record.effects is not None and record.effects.refinement
-    schedule = Schedule(train, sh_degree=0, agr=agr)  # its steps do not depend on the degree
-    steps = [(step, "R") for step in schedule.resets_after[:MOST_RESETS]] + [(schedule.densify_stop, "D")]
-    if agr:
-        steps.append((schedule.scaled(train.refine_from), "A"))
-    return [(step, letter) for step, letter in steps if step <= train.iterations]
