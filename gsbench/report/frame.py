@@ -22,7 +22,7 @@ from gsbench.report.columns import CURVES, RUNS, VIEWS
 RUN = ["experiment", "dataset", "scene", "model", "variant", "seed"]  # together they name a run
 TIMES = ["train_s", "train_min", "train_cpu_s", "frame_ms", "frame_p10_ms", "frame_p90_ms", "fps"]
 ALONE = 3.0  # load up to which a run has its GPU for itself: a training keeps one or two CPU threads busy
-NUMBERS = [column.name for column in RUNS if column.kind is float]
+NUMBERS = [column.name for column in RUNS if column.kind == "float"]
 
 Records = list[tuple[Path, Record]]  # with the paths of their files
 
@@ -123,7 +123,7 @@ def laid_out(records: Records, faults: Sequence[str]) -> Results:
     first = [*(column.name for column in RUNS), "path", "record"]
     # Behind the declared columns stand those that depend on the records: protocol_* and stage_*.
     runs = runs.reindex(columns=[*first, *(name for name in runs if name not in first)])
-    runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in (str, dict)})
+    runs = runs.astype({column.name: column.kind for column in RUNS if column.kind not in ("str", "dict")})
     views = [view for i, (_, record) in enumerate(records) for view in _views(i, record)]
     points = [(i, point) for i, (_, record) in enumerate(records) for point in record.curve]
     curves = [{"run": i} | {name: getattr(point, key) for name, key in CURVES.items()} for i, point in points]

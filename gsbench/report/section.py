@@ -13,6 +13,7 @@ import pandas as pd
 
 from gsbench.errors import printable
 from gsbench.report import stats
+from gsbench.report.columns import RUNS
 from gsbench.report.frame import Results
 
 EMPTY = "–"
@@ -37,30 +38,7 @@ class Column:
         return self.digits if self.digits is not None else 1 if abs(value) >= 10 else 2
 
 
-COLUMNS = {
-    "psnr_db": Column("PSNR", 2, "higher"),
-    "psnr_train_db": Column("PSNR train", 2),
-    "psnr_moving_db": Column("PSNR moving", 2, "higher"),
-    "psnr_object_db": Column("PSNR object", 2, "higher"),
-    "ssim": Column("SSIM", 3, "higher"),
-    "lpips_alex": Column("LPIPS-Alex", 3, "lower"),
-    "lpips_vgg": Column("LPIPS-VGG", 3, "lower"),
-    "flicker": Column("flicker", 2, "lower"),
-    "static_drift": Column("static drift", 2, "lower"),
-    "flicker_truth": Column("flicker of the truth", 2),
-    "drift_3d": Column("3D drift", 4, "lower"),
-    "drift_3d_px": Column("3D drift, pixels", 2, "lower"),
-    "psnr_best_on_test_db": Column("psnr_best_on_test (leaks)", 2),
-    "psnr_val_db": Column("PSNR val", 2, "higher"),
-    "train_min": Column("train min", None, "lower"),
-    "train_s": Column("training s", 1, "lower"),
-    "train_cpu_s": Column("CPU s", 1, "lower"),
-    "frame_ms": Column("ms a frame", 2, "lower"),
-    "fps": Column("FPS", None, "higher"),
-    "gaussians": Column("#Gaussians", 0, "lower"),
-    "model_mb": Column("MB", 2, "lower"),
-    "iterations": Column("iterations", 0),
-    "load": Column("load", 1),
+COLUMNS = {column.name: Column(column.title, column.digits, column.better) for column in RUNS if column.title} | {
     "p_holm": Column("p, Holm", 3),
     "low": Column("95 % low", 2, signed=True),
     "high": Column("95 % high", 2, signed=True),

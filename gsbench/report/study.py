@@ -27,7 +27,7 @@ RUNS_FILE, VIEWS_FILE, CURVES_FILE = "runs.csv", "views.csv.gz", "curves.csv.gz"
 MAX_TABLE = 1 << 26  # bytes of a table, unpacked; the largest known has less than four million
 FORMULA = ("=", "+", "-", "@")  # a spreadsheet computes a text that begins with one of these
 _JSON = tuple('"[{-0123456789tfnNI')  # JSON begins with one of these
-_BY_PLACE = {column.place: column for column in RUNS if column.place and column.kind is not dict}
+_BY_PLACE = {column.place: column for column in RUNS if column.place and column.kind != "dict"}
 _BY_NAME = {column.name: column for column in _BY_PLACE.values()}
 
 Row = dict[str, str]  # the cells of a row by column
