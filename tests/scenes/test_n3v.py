@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scenes.capture import COLOR, Capture, has_estimated_up
-from scenes.tiny_scene import assert_refused, write_image
+from scenes.tiny_scene import assert_refused, write_image, write_points
 from scipy.spatial.transform import Rotation
 
 from gsbench import scenes
@@ -144,11 +144,7 @@ def test_initial_points(root, kind):
     if kind == "bin":
         Capture("PINHOLE", WIDTH, HEIGHT, (1, 1, 1, 1), [], np.empty((0, 4, 4)), means).write(root, kind)
     else:
-        names = "".join(
-            f"property {'float' if x in 'xyz' else 'uchar'} {x}\n" for x in ("x", "y", "z", "red", "green", "blue")
-        )
-        rows = "".join(f"{x} {y} {z} {' '.join(map(str, COLOR))}\n" for x, y, z in means)
-        (root / "points3d.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{names}end_header\n{rows}")
+        write_points(root / "points3d.ply", means, COLOR)
     scene = scenes.load(root)
     assert scene.points is not None
     torch.testing.assert_close(scene.placement.to_user(scene.points.means).numpy(), means, rtol=0, atol=1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scenes.capture import circle, has_estimated_up
-from scenes.tiny_scene import assert_refused, write_image
+from scenes.tiny_scene import assert_refused, edited, write_image
 
 from gsbench import scenes
 from gsbench.reading import parse
@@ -101,29 +101,20 @@ def test_cameras_times_and_splits(root):
     assert {*scenes.load(root).notes} - {*scene.notes} == notes
 
 
-def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
-    def apply(root: Path) -> None:
-        content = json.loads((root / name).read_text())
-        change(content)
-        (root / name).write_text(json.dumps(content))
-
-    return apply
-
-
 LEFT = "camera/left_000.json"
 FAULTS: list[tuple[Callable[[Path], object], str]] = [
-    (edit("dataset.json", lambda content: content.pop("val_ids")), "missing required field val_ids"),
-    (edit("dataset.json", lambda content: content.update(val_ids=[])), "as of HyperNeRF's vrig scenes.* got 2 and 0"),
-    (edit("dataset.json", lambda content: content.update(val_ids=["left_000"])), "each image once.* 2 different"),
-    (edit("dataset.json", lambda content: content["train_ids"].append("../../secret")), "'../../secret'"),
-    (edit("metadata.json", lambda content: content.pop("left_003")), "metadata.json: 'left_003': expected an object"),
-    (edit("metadata.json", lambda content: content["left_003"].update(warp_id=-1)), "'left_003': expected an object"),
-    (edit("metadata.json", lambda content: [x.update(warp_id=0) for x in content.values()]), "several times"),
-    (edit(LEFT, lambda content: content.update(skew=0.1)), "left_000.json: skew, radial_distortion: expected 0"),
-    (edit(LEFT, lambda content: content.update(radial_distortion=[0, 0, 1])), "k1 k2 0"),
-    (edit(LEFT, lambda content: content.update(focal_length=-1)), "positive focal lengths"),
-    (edit(LEFT, lambda content: content.update(position=[1, 2])), "left_000.json: position: expected"),
-    (edit(LEFT, lambda content: content.update(orientation=[[1, 0, 0]] * 3)), "orientation: .*rigid"),
+    (edited("dataset.json", lambda content: content.pop("val_ids")), "missing required field val_ids"),
+    (edited("dataset.json", lambda content: content.update(val_ids=[])), "as of HyperNeRF's vrig scenes.* got 2 and 0"),
+    (edited("dataset.json", lambda content: content.update(val_ids=["left_000"])), "each image once.* 2 different"),
+    (edited("dataset.json", lambda content: content["train_ids"].append("../../secret")), "'../../secret'"),
+    (edited("metadata.json", lambda content: content.pop("left_003")), "metadata.json: 'left_003': expected an object"),
+    (edited("metadata.json", lambda content: content["left_003"].update(warp_id=-1)), "'left_003': expected an object"),
+    (edited("metadata.json", lambda content: [x.update(warp_id=0) for x in content.values()]), "several times"),
+    (edited(LEFT, lambda content: content.update(skew=0.1)), "left_000.json: skew, radial_distortion: expected 0"),
+    (edited(LEFT, lambda content: content.update(radial_distortion=[0, 0, 1])), "k1 k2 0"),
+    (edited(LEFT, lambda content: content.update(focal_length=-1)), "positive focal lengths"),
+    (edited(LEFT, lambda content: content.update(position=[1, 2])), "left_000.json: position: expected"),
+    (edited(LEFT, lambda content: content.update(orientation=[[1, 0, 0]] * 3)), "orientation: .*rigid"),
     (lambda root: (root / LEFT).unlink(), "camera/left_000.json: expected a file"),
     (lambda root: (root / "rgb/2x/left_003.png").unlink(), "rgb/2x/left_003.png .*expected a file"),
 ]

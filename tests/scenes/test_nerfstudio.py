@@ -10,19 +10,12 @@ import numpy as np
 import pytest
 import torch
 from capture import circle, has_estimated_up
-from tiny_scene import check_message, write_image
+from tiny_scene import assert_refused, edited, write_image, write_points
 
 from gsbench import scenes
-from gsbench.errors import InputError
 
 COUNT = 17
-PLY = "ply\nformat ascii 1.0\nelement vertex 2\n{}end_header\n0 0 1 255 0 0\n1 2 3 0 255 51\n".format(
-    "".join(
-        f"property {kind} {name}\n"
-        for kind, names in (("float", "xyz"), ("uchar", ("red", "green", "blue")))
-        for name in names
-    )
-)
+MEANS, COLORS = [[0, 0, 1], [1, 2, 3]], [[255, 0, 0], [0, 255, 51]]
 
 
 @pytest.fixture
@@ -39,7 +32,7 @@ def root(tmp_path: Path) -> Path:
     content |= {"frames": [frames[i] for i in order], "applied_transform": np.eye(4)[:3].tolist()}
     content["ply_file_path"] = "sparse_pc.ply"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    (tmp_path / "sparse_pc.ply").write_text(PLY)
+    write_points(tmp_path / "sparse_pc.ply", MEANS, COLORS)
     return tmp_path
 
 
@@ -48,7 +41,7 @@ def content_of(root: Path) -> dict[str, Any]:
 
 
 def change(root: Path, **values: Any) -> None:
-    (root / "transforms.json").write_text(json.dumps(content_of(root) | values))
+    edited("transforms.json", lambda content: content.update(values))(root)
 
 
 def test_it_is_read(root):
@@ -99,30 +92,13 @@ def test_times_of_the_file_or_of_a_table(root):
 def test_fingerprint(root):
     """Catches other points, another file or another image under the same fingerprint."""
     before = {scenes.load(root).fingerprint}
-    (root / "sparse_pc.ply").write_text(PLY.replace("1 2 3", "1 2 4"))
+    write_points(root / "sparse_pc.ply", [[0, 0, 1], [1, 2, 4]], COLORS)
     before.add(scenes.load(root).fingerprint)
     change(root, fl_x=9.25)
     before.add(scenes.load(root).fingerprint)
     write_image(root / "images" / "frame_00003.png", np.full((6, 8, 3), 1, np.uint8))
     assert scenes.load(root).fingerprint not in before
     assert len(before) == 3
-
-
-def frames(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], None]:
-    def apply(root: Path) -> None:
-        content = content_of(root)
-        change(content["frames"])
-        (root / "transforms.json").write_text(json.dumps(content))
-
-    return apply
-
-
-def without_colours(root: Path) -> None:
-    lines = PLY.splitlines()
-    body = lines.index("end_header")
-    rows = [line for line in lines[:body] if "uchar" not in line] + ["end_header"]
-    rows += [" ".join(line.split()[:3]) for line in lines[body + 1 :]]
-    (root / "sparse_pc.ply").write_text("\n".join(rows))
 
 
 FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
@@ -140,22 +116,21 @@ FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
     ({"test_filenames": 3}, "test_filenames: expected file_path of frames, got 3"),
     ({"frames": []}, "at least one frame"),
     ({"w": math.inf}, "w: expected a finite number"),
-    (without_colours, "expected colours as red green blue, or as f_dc_0"),
     (
-        frames(lambda listed: listed.__delitem__(slice(7, None))),
+        edited("transforms.json", lambda content: content.update(frames=content["frames"][:7])),
         "at least 8, .*list train_filenames and test_filenames",
     ),
-    (frames(lambda listed: listed[3].update(time=0.5)), r"frames\[3\]\.time: this frame has a time and the first"),
+    (
+        edited("transforms.json", lambda content: content["frames"][3].update(time=0.5)),
+        r"frames\[3\]\.time: this frame has a time and the first",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("fault", "words"), FAULTS)
 def test_what_is_wrong_is_one_line(root, fault, words):
     """Catches a stack trace, lists that name images of no frame, and a scene without a test view."""
-    fault(root) if callable(fault) else change(root, **fault)
-    with pytest.raises(InputError, match=words) as caught:
-        scenes.load(root)
-    check_message(caught.value)
+    assert_refused(root, fault if callable(fault) else lambda folder: change(folder, **fault), words)
 
 
 def test_views_that_train_and_test_share_are_told(root):

@@ -5,17 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from scenes.capture import circle, has_estimated_up
-from scenes.tiny_scene import assert_refused, write_image
+from scenes.tiny_scene import assert_refused, edited, write_image
 
 from gsbench import scenes
-from gsbench.scenes import View
 
-BASKETBALL = Path(__file__).resolve().parents[2] / "../shared/data/panoptic/basketball"
 WIDTH, HEIGHT, TIMES, TEST_CAMERA = 12, 12, 3, 2
 K = [[10.0, 0, 5.5], [0, 11.0, 6.5], [0, 0, 1]]
 
@@ -43,14 +40,8 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def edit(change: Callable[[dict[str, Any]], object], split: str = "train") -> Callable[[Path], object]:
-    def apply(root: Path) -> None:
-        source = root / f"{split}_meta.json"
-        content = json.loads(source.read_text())
-        change(content)
-        source.write_text(json.dumps(content))
-
-    return apply
+def edit(change: Callable[[dict[str, Any]], object], split: str = "train") -> Callable[[Path], None]:
+    return edited(f"{split}_meta.json", change)
 
 
 def test_cameras_times_masks_and_splits(root):
@@ -135,54 +126,3 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
 def test_faulty_files_are_told(root, apply, message):
     """Catches lists that are read askew, cameras that are no pinholes, missing files, and pickles."""
     assert_refused(root, apply, message)
-
-
-def moving(views: list[View], cameras: int) -> dict[str, np.ndarray]:
-    """The pixels of fixed cameras that differ from their median over time, dilated by two pixels."""
-    masks = {}
-    for camera in range(cameras):
-        of_camera = views[camera::cameras]
-        images = np.stack([view.image.numpy() for view in of_camera])
-        differs = np.abs(images - np.median(images, 0)).max(-1) > 0.12
-        for view, mask in zip(of_camera, differs.astype(np.uint8), strict=True):
-            opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-            masks[view.name] = cv2.dilate(opened, np.ones((5, 5), np.uint8)) > 0
-    return masks
-
-
-def inside(points: np.ndarray, view: View, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points are in the image, and which of them are in a mask of it."""
-    viewmat, K = view.camera.viewmat.numpy(), view.camera.K.numpy()
-    x = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
-    pixel = x[:, :2] / x[:, 2:]
-    is_seen = (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel < [view.camera.width, view.camera.height]).all(1)
-    column, row = np.where(is_seen[:, None], pixel, 0).astype(int).T
-    return is_seen, is_seen & mask[row, column]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not BASKETBALL.is_dir(), reason="../shared/data/panoptic is not here")
-def test_the_hull_of_the_players_is_where_test_cameras_see_them(tmp_path):
-    """Catches a pose, a time or intrinsics of the wrong camera: the hull of what moves would be empty or elsewhere."""
-    for split in ("train", "test"):
-        content = json.loads((BASKETBALL / f"{split}_meta.json").read_text())
-        kept = {key: value[::8] if isinstance(value, list) else value for key, value in content.items()}
-        (tmp_path / f"{split}_meta.json").write_text(json.dumps(kept))
-    (tmp_path / "ims").mkdir()
-    for folder in (BASKETBALL / "ims").iterdir():
-        (tmp_path / "ims" / folder.name).symlink_to(folder)
-    scene = scenes.load(tmp_path, downscale=4)
-    train, test = moving(scene.train, 27), moving(scene.test, 4)
-    axis = np.linspace(-3, 3, 31)
-    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    shares = []
-    for time in (0, 3, 6):
-        views = scene.train[27 * time : 27 * (time + 1)]
-        by_view = [inside(grid, view, train[view.name]) for view in views]
-        in_images, in_masks = (np.sum(each, 0) for each in zip(*by_view, strict=True))
-        hull = grid[(in_images >= 12) & (in_masks >= 0.95 * in_images)]
-        assert len(hull) > 30
-        for view in scene.test[4 * time : 4 * (time + 1)]:
-            in_image, in_mask = inside(hull, view, test[view.name])
-            shares.append(in_mask.sum() / in_image.sum())
-    assert np.mean(shares) > 0.9  # masks cover 14 % of the test images

@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tiny_scene import COUNTS, check_message, edit, write_image, write_images
+from tiny_scene import COUNTS, check_message, write_image, write_images
 
 from gsbench import scenes
 from gsbench.errors import InputError
 from gsbench.scenes import images
 from gsbench.train.batches import reduced
 
-MUJOCO = Path(__file__).resolve().parents[2] / "../shared/data/mujoco"
 NUMBERS = np.arange(48, dtype=np.uint8).reshape(6, 8)  # of the tiny scene's size
 
 
@@ -107,20 +106,3 @@ def test_a_damaged_mask_is_refused(damage, words, tiny, tmp_path):
     with pytest.raises(InputError) as caught:
         scenes.load(tiny)
     check_message(caught.value, words, "the mask of train/r_1.png")
-
-
-@pytest.mark.skipif(not MUJOCO.is_dir(), reason="../shared/data/mujoco is not here")
-def test_regions_of_a_mujoco_scene(tmp_path):
-    """Catches the layout of a published data set that has masks: every object is seen where the image is opaque."""
-    (root,) = MUJOCO.glob("scene1_*")
-    for split in ("train", "val", "test"):
-        shutil.copy(root / f"transforms_{split}.json", tmp_path)
-        edit(tmp_path, lambda content: content.update(frames=content["frames"][:2]), split)
-        for name in ("r_0000.png", "r_0001.png", "masks/r_0000.png", "masks/r_0001.png"):
-            (tmp_path / split / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(root / split / name, tmp_path / split / name)
-    scene = scenes.load(tmp_path, downscale=2)
-    for view in scene.train + scene.val + scene.test:
-        assert view.alpha.shape == view.regions.shape == view.image.shape[:2] == (400, 400)
-        assert set(view.regions.unique().tolist()) == {0, 1, 2}
-        assert (view.alpha[view.regions > 0] > 0).float().mean() > 0.99

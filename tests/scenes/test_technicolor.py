@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scenes.capture import COLOR, Capture, has_estimated_up
-from scenes.tiny_scene import assert_refused, write_image
+from scenes.tiny_scene import assert_refused, write_image, write_points
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -62,10 +62,7 @@ def test_cameras_times_and_splits(root):
 def test_points_keep_their_times(root):
     """Catches times that are lost where a scene comes to its standard place, and a fingerprint without the points."""
     before = scenes.load(root).fingerprint
-    kinds = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float time")
-    properties = [f"property {kind}" for kind in kinds]
-    header = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header"]
-    (root / "points3d.ply").write_text("\n".join([*header, "0 0 50 1 2 3 0.25", "1 1 50 1 2 3 1", ""]))
+    write_points(root / "points3d.ply", [(0, 0, 50), (1, 1, 50)], COLOR, time=[0.25, 1])
     scene = scenes.load(root)
     points = scene.points
     assert scene.fingerprint != before

@@ -8,6 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
+from plyfile import PlyData, PlyElement
 
 from gsbench import scenes
 from gsbench.errors import InputError
@@ -33,13 +35,31 @@ def write_images(root: Path, pixels: np.ndarray) -> None:
         write_image(root / name, pixels)
 
 
+def edited(name: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Return what applies `change` to the content of a JSON file of a folder."""
+
+    def apply(root: Path) -> None:
+        content = json.loads((root / name).read_text())
+        change(content)
+        (root / name).write_text(json.dumps(content))
+
+    return apply
+
+
 def edit(root: Path, change: Callable[[dict[str, Any]], object], *splits: str) -> None:
     """Apply `change` to the content of transforms_<split>.json, that of train if no split is named."""
     for split in splits or ("train",):
-        source = root / f"transforms_{split}.json"
-        content = json.loads(source.read_text())
-        change(content)
-        source.write_text(json.dumps(content))
+        edited(f"transforms_{split}.json", change)(root)
+
+
+def write_points(path: Path, means: ArrayLike, colors: ArrayLike, **columns: ArrayLike) -> None:
+    """Write points [P, 3] with their colours, [P, 3] or one for all, and other columns of floats, as an ascii PLY."""
+    kinds = [*((x, "f4") for x in "xyz"), *((x, "u1") for x in ("red", "green", "blue")), *((x, "f4") for x in columns)]
+    table = np.zeros(len(np.asarray(means)), kinds)
+    rgb = np.broadcast_to(colors, (len(table), 3))
+    for (name, _), column in zip(kinds, (*np.transpose(means), *rgb.T, *columns.values()), strict=True):
+        table[name] = column
+    PlyData([PlyElement.describe(table, "vertex")], text=True).write(str(path))
 
 
 def write_tiny(root: Path) -> Path:
