@@ -214,8 +214,6 @@ def read_images(file: ModelFile) -> list[PosedImage]:
         viewmat[:3, :3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix()  # scipy has w last
         viewmat[:3, 3] = pose[4:]
         by_name[name] = PosedImage(name, viewmat, camera)
-    if not by_name:
-        raise InputError(f"{file.path}: expected at least one image")
     return list(by_name.values())
 
 

@@ -124,6 +124,7 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "focal is text": (change(fl_x="10"), JSON, "fl_x"),
     "width zero": (change(w=0), JSON, "w"),
     "width contradicts the image": (change(w=800), JSON, "w: expected the images' own 8"),
+    "height contradicts the image": (change(h=800.0), JSON, "h: expected the images' own 6"),
     # the paths
     "path missing": (drop_from_frame("file_path"), JSON, PATH),
     "path is a number": (change_frame(file_path=3), JSON, PATH),
