@@ -132,9 +132,8 @@ def load(
         layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
         raise InputError(f"{root}: {why}: looked for {layouts}", docs="data.md#what-is-read")
     layout = present[0]  # the order of _LAYOUTS decides
-    options: dict[str, Any] = {} if frames is None else {"frames": _frames(frames, layout)}
-    options |= {} if repair is None else {"repair": _names("repair", repair, layout)}
-    options |= {} if leave_out is None else {"leave_out": _names("leave_out", leave_out, layout)}
+    given = {"frames": frames, "repair": repair, "leave_out": leave_out}
+    options = {name: _option(name, value, layout) for name, value in given.items() if value is not None}
     from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
 
     module, function = layout.reader.split(".")
@@ -148,31 +147,24 @@ def load(
     return scene
 
 
-def _frames(frames: object, layout: _Layout) -> tuple[int, int]:
-    """Check and return the first and the last frame; raise InputError for a layout without this option."""
-    if "frames" not in layout.options:
-        raise InputError(f"frames: {layout.marker} lists its own frames and times, got {frames!r:.80}: leave it out")
-    if not isinstance(frames, tuple | list) or len(frames) != 2 or not all(type(n) is int for n in frames):
-        raise InputError(f"frames: expected the numbers of the first and the last frame, got {frames!r:.80}")
-    if not 0 <= frames[0] <= frames[1]:
-        raise InputError(f"frames: expected 0 <= first <= last, got {frames!r:.80}")
-    return frames[0], frames[1]
-
-
-_NAMES = {  # of an option that lists names: what a layout without it lacks, and an example of a name
-    "repair": ("frame before an image", "Birthday_undist_00173_09"),
-    "leave_out": ("names of cameras", "cam13"),
+_OPTIONS = {  # of an option that only some layouts have: what the others do instead, and what is expected
+    "frames": ("lists its own frames and times", "the numbers of the first and the last frame, 0 <= first <= last"),
+    "repair": ("has no frame before an image", "names such as Birthday_undist_00173_09"),
+    "leave_out": ("has no names of cameras", "names such as cam13"),
 }
 
 
-def _names(option: str, names: object, layout: _Layout) -> tuple[str, ...]:
-    """Check and return the names that an option lists; raise InputError for a layout without this option."""
-    lacks, example = _NAMES[option]
-    if option not in layout.options:
-        raise InputError(f"{option}: {layout.marker} has no {lacks}, got {names!r:.80}: leave it out")
-    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"{option}: expected names such as {example}, got {names!r:.80}")
-    return tuple(names)
+def _option(name: str, value: Sequence[Any], layout: _Layout) -> tuple[Any, ...]:
+    """Check and return the value of an option; raise InputError for a layout that does not have it."""
+    instead, expected = _OPTIONS[name]
+    if name not in layout.options:
+        raise InputError(f"{name}: {layout.marker} {instead}, got {value!r:.80}: leave it out")
+    kind = int if name == "frames" else str
+    if not isinstance(value, tuple | list) or not all(type(entry) is kind for entry in value):
+        raise InputError(f"{name}: expected {expected}, got {value!r:.80}")
+    if name == "frames" and (len(value) != 2 or not 0 <= value[0] <= value[1]):
+        raise InputError(f"{name}: expected {expected}, got {value!r:.80}")
+    return tuple(value)
 
 
 def _folder(path: object) -> Path:

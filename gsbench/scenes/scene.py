@@ -1,5 +1,6 @@
 """Define the data types Camera, View (camera, time and image), Points and Scene (train, val and test views)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -164,11 +165,7 @@ class Scene:
     def with_near(self, near: float) -> "Scene":  # in the user's units
         """Return a copy of the scene in which the near plane of all cameras is `near`."""
         depth = self.placement.near_to_standard(near)
-        train, val, test = (
-            [replace(view, camera=replace(view.camera, near=depth)) for view in views]
-            for views in (self.train, self.val, self.test)
-        )
-        return replace(self, train=train, val=val, test=test)
+        return self._with_views(lambda view: replace(view, camera=replace(view.camera, near=depth)))
 
     def with_val(self, every: int) -> "Scene":
         """Return a copy of the scene in which every n-th training view is a validation view, from the n-th on.
@@ -187,7 +184,10 @@ class Scene:
 
     def to(self, device: str) -> "Scene":
         """Return a copy of the scene whose views are on `device`."""
-        train, val, test = ([view.to(device) for view in views] for views in (self.train, self.val, self.test))
+        return self._with_views(lambda view: view.to(device))
+
+    def _with_views(self, change: Callable[[View], View]) -> "Scene":
+        train, val, test = ([change(view) for view in views] for views in (self.train, self.val, self.test))
         return replace(self, train=train, val=val, test=test)
 
 

@@ -167,19 +167,13 @@ def _replacements(names: tuple[str, ...], listed: list[_Image]) -> dict[_Image, 
         if scene is None or match["scene"] != scene["scene"]:
             continue
         frame, camera = int(match["frame"]), int(match["camera"])
-        if (frame, camera) not in by_number:
-            raise InputError(f"data.repair: expected an image that is loaded, got {name!a:.80}: leave it out")
-        if camera == TEST_CAMERA:
+        damaged, before = (by_number.get((number, camera)) for number in (frame, frame - 1))
+        if damaged is None or before is None or camera == TEST_CAMERA:  # a test needs the true image
             raise InputError(
-                f"data.repair: expected a training image, {name} is a test image, and a test needs the "
-                "true one: choose other scene.frames"
+                f"data.repair: expected training images that are loaded, as those before them, got {name}: leave it "
+                "out, or choose other scene.frames"
             )
-        if (frame - 1, camera) not in by_number:
-            raise InputError(
-                f"data.repair: {name}: expected the image of its camera in frame {frame - 1}, it is not "
-                "loaded: choose other scene.frames"
-            )
-        replaced[by_number[frame, camera]] = by_number[frame - 1, camera]
+        replaced[damaged] = before
     return replaced
 
 

@@ -162,10 +162,10 @@ def test_a_damaged_image_is_replaced_if_it_is_named(root, capsys):
     ("damaged", "repair", "message"),
     [
         ("", ["Tiny_undist_00101_09"], "is whole: leave it out"),
-        ("00100_09", ["Tiny_undist_00100_09"], "frame 99, it is not loaded"),
+        ("00100_09", ["Tiny_undist_00100_09"], "images that are loaded, as those before them, got .*00100_09: leave"),
         ("00101_09 00100_09", ["Tiny_undist_00101_09"], "00100_09.png: damaged"),
-        ("00101_10", ["Tiny_undist_00101_10"], "is a test image"),
-        ("00101_09", ["Tiny_undist_00108_09"], "expected an image that is loaded"),
+        ("00101_10", ["Tiny_undist_00101_10"], "expected training images that are loaded"),
+        ("00101_09", ["Tiny_undist_00108_09"], "images that are loaded"),
         ("00101_09", ["00101_09"], "expected names such as"),
         ("00101_09", "Tiny_undist_00101_09", "repair: expected names such as"),
     ],
