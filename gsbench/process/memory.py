@@ -7,7 +7,6 @@ import errno
 import os
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -87,51 +86,35 @@ def _address_space() -> int | None:
 
 
 class Files(NamedTuple):
-    """Name the files in which a version of Linux's control groups has its memory."""
+    """Name the folder and the files in which a version of Linux's control groups has the limits of memory."""
 
+    top: str
     limit: str
     used: str
     cache: str  # the line in memory.stat: cached files, which the system can drop at any time and which `used` counts
 
 
-VERSIONS = {
-    "cgroup2": Files("memory.max", "memory.current", "inactive_file"),
-    "cgroup": Files("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-}
+VERSION_1 = Files("sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+VERSION_2 = Files("sys/fs/cgroup", "memory.max", "memory.current", "inactive_file")
 
 
 def left_by_control_groups(root: Path = Path("/")) -> int | None:
     """Return the bytes that the control groups of this process leave to it; None if no limit can be read.
 
-    The limit of a container or of a batch job can be set on any group between the root and that of the process.
+    The limit of a container or of a batch job can be set on any group between the top and that of the process. In a
+    container, the path of the process' group may be that of the host: of such a path, only the top is there.
 
     Args:
-        root: the folder that has proc/ and the mounted control groups.
+        root: the folder that has proc/ and sys/.
     """
-    left = (_left(folder, VERSIONS[version]) for version, folder in _folders(root))
-    return min((x for x in left if x is not None), default=None)
-
-
-def _folders(root: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the version and the folder of each control group that can limit this process: its own and those above."""
-    groups = {}  # the path of this process' group, by the version of control groups
+    left = []
     for line in lines_of(root / "proc/self/cgroup"):
         number, controllers, path = (*line.split(":", 2), "", "")[:3]  # also of a damaged line
-        if number == "0" and not controllers:
-            groups["cgroup2"] = path
-        elif "memory" in controllers.split(","):
-            groups["cgroup"] = path
-    for line in lines_of(root / "proc/self/mountinfo"):
-        mount, _, filesystem = line.partition(" - ")
-        kind, _, options = filesystem.partition(" ")
-        fields = [re.sub(r"\\([0-7]{3})", lambda octal: chr(int(octal[1], 8)), x) for x in mount.split(" ")]
-        if kind not in groups or len(fields) < 5 or (kind == "cgroup" and "memory" not in re.split("[ ,]", options)):
-            continue
-        top = root / fields[4].lstrip("/")  # the mount point
-        group = PurePosixPath(groups[kind])  # fields[3]: the group that is mounted there
-        inside = group.relative_to(fields[3]) if group.is_relative_to(fields[3]) else PurePosixPath()
-        for folder in (inside, *inside.parents):
-            yield kind, top / folder
+        files = VERSION_2 if number == "0" and not controllers else VERSION_1
+        if files is VERSION_2 or "memory" in controllers.split(","):
+            group = PurePosixPath(path.lstrip("/"))
+            left += [_left(root / files.top / folder, files) for folder in (group, *group.parents)]
+    return min((x for x in left if x is not None), default=None)
 
 
 def _left(folder: Path, files: Files) -> int | None:

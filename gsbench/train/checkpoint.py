@@ -3,10 +3,10 @@
 import hashlib
 import io
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,41 +42,16 @@ def save(path: Path, content: Checkpoint) -> None:
 
     def write(file: io.BufferedRandom) -> None:
         file.write(MAGIC + b"0" * DIGEST + b"\n")  # room for the SHA-256 of what follows
-        stream = _WithFirstError(file)
-        torch.save({f.name: getattr(content, f.name) for f in fields(content)}, cast(IO[bytes], stream))
-        if stream.error is not None:
-            raise stream.error
+        try:
+            torch.save({f.name: getattr(content, f.name) for f in fields(content)}, file)
+        except RuntimeError as error:  # torch's own, raised while the disk's error was handled
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
         file.seek(len(MAGIC) + DIGEST + 1)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(len(MAGIC))
         file.write(digest.encode())
 
     write_atomically(path, write)
-
-
-@dataclass
-class _WithFirstError:
-    """A file that keeps the first error of its disk, which torch would hide, and writes nothing after it."""
-
-    file: io.BufferedRandom
-    error: OSError | None = None
-
-    def write(self, data: bytes) -> int:
-        """Write bytes and return their number."""
-        self._attempt(lambda: self.file.write(data))
-        return len(data)
-
-    def flush(self) -> None:
-        """Flush the file."""
-        self._attempt(self.file.flush)
-
-    def _attempt(self, action: Callable[[], object]) -> None:
-        """Do an action unless an earlier one has failed; keep its error."""
-        try:
-            if self.error is None:
-                action()
-        except OSError as error:
-            self.error = error
 
 
 def load(path: Path, training: str, data: str, device: str) -> dict[str, Any] | None:
