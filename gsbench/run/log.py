@@ -6,7 +6,6 @@ error of theirs ends no run.
 
 import contextlib
 import importlib.util
-import json
 import math
 import os
 import re
@@ -16,12 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import msgspec
+
 from gsbench.config_roles import flat
 from gsbench.errors import InputError, check_known, how_to_install, one_line
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.curve import Point
 from gsbench.measure.record import Record
-from gsbench.reading import parse_json, read_file
+from gsbench.reading import read_file
 from gsbench.run.identity import RunSpec
 from gsbench.train.loop import Trainer
 
@@ -37,19 +38,23 @@ WANDB_SECONDS = 30.0  # that Weights & Biases waits for a server
 SENT = {"val/psnr": "psnr_val", "train/loss": "loss", "train/seconds": "seconds", "train/gaussians": "gaussians"}
 
 Numbers = Mapping[str, float]
-Line = dict[str, Any]  # of curve.jsonl
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What a tracker is told about a run before its first number."""
+class Line:
+    """A line of curve.jsonl: a point of the curve, and what else is known of its iteration."""
 
-    folder: Path
-    name: str
-    experiment: str
-    settings: Mapping[str, Any]  # by dotted key
-    step: int  # finished steps; above 0 if the run continues from a checkpoint
+    iteration: int
+    seconds: float
+    psnr_val: float | None  # dB
+    loss: float | None = None
+    gaussians: int | None = None
+
+    @property
+    def point(self) -> Point:
+        """The point of the curve."""
+        return Point(self.iteration, self.seconds, self.psnr_val)
 
 
 class Tracker(Protocol):
@@ -65,13 +70,13 @@ class Tracker(Protocol):
 class TensorBoard:
     """Writes event files into the folder `tensorboard` of the run; needs no server."""
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, spec: RunSpec, step: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
         # Events of an earlier attempt after this step are hidden, as the run measures them again.
-        self.writer: Any = SummaryWriter(str(subject.folder / "tensorboard"), purge_step=subject.step + 1)
-        lines = [f"    {key}: {value}" for key, value in subject.settings.items()]
-        self.writer.add_text("settings", "\n".join(lines), subject.step)
+        self.writer: Any = SummaryWriter(str(spec.folder / "tensorboard"), purge_step=step + 1)
+        lines = [f"    {key}: {value}" for key, value in flat(spec.plain)]
+        self.writer.add_text("settings", "\n".join(lines), step)
 
     def add(self, step: int, numbers: Numbers) -> None:
         """Write numbers as scalars."""
@@ -87,21 +92,21 @@ class TensorBoard:
 class WeightsAndBiases:
     """Logs to the project `gsbench`; WANDB_MODE=offline writes into the folder `wandb` of the run instead."""
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, spec: RunSpec, step: int) -> None:
         import wandb
 
-        old_id = _read_id(subject)
+        old_id = _read_id(spec, step)
         self.run: Any = wandb.init(
             project="gsbench",
-            group=subject.experiment,
-            name=subject.name,
-            dir=str(subject.folder),
+            group=spec.config.experiment,
+            name=spec.name,
+            dir=str(spec.folder),
             id=old_id,
             resume="allow" if old_id else None,
-            config=dict(subject.settings),
+            config=dict(flat(spec.plain)),
             settings=wandb.Settings(init_timeout=WANDB_SECONDS, console="off"),
         )
-        _write_id(subject, self.run.id)
+        _write_id(spec, self.run.id)
 
     def add(self, step: int, numbers: Numbers) -> None:
         """Log numbers at a step."""
@@ -115,22 +120,23 @@ class WeightsAndBiases:
 class MLflow:
     """Logs to the server that MLFLOW_TRACKING_URI names, or else into this folder."""
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, spec: RunSpec, step: int) -> None:
         for key, value in (("TIMEOUT", SECONDS), ("MAX_RETRIES", "1")):  # which MLflow may read when it is imported
             os.environ.setdefault(f"MLFLOW_HTTP_REQUEST_{key}", value)
         import mlflow
 
         self.client: Any = mlflow.MlflowClient()
-        self.id = _read_id(subject)
+        self.id = _read_id(spec, step)
         if self.id is None:
-            earlier = self.client.get_experiment_by_name(subject.experiment)
-            experiment = earlier.experiment_id if earlier else self.client.create_experiment(subject.experiment)
-            self.id = str(self.client.create_run(experiment, run_name=subject.name).info.run_id)
-            values = [(key, str(value)[:LONGEST_PARAMETER]) for key, value in subject.settings.items()]
+            name = spec.config.experiment
+            earlier = self.client.get_experiment_by_name(name)
+            experiment = earlier.experiment_id if earlier else self.client.create_experiment(name)
+            self.id = str(self.client.create_run(experiment, run_name=spec.name).info.run_id)
+            values = [(key, str(value)[:LONGEST_PARAMETER]) for key, value in flat(spec.plain)]
             for i in range(0, len(values), MOST_PARAMETERS):
                 chosen = [mlflow.entities.Param(*pair) for pair in values[i : i + MOST_PARAMETERS]]
                 self.client.log_batch(self.id, params=chosen)
-            _write_id(subject, self.id)
+            _write_id(spec, self.id)
         else:
             self.client.update_run(self.id, status="RUNNING")
 
@@ -145,11 +151,12 @@ class MLflow:
         self.client.set_terminated(self.id, ended)
 
 
-TRACKERS: dict[str, Callable[[Subject], Tracker]] = {
+# By the name of their package, made for a run that has finished some steps: more than 0 if it continues.
+TRACKERS: dict[str, Callable[[RunSpec, int], Tracker]] = {
     "tensorboard": TensorBoard,
     "wandb": WeightsAndBiases,
     "mlflow": MLflow,
-}  # by the name of their package
+}
 
 
 def check_tracker(name: str | None) -> None:
@@ -164,17 +171,17 @@ def check_tracker(name: str | None) -> None:
         )
 
 
-def _read_id(subject: Subject) -> str | None:
+def _read_id(spec: RunSpec, step: int) -> str | None:
     """Return the id of a run that continues; None if it starts anew or no id was stored."""
     try:
-        text = (subject.folder / ID_FILE).read_text()[:100] if subject.step else ""
+        text = (spec.folder / ID_FILE).read_text()[:100] if step else ""
     except (OSError, UnicodeDecodeError):
         return None
     return text if re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) else None
 
 
-def _write_id(subject: Subject, number: str) -> None:
-    write_atomically(subject.folder / ID_FILE, number.encode(), lasting=False)
+def _write_id(spec: RunSpec, number: str) -> None:
+    write_atomically(spec.folder / ID_FILE, number.encode(), lasting=False)
 
 
 class RunLog:
@@ -189,16 +196,14 @@ class RunLog:
         self.path, self.trainer, self.config = spec.folder / FILE_NAME, trainer, spec.config
         points = trainer.curve.points
         earlier_lines = _read_curve(self.path)
-        lines = [earlier_lines.get(point, _line(point)) for point in points]
+        lines = [earlier_lines.get(point, Line(*point)) for point in points]
         self.written = len(points)
         with contextlib.suppress(OSError):  # a full disk ends the run at its checkpoint, which says so
-            text = "".join(f"{json.dumps(line)}\n" for line in lines)
-            write_atomically(self.path, text.encode(), lasting=False)
-        continued = trainer.step if spec.config.resume else 0
-        subject = Subject(spec.folder, spec.name, spec.config.experiment, dict(flat(spec.plain)), continued)
+            write_atomically(self.path, b"".join(map(_encoded, lines)), lasting=False)
         self.tracker: Tracker | None = None  # None also after its first error
         if (name := spec.config.log) is not None:
-            self.tracker = self._guarded(lambda: TRACKERS[name](subject))
+            continued = trainer.step if spec.config.resume else 0
+            self.tracker = self._guarded(lambda: TRACKERS[name](spec, continued))
         for point, line in zip(points, lines, strict=True):
             if point not in earlier_lines:  # measured before the run had a log, while models or lengths were compared
                 self._send_line(line)
@@ -206,9 +211,9 @@ class RunLog:
     def follow(self) -> None:
         """Write what was measured since the last call; called after every step."""
         for point in self.trainer.curve.points[self.written :]:
-            line = _line(point, self.trainer.finite_check.loss, len(self.trainer.model))
-            with contextlib.suppress(OSError), self.path.open("a") as file:
-                file.write(f"{json.dumps(line)}\n")
+            line = Line(*point, self.trainer.finite_check.loss, len(self.trainer.model))
+            with contextlib.suppress(OSError), self.path.open("ab") as file:
+                file.write(_encoded(line))
             self._send_line(line)
             self.written += 1
 
@@ -225,7 +230,7 @@ class RunLog:
 
     def _send_line(self, line: Line) -> None:
         """Send a line of curve.jsonl to the tracker."""
-        self._send(line["iteration"], {name: line[key] for name, key in SENT.items()})
+        self._send(line.iteration, {name: getattr(line, key) for name, key in SENT.items()})
 
     def _send(self, step: int, numbers: Mapping[str, float | None]) -> None:
         """Send what is known and finite of some numbers to the tracker."""
@@ -247,29 +252,19 @@ class RunLog:
             return None
 
 
-def _line(point: Point, loss: float | None = None, gaussians: int | None = None) -> Line:
-    """Return a line of curve.jsonl; what is not known or not finite is None."""
-    return {
-        **point._asdict(),
-        "loss": loss if loss is not None and math.isfinite(loss) else None,
-        "gaussians": gaussians,
-    }
+def _encoded(line: Line) -> bytes:
+    return msgspec.json.encode(line) + b"\n"  # NaN and infinity become null
 
 
 def _read_curve(path: Path) -> dict[Point, Line]:
     """Read the lines of a curve.jsonl by their points; lines that are no JSON of a point are left out."""
     lines_by_point = {}
     try:
-        lines = read_file(path, str(path), LARGEST).splitlines()
+        texts = read_file(path, str(path), LARGEST).splitlines()
     except InputError:  # there is none yet
         return {}
-    for text in lines:
-        with contextlib.suppress(InputError, KeyError, TypeError):
-            read = parse_json(text, str(path))
-            point = Point(read["iteration"], read["seconds"], read["psnr_val"])
-            lines_by_point[point] = _line(point, _number(read["loss"]), _number(read["gaussians"]))
+    for text in texts:
+        with contextlib.suppress(msgspec.MsgspecError):
+            line = msgspec.json.decode(text, type=Line)
+            lines_by_point[line.point] = line
     return lines_by_point
-
-
-def _number(value: Any) -> Any:
-    return value if type(value) in (int, float) else None

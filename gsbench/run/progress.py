@@ -174,35 +174,32 @@ def release_claim(folder: Path, claim: Progress, *, is_stopped: bool = False) ->
 
 
 def _read(path: Path) -> tuple[bytes | None, Progress | None]:
-    """Read a claim: its content, None if there is none, and its progress, None if the claim is damaged or missing."""
-    for _ in range(READS):
-        content = _content(path)
-        if content is None:
-            break
+    """Read a claim: its content, None if there is none, and its progress, None if the claim is damaged or missing.
+
+    Raises:
+        OSError: it cannot be read, which does not make it a damaged one.
+    """
+    content = None
+    for attempt in range(1, READS + 1):
         try:
-            return content, parse(Progress, parse_json(content, str(path)), str(path))
+            content = _content(path)
+            return content, None if content is None else parse(Progress, parse_json(content, str(path)), str(path))
         except InputError:
+            time.sleep(PAUSE)
+        except OSError as error:
+            if error.errno != errno.ESTALE or attempt == READS:
+                raise
             time.sleep(PAUSE)
     return content, None
 
 
 def _content(path: Path) -> bytes | None:
-    """Return the bytes of a claim, or None if there is none.
-
-    Raises:
-        OSError: it cannot be read, which does not make it a damaged one.
-    """
-    for attempt in range(1, READS + 1):
-        try:
-            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would be waited for
-                return file.read(LARGEST)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            if error.errno != errno.ESTALE or attempt == READS:
-                raise
-            time.sleep(PAUSE)
-    raise AssertionError("the last attempt returns or raises")
+    """Return the bytes of a claim, or None if there is none."""
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:  # a pipe would be waited for
+            return file.read(LARGEST)
+    except FileNotFoundError:
+        return None
 
 
 def _is_same_process(other: Progress, claim: Progress) -> bool:
