@@ -31,15 +31,7 @@ from gsbench.run import fitting, measuring, progress
 from gsbench.run.identity import RunSpec
 from gsbench.run.log import RunLog, check_tracker
 from gsbench.run.progress import Progress
-from gsbench.run.selection import (
-    ChosenModel,
-    best_length,
-    best_of,
-    check_candidates,
-    choose_model,
-    plain,
-    reporter,
-)
+from gsbench.run.selection import ChosenModel, best_on_val, check_candidates, choose_model, plain, reporter
 from gsbench.run.settings import check_settings, is_auto, lpips_weights, with_candidate
 from gsbench.run.setup import (
     build,
@@ -111,7 +103,7 @@ class Execution:
     def fit(self, model: GaussianModel, scene: Scene) -> Trainer:
         """Train to the last step; for model=auto a test of the scene, or `effects.compare` on val, chooses the model.
 
-        It raises the errors of `gsbench.run.fitting.resume` and `fit`, and of `gsbench.run.selection.best_of`.
+        It raises the errors of `gsbench.run.fitting.resume` and `fit`, and of `gsbench.run.selection.best_on_val`.
         """
         spec = self.spec
         if is_auto(spec.config):
@@ -120,8 +112,7 @@ class Execution:
         screen, device = self.chosen.screen, spec.config.device
         if self.chosen.compares or lengths_of(spec.config) is not None:  # these add the costs of the screen themselves
             reset_peak_memory(device)
-            choose = best_of if self.chosen.compares else best_length
-            trainer = choose(spec, scene, self.start, self.chosen)
+            trainer = best_on_val(spec, scene, self.start, self.chosen)
             self.chosen, self.model = replace(self.chosen, config=trainer.config), trainer.model
         else:
             trainer = self.trainer(model, scene)

@@ -11,7 +11,7 @@ be short is better (docs/tuning.md).
 
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,7 +33,7 @@ from gsbench.scenes import Scene
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import Schedule
 from gsbench.train.divergence import DivergedError
-from gsbench.train.hooks.choices import Choices, ChosenOnVal, choices_in, lengths_of
+from gsbench.train.hooks.choices import Choices, ChosenOnVal, choices_in, length_name, lengths_of
 from gsbench.train.loop import Trainer
 from gsbench.train.optim import check_rates
 
@@ -70,29 +70,30 @@ class Candidates:
         config = self.settings[name]
         return fitting.trainer_of(build(config), self.scene, config, self.start)
 
-    def chosen(self, chosen_in: Callable[[ChosenOnVal], str | None], choose: Callable[[], Trainer]) -> Trainer:
-        """Return the trainer of the candidate that the run's own checkpoint names; if it names none, that of `choose`.
-
-        The choice is saved in the run's checkpoint, before the checkpoints of the candidates are deleted. `chosen_in`
-        returns the name of the chosen candidate by the choices in a checkpoint.
-
-        Raises:
-            InputError: a checkpoint is damaged.
-        """
-        state = fitting.saved_state(self.spec, self.scene)
-        name = chosen_in(choices_in(state)) if state else None
-        if name is None:
-            trainer = choose()
-            fitting.save(trainer.state_dict(), self.spec, self.scene, plain(self.spec, trainer.config))
-        elif name in self.settings:
-            trainer = self.trainer(name)
-            fitting.resume(trainer, self.spec, state)
+    def chosen(self, model: "ChosenModel") -> Trainer:
+        """Train the candidates, print which is the best, and return its trainer with the costs of all."""
+        results: list[Result] = []
+        for name, config in self.settings.items():
+            if model.compares:
+                until = Schedule(config.train, config.model.sh_degree, config.agr).compares_after
+                steps = (len(self.settings) - 1) * until + config.train.iterations  # one of them is trained to the end
+            else:
+                until = config.train.iterations
+                steps = sum(each.train.iterations for each in self.settings.values())
+            results.append(self.train(name, until, results, steps))
+            top = highest(results)
+            if not model.compares and top is not results[-1] and top.error is None:
+                break
+        chosen, tried = best(results), [result.candidate for result in results]
+        if model.compares:
+            comparison = ModelComparison(chosen.steps, chosen.candidate.name, tried)
+            choice, message = ChosenOnVal(comparison=comparison), messages.of_comparison(comparison)
         else:
-            raise InputError(
-                f"checkpoint: expected one of {', '.join(self.settings)}, got {name!r:.80}: "
-                f"start over with resume=false"
-            )
-        shutil.rmtree(self.spec.folder / FOLDER, ignore_errors=True)
+            length = LengthChoice(chosen.steps, tried)
+            choice, message = ChosenOnVal(length=length), messages.of_lengths(length)
+        print(f"{self.spec.name}: {message}", file=sys.stderr)
+        trainer = self.trained(chosen, results, model)
+        trainer.hook(Choices).chosen = choice
         return trainer
 
     def trained(self, chosen: "Result", results: Sequence["Result"], model: "ChosenModel") -> Trainer:
@@ -269,38 +270,39 @@ def choose_model(spec: RunSpec, scene: Scene) -> ChosenModel:
     return chosen
 
 
-def best_of(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: ChosenModel) -> Trainer:
+def best_on_val(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: ChosenModel) -> Trainer:
     """Return the trainer of the candidate with the highest PSNR on val, from which the run continues.
 
     The candidates are trained one after another, each with the settings and the seed of the run, so that the result is
-    bit-equal to a run of the chosen model alone. A checkpoint of each is kept until the choice is saved in the run's
-    own checkpoint. The seconds of the time screen and of the other candidates count as training.
+    bit-equal to a run of the chosen one alone. Models are trained until they are compared. Lengths are trained to their
+    last step, from the shortest on, and end with the first that is not better on val than all before it; each is gated
+    as such a run is, after its PSNR on val was measured. The seconds of the time screen and of the other candidates
+    count as training.
+
+    A checkpoint of each candidate is kept until the choice is saved in the run's own checkpoint.
 
     Raises:
         InputError: a checkpoint is damaged.
         DivergedError, NoGaussianError, OverBudgetError: no candidate can be chosen; the error is that of the first.
         Stopped: a signal asked the process to end; the checkpoint of the present candidate is saved.
     """
-    settings = {name: gated_if_possible(candidate) for name, candidate in candidates(spec.config).items()}
-    trainings = Candidates(spec, scene, start, settings)
-    return trainings.chosen(
-        lambda choices: choices.comparison.chosen if choices.comparison else None,
-        lambda: _trained_models(trainings, model),
-    )
-
-
-def _trained_models(trainings: Candidates, model: ChosenModel) -> Trainer:
-    """Train all candidates, print which is the best, and return its trainer with the costs of all."""
-    results: list[Result] = []
-    for name, config in trainings.settings.items():
-        until = Schedule(config.train, config.model.sh_degree, config.agr).compares_after
-        steps = (len(trainings.settings) - 1) * until + config.train.iterations  # one of them is trained to the end
-        results.append(trainings.train(name, until, results, steps))
-    chosen = best(results)
-    comparison = ModelComparison(chosen.steps, chosen.candidate.name, [result.candidate for result in results])
-    print(f"{trainings.spec.name}: {messages.of_comparison(comparison)}", file=sys.stderr)
-    trainer = trainings.trained(chosen, results, model)
-    trainer.hook(Choices).chosen.comparison = comparison
+    if model.compares:
+        settings = {name: gated_if_possible(candidate) for name, candidate in candidates(spec.config).items()}
+    else:
+        settings = lengths(model.config)
+    trainings, state = Candidates(spec, scene, start, settings), fitting.saved_state(spec, scene)
+    name = choices_in(state).candidate if state else None
+    if name is None:
+        trainer = trainings.chosen(model)
+        fitting.save(trainer.state_dict(), spec, scene, plain(spec, trainer.config))
+    elif name in settings:
+        trainer = trainings.trainer(name)
+        fitting.resume(trainer, spec, state)
+    else:
+        raise InputError(
+            f"checkpoint: expected one of {', '.join(settings)}, got {name!r:.80}: start over with resume=false"
+        )
+    shutil.rmtree(spec.folder / FOLDER, ignore_errors=True)
     return trainer
 
 
@@ -322,44 +324,3 @@ def lengths(config: Config) -> dict[str, Config]:
     alone: dict[str, Any] = {"lengths": None}  # a dict, as mypy does not know the keys of hooks
     trains = [replace(train, iterations=train.iterations >> k, **alone) for k in reversed(range(count))]
     return {length_name(shorter.iterations): replace(config, train=shorter) for shorter in trains}
-
-
-def length_name(iterations: int) -> str:
-    """Return the name of a length among the candidates of a run."""
-    return f"iterations={iterations}"
-
-
-def best_length(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, model: ChosenModel) -> Trainer:
-    """Return the trainer of the length with the highest PSNR on val, at its last step.
-
-    The lengths are trained from the shortest on. They end with the first that is not better on val than all before it.
-    The result is bit-equal to a run of the chosen length alone. Each length is gated as such a run is, after its PSNR
-    on val was measured. The seconds of the time screen and of the other lengths count as training.
-
-    Raises:
-        InputError: a checkpoint is damaged.
-        DivergedError, NoGaussianError: all lengths failed; the error is that of the shortest.
-        Stopped: a signal asked the process to end; the checkpoint of the present length is saved.
-    """
-    trainings = Candidates(spec, scene, start, lengths(model.config))
-    return trainings.chosen(
-        lambda choices: length_name(choices.length.kept) if choices.length else None,
-        lambda: _trained_lengths(trainings, model),
-    )
-
-
-def _trained_lengths(trainings: Candidates, model: ChosenModel) -> Trainer:
-    """Train one length after the other, print which is the best, and return its trainer with the costs of all."""
-    results: list[Result] = []
-    steps = sum(config.train.iterations for config in trainings.settings.values())
-    for name, config in trainings.settings.items():
-        results.append(trainings.train(name, config.train.iterations, results, steps))
-        top = highest(results)
-        if top is not results[-1] and top.error is None:
-            break
-    chosen = best(results)
-    choice = LengthChoice(chosen.steps, [result.candidate for result in results])
-    print(f"{trainings.spec.name}: {messages.of_lengths(choice)}", file=sys.stderr)
-    trainer = trainings.trained(chosen, results, model)
-    trainer.hook(Choices).chosen.length = choice
-    return trainer

@@ -20,11 +20,12 @@ from gsbench.measure.speed import RenderTimes
 from gsbench.report.sections.curves import events
 from gsbench.run import load, log, measuring, progress, selection
 from gsbench.run.identity import RunSpec
-from gsbench.run.selection import FOLDER, choose_model, length_name, lengths
+from gsbench.run.selection import FOLDER, choose_model, lengths
 from gsbench.run.settings import candidates, label_of
 from gsbench.scenes import View
 from gsbench.train import checkpoint
 from gsbench.train.divergence import DivergedError
+from gsbench.train.hooks.choices import length_name
 from gsbench.train.loop import Trainer
 
 

@@ -32,6 +32,13 @@ class ChosenOnVal:
     length: LengthChoice | None = None  # by which `train.lengths` chose this training
     comparison: ModelComparison | None = None  # by which model=auto chose the model (`effects.compare`)
 
+    @property
+    def candidate(self) -> str | None:
+        """Return the name of the chosen model or length; None if there was no choice."""
+        if self.length is not None:
+            return length_name(self.length.kept)
+        return self.comparison.chosen if self.comparison else None
+
 
 class Choices(Hook):
     """Keep the choices on val of a training."""
@@ -93,6 +100,11 @@ def _parsed(state: object) -> ChosenOnVal:
     return ChosenOnVal(
         **{name: state[name] and parse(kind, state[name], f"checkpoint: {name}") for name, kind in kinds.items()}
     )
+
+
+def length_name(iterations: int) -> str:
+    """Return the name of a length among the candidates of a run."""
+    return f"iterations={iterations}"
 
 
 def lengths_of(config: Config) -> int | None:
