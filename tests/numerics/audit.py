@@ -11,6 +11,7 @@ from multiprocessing import get_context
 import torch
 from tqdm import tqdm
 
+from gsbench.models.cholesky import FACTOR_ORDERS
 from numerics import colors, curves, pictures, population, slices, trainings
 from numerics.cases import CASES, Case, Cell, of_area, present
 from numerics.slices import JOINT
@@ -80,8 +81,7 @@ def _judged(
 
 def hard_slices(audit: Audit, name: str, N: int) -> None:
     """Measure the errors of N random slices: of 7DGS in a factor order, or of another model."""
-    measure = population.moving_slices if name in population.MOVING else population.hard_slices
-    cells, audit.verified[name] = measure(name, N, audit.backends)
+    cells, audit.verified[name] = population.hard_slices(name, N, audit.backends)
     audit.cells += cells
 
 
@@ -104,7 +104,7 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
         _judged(audit, CASES["poisoned_photograph"], trainings.judge, fastest),
         _judged(audit, drifting, trainings.drift, fastest, trainings.SEEDS[:1], steps=SHORT_STEPS),
     ]
-    return steps + _hard_slices(audit, dict.fromkeys((*population.FACTOR_ORDERS, *population.MOVING), FEW))
+    return steps + _hard_slices(audit, dict.fromkeys((*FACTOR_ORDERS, *population.MOVING), FEW))
 
 
 def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -> list[tuple[str, Step]]:
@@ -117,7 +117,7 @@ def _steps(audit: Audit, million: int, long: bool, other: ProcessPoolExecutor) -
         steps.append(_judged(audit, case, trainings.judge, fastest, **more))
     drifts = other.submit(_drifts, fastest, long)
     few = million if long else min(million, NOT_DEFAULT)
-    counts = {order: million if order == DEFAULT_ORDER else few for order in population.FACTOR_ORDERS}
+    counts = {order: million if order == DEFAULT_ORDER else few for order in FACTOR_ORDERS}
     return [
         *steps,
         *_hard_slices(audit, counts | dict.fromkeys(population.MOVING, min(million, MOVING))),

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from gsbench.kernels.backends import BACKENDS
 from gsbench.measure.speed import synchroniser
-from gsbench.models import build
-from gsbench.models.cholesky import CholeskyModel
+from gsbench.models import CameraTime, GaussianModel
+from gsbench.models.cholesky import FACTOR_ORDERS
 from gsbench.models.gaussian_batch import tensors_of
 from numerics import population
 from numerics.cases import backends_with, device_of
-from numerics.population import FACTOR_ORDERS, SCHEMES
+from numerics.population import SCHEMES
+from numerics.slices import load
 
 SPREAD = 40_000  # Gaussians in the measurement of errors against condition number
 DECADES = 8.0  # diagonal entries go down to 10^-u, with u random in [0, DECADES] for each Gaussian
@@ -54,30 +54,32 @@ def by_condition() -> Iterator[ConditionCurve]:
     factor, so that the default scheme would have nothing to compute."""
     order, generator = "paper", Generator().manual_seed(2)
     decades = DECADES * torch.rand(SPREAD, 1, generator=generator, dtype=torch.float64)
-    hard = population.draw(generator, SPREAD, order, decades)
-    exact = population.truth(hard, order)
-    condition = np.log10(np.linalg.cond(population.factor(hard)))
+    hard = population.draw_factors(generator, order, SPREAD, decades)
+    exact = population.truth(hard)
+    model, _ = load(hard, "square_root", "reference")
+    factors = model.factors({name: value.double() for name, value in hard.raw.items()})
+    condition = np.log10(np.linalg.cond(factors.numpy()))
     for scheme in SCHEMES:
-        errors = population.judge(hard, exact, order, scheme, "reference")
-        cov, curve = np.nan_to_num(errors.cov, nan=np.inf), ConditionCurve(scheme)
+        errors = population.judge(hard, exact, scheme, "reference")
+        cov, bad = np.nan_to_num(errors.shape.numpy(), nan=np.inf), errors.bad.numpy()
+        curve = ConditionCurve(scheme)
         for low, high in itertools.pairwise(BINS):
             inside = (low <= condition) & (condition < high)
             if inside.sum() >= LEAST:
                 curve.condition.append(float(10 ** ((low + high) / 2)))
                 curve.median.append(float(np.quantile(cov[inside], 0.5, method="higher")))
                 curve.percentile99.append(float(np.quantile(cov[inside], 0.99, method="higher")))
-                curve.bad.append(float(errors.bad[inside].mean()))
+                curve.bad.append(float(bad[inside].mean()))
         yield curve
 
 
 def _passes(
-    model: CholeskyModel, hard: population.Hard
+    model: GaussianModel, raw: dict[str, Tensor]
 ) -> tuple[Callable[[], tuple[Tensor, ...]], Callable[[tuple[Tensor, ...]], None]]:
     """Return the forward pass of slicing, and the backward pass from its result; each waits for its device."""
     device = device_of(model.backend.name)
-    parameters = population.raw_parameters(hard, model)
-    raw = {name: value.to(device).requires_grad_() for name, value in parameters.items()}
-    query, wait = population.at_the_origin(model), synchroniser(device)
+    raw = {name: value.detach().to(device).requires_grad_() for name, value in raw.items()}
+    query, wait = CameraTime(torch.zeros(3, device=device), torch.zeros((), device=device)), synchroniser(device)
 
     def forward() -> tuple[Tensor, ...]:
         out = tensors_of(model.slice_geometry(raw, query))
@@ -94,13 +96,10 @@ def _passes(
 def safety(backends: list[str]) -> Iterator[SliceTime]:
     """Yield the times of the forward and the backward pass of each scheme on each backend."""
     for order in FACTOR_ORDERS:
-        hard = population.draw(Generator().manual_seed(3), TIMED, order, 1.0)
+        hard = population.draw_factors(Generator().manual_seed(3), order, TIMED, 1.0)
         for scheme in SCHEMES:
             for backend in backends_with(scheme, "7dgs", backends):
-                model = build(
-                    "7dgs", lambda_d=0.35, lambda_t=0.35, factor_order=order, scheme=scheme, backend=BACKENDS[backend]
-                )
-                forward, backward = _passes(model.to(device_of(backend)), hard)
+                forward, backward = _passes(*load(hard, scheme, backend))
                 times = []
                 for _ in range(1 if backend == "reference" else REPEATS):
                     start = time.perf_counter()

@@ -9,7 +9,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 from gsbench.kernels.backends import BACKENDS
 from gsbench.kernels.headers import ALPHA_MIN, LOG_SIZE_MAX
 from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.cholesky import FACTOR_ORDERS, WIDTH
 from gsbench.models.factors import CholeskyLayout
 from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.slicing import SCHEMES, subtract
@@ -44,6 +45,7 @@ class Observed:
     center: Tensor
     time: float = TIME
     log_lambda: dict[str, float] = field(default_factory=dict)
+    options: dict[str, str] = field(default_factory=dict)  # of the model, beside those in OPTIONS
 
     @property
     def family(self) -> str:
@@ -139,6 +141,11 @@ def hard(*models: str) -> Callable[..., Any]:
 def variables(model: str) -> str:
     """Return the variable of each row of the triangular factor: d (direction), t (time) or p (position)."""
     return "dddtppp" if model == "7dgs" else "dddppp"
+
+
+def letters_of(order: str) -> str:
+    """Return the same for 7DGS in a factor order."""
+    return "".join(x * WIDTH[x] for x in FACTOR_ORDERS[order])
 
 
 def _rows(observed: Observed, variable: str) -> list[int]:
@@ -469,8 +476,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 LEAST_GRADIENT = 1e-20  # errors of a smaller gradient are relative to this, because float32 underflows
 
 
-@dataclass(frozen=True)
-class SliceTruth:
+class SliceTruth(NamedTuple):
     """The exact conditional mean, covariance and opacity of N Gaussians, and the gradient of a loss."""
 
     outputs: Tensor  # [N, 13] float64: mean (3), covariance (9), opacity; [N, 14] with the exponent of a Beta profile
@@ -479,13 +485,13 @@ class SliceTruth:
     gradient: Tensor  # [N, parameters], in the order of `Observed.raw`
 
 
-@dataclass(frozen=True)
-class SliceErrors:
+class SliceErrors(NamedTuple):
     """The relative errors of the slices of N Gaussians."""
 
-    forward: Tensor  # [N]
+    shape: Tensor  # [N] of the covariance
+    forward: Tensor  # [N] the largest of mean, covariance, opacity and exponent
     gradient: Tensor  # [N]
-    bad: Tensor  # [N] bool: not finite
+    bad: Tensor  # [N] bool: not finite, or an indefinite covariance
     drawn: Tensor  # [N] bool: opaque enough to be rendered; of other slices only the opacity counts
 
 
@@ -496,15 +502,20 @@ def judge(case: Case, backends: list[str], schemes: Sequence[str] = SCHEMES, cop
         exact = truth(observed)
         for scheme in schemes if model in JOINT else (ONE_SCHEME,):
             for backend in backends_with(scheme, model, backends):
-                gaussians, raw = load(observed, scheme, backend)
-                errors = compare(*differentiate(gaussians, raw, observed, exact.weights), exact)
-                bad = errors.bad | indefinite(gaussians, raw)
+                errors = errors_of(observed, exact, scheme, backend)
                 gaussians, raw = load(observed, scheme, backend, copies)
                 weights = exact.weights.repeat(copies, 1)
                 ms = fastest(functools.partial(differentiate, gaussians, raw, observed, weights))
                 at = (case.area, case.name, model, scheme, backend)
-                measured = (worst(errors.forward), worst(errors.gradient), bad.double().mean().item(), ms)
+                measured = (worst(errors.forward), worst(errors.gradient), errors.bad.double().mean().item(), ms)
                 yield Cell(*at, *measured, case.bound, f"{int(errors.drawn.sum())} of {COUNT} drawn")
+
+
+def errors_of(observed: Observed, exact: SliceTruth, scheme: str, backend: str) -> SliceErrors:
+    """Measure the errors of slices in float32 by one scheme and backend."""
+    gaussians, raw = load(observed, scheme, backend)
+    errors = compare(*differentiate(gaussians, raw, observed, exact.weights), exact)
+    return errors._replace(bad=errors.bad | indefinite(gaussians, raw))
 
 
 def truth(observed: Observed) -> SliceTruth:
@@ -545,7 +556,10 @@ def exact_slice(observed: Observed) -> oracle.Function:
         options = {"log_lambda": {name: single(value) for name, value in observed.log_lambda.items()}}
     if observed.model in ("6dgs", "7dgs"):
         time = time if observed.model == "7dgs" else None
-        options |= {"order": variables(observed.model), "half": 0.5 if observed.model == "7dgs" else 1.0}
+        order = observed.options.get("factor_order")
+        options |= {"order": letters_of(order) if order else variables(observed.model)}
+        options |= {"half": 0.5 if observed.model == "7dgs" else 1.0}
+        options |= {"relative": observed.options.get("off_diagonal") != "raw"}
     return functools.partial(
         oracle.SLICES[observed.family], layout=layout, center=observed.center.tolist(), time=time, **options
     )
@@ -554,7 +568,7 @@ def exact_slice(observed: Observed) -> oracle.Function:
 def load(observed: Observed, scheme: str, backend: str, copies: int = 1) -> tuple[GaussianModel, dict[str, Tensor]]:
     """Make a model, and raw parameters that repeat the Gaussians of a case `copies` times."""
     name = "dgs" if observed.model in COUPLINGS else observed.model
-    options = OPTIONS.get(observed.model, {}) | ({"scheme": scheme} if name in JOINT else {})
+    options = OPTIONS.get(observed.model, {}) | observed.options | ({"scheme": scheme} if name in JOINT else {})
     model = build(name, backend=BACKENDS[backend], **options)
     for name, value in observed.log_lambda.items():
         model.log_lambda[name] = nn.Parameter(torch.tensor(value))
@@ -588,7 +602,7 @@ def compare(outputs: Tensor, gradient: Tensor, exact: SliceTruth) -> SliceErrors
     others = torch.cat([wrong[:, 12:13], wrong[:, 13:] / exact.outputs[:, 13:]], 1).abs().amax(1)
     slope = (gradient - exact.gradient).norm(dim=1) / exact.gradient.norm(dim=1).clamp(min=LEAST_GRADIENT)
     bad = ~(outputs.isfinite().all(1) & gradient.isfinite().all(1))
-    return SliceErrors(torch.maximum(geometry, others), slope, bad, drawn)
+    return SliceErrors(shape, torch.maximum(geometry, others), slope, bad, drawn)
 
 
 @torch.no_grad()

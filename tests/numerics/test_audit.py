@@ -3,10 +3,10 @@
 import json
 import math
 
-import numpy as np
 import pytest
 import torch
 
+from gsbench.models.cholesky import FACTOR_ORDERS
 from numerics import __main__ as command
 from numerics import audit, page, pictures, population, trainings
 from numerics.cases import CASES, Bound, Cell, present
@@ -26,7 +26,7 @@ def test_the_short_audit_passes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(audit, "run", lambda **words: results.append(run(**words)) or results[0])
     assert command.main(["--short", "--out", str(tmp_path / "none")]) == 0, capsys.readouterr().out
     assert {cell.case for cell in results[0].cells} >= CASES.keys() - LONG
-    assert results[0].verified.keys() == {*population.MOVING, *population.FACTOR_ORDERS}
+    assert results[0].verified.keys() == {*population.MOVING, *FACTOR_ORDERS}
     assert max(results[0].verified.values()) < 1e-6, "the float64 slices that others are held to"
     assert not (tmp_path / "none").exists(), "a page of half the cases"
 
@@ -40,7 +40,7 @@ def test_the_whole_audit_passes(tmp_path, capsys):
     assert [line.count("Gaussians, in float64") for line in drifts] == [3, 3, 3]
 
 
-@pytest.mark.parametrize("order", population.FACTOR_ORDERS)
+@pytest.mark.parametrize("order", FACTOR_ORDERS)
 def test_schemes_on_hard_slices(order):
     """Catches a default beyond its bounds, and an audit so blind that the schemes that subtract pass it."""
     cells, _ = population.hard_slices(order, 4_000, BACKENDS)
@@ -97,7 +97,7 @@ def test_missing_numbers_are_not_good_ones():
     """Catches a NaN error that passes a comparison, and an infinite one hidden by a percentile."""
     assert not cell("square_root", math.nan).holds
     assert page.show(cell("square_root", 2.0)).startswith(page.MARK)
-    errors = np.full(1000, 1e-7)
+    errors = torch.full((1000,), 1e-7)
     errors[-2:] = math.nan
     assert population.percentile(errors) == math.inf
 
