@@ -94,7 +94,7 @@ def _short_steps(audit: Audit) -> list[tuple[str, Step]]:
     fastest, steps = audit.backends[0], []
     for case in of_area("slicing"):
         some = [model for model in case.subjects if model in JOINT and model != "6dgs"]  # 6DGS is 7DGS without time
-        few = only(case, *(some or case.subjects[:1]))
+        few = only(case, *some, *[model for model in case.subjects if model not in JOINT][:1])
         steps.append(_judged(audit, few, slices.judge, audit.backends, ["square_root"], copies=1))
     for area in ("colour", "projection", "blending"):
         steps += [_judged(audit, case, FIXED[area], audit.backends) for case in of_area(area) if case.name != SLOWEST]
