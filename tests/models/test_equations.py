@@ -6,17 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numerics import population, slices
+from numerics.cases import CASES
 from small import CAMERA, CHOLESKY, MODELS, N, covariances, fresh, joint, lively, moved, raw, seeded, started
 
 from gsbench.kernels.backends import REFERENCE
 from gsbench.models import CameraTime, Gaussians3D, build
 from gsbench.models.base import Raw
-from gsbench.models.beta import BetaModel, joint_factor, opacity_factor, softplus_inverse
+from gsbench.models.beta import BetaModel, joint_factor, opacity_factor
 from gsbench.models.camera_time import unit
 from gsbench.models.cholesky import CholeskyModel
 from gsbench.models.gaussian_batch import tensors_of
 from gsbench.models.gaussians4d import TIME_OPACITY_FACTOR_MIN
-from gsbench.models.moving import precision_factor
 from gsbench.models.slicing import slice_gaussians
 
 TIME = 0.45
@@ -196,66 +197,14 @@ def test_4dgs_that_is_long_in_time_keeps_its_digits():
     assert error.max() < 1e-3
 
 
-# ---- dGS, dBS and FreeTimeGS: one Gaussian at the origin, with numbers for which the equations were evaluated by hand
-
-DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-FROM_ORIGIN = CameraTime(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # from there, the origin is in DIRECTION
-VIEW, MOMENT = math.log(0.4), math.log(math.sqrt(10))
-DIRECT = {
-    "means": torch.zeros(1, 3),
-    "scales": torch.tensor([[0.01, 0.02, 0.03]]).log(),
-    "quats": torch.tensor([[1.0, 0, 0, 0]]),
-    "directions": torch.tensor([[0.0, 0, 2]]),
-    "times": torch.zeros(1, 1),
-    "precision": torch.tensor([[VIEW, 0.1, VIEW, 0, 0, VIEW, MOMENT]]),
-    "coupling": torch.full((1, 12), 0.3),
-    "shares": torch.full((1, 2), -1.2),
-}
+# ---- all models that the audit of stability knows
 
 
-def change(raw: Raw, name: str, **options: Any) -> tuple[list[float], float]:
-    """The shift of the mean and the opacity factor of one Gaussian, which have no gradient by its mean."""
-    model = build(name, **options)
-    values = {key: value.double() for key, value in raw.items()}
-    values["means"].requires_grad_()
-    shift, factor = model.change(values, FROM_ORIGIN)
-    assert not shift.requires_grad
-    assert not factor.requires_grad
-    return shift[0].tolist(), factor.item()
-
-
-def test_the_equations_of_dgs():
-    """Catches L for its transpose, a half in the exponent, Lam of another column, a mean direction that is not unit, a
-    coupling that is ignored, and a gradient of the mean by way of the direction from the camera."""
-    shift, factor = change(DIRECT, "dgs")
-    assert shift == pytest.approx([0.00279045] * 3, rel=1e-5)
-    assert factor == pytest.approx(0.850101, rel=1e-6)
-    share, V_pq = 1 / (1 + math.exp(1.2)), 0.02 / math.sqrt(12)  # V_pq delta of every axis
-    delta, through = 0.6 - 0.2 + 0.2, 0.096 + 0.024 - 0.032 + 2.0
-    interpolated = V_pq * ((1 - share) * delta + share * through)
-    assert change(DIRECT, "dgs", coupling="interpolated")[0][0] == pytest.approx(interpolated)
-    assert change(DIRECT, "dgs", coupling="none")[0] == [0, 0, 0]
-
-
-def test_the_equations_of_dbs():
-    """Catches an exponent of another variable, weights b / 4 that are not those of V_qq delta, and exp for softplus."""
-    raw = {key: value for key, value in DIRECT.items() if key not in ("shares", "quats")}
-    raw |= {
-        "scales": softplus_inverse(DIRECT["scales"].double().exp()),
-        "directions": torch.tensor([[0.0, 0, 1]]),
-        "times": torch.full((1, 1), 0.5),
-        "betas": torch.tensor([[7.0, -3, -3, -3, 0]]),
-    }
-    shift, factor = change(raw, "dbs")
-    assert shift == pytest.approx([0.0115723] * 3, rel=1e-5)
-    assert factor == pytest.approx(0.145891, rel=1e-5)
-
-
-def test_precision_is_positive_and_couples_no_time():
-    """Catches a transposed or shifted triangle: direction and time stay apart."""
-    L = precision_factor(torch.arange(7.0)[None])[0]
-    expected = [[1, 0, 0, 0], [1, math.exp(2), 0, 0], [3, 4, math.exp(5), 0], [0, 0, 0, math.exp(6)]]
-    torch.testing.assert_close(L, torch.tensor(expected))
+@pytest.mark.parametrize("model", [*slices.JOINT, *slices.MOVING])
+def test_what_mpmath_has_by_another_program(model):
+    """Catches any wrong line of an equation or a coupling, exp for softplus, and a gradient by the mean through the
+    direction of dGS and dBS."""
+    assert population.verify(CASES["ordinary_gaussians"](model=model), 3) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["dgs", "ex4dgs", "freetime", "freetime_plus", "sharptime", "stg"])
@@ -272,6 +221,8 @@ def test_a_frozen_gaussian_is_the_mean_over_views(name):
 
 # ---- UBS, and what dBS shares with it
 
+DIRECTION = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+FROM_ORIGIN = CameraTime(-DIRECTION, torch.tensor(0.7, dtype=torch.float64))  # from there, the origin is in DIRECTION
 PROFILES = ("ubs", "ubs_static", "dbs", "dbs_static")
 
 

@@ -1,4 +1,4 @@
-"""FreeTimeGS, its gate and SharpTimeGS against their equations."""
+"""The gate of FreeTimeGS++ and SharpTimeGS against their equations."""
 
 import math
 
@@ -10,16 +10,6 @@ from gsbench.models import CameraTime, build
 from gsbench.models.freetime import permanent_share
 
 QUERY = CameraTime.at(CAMERA, 0.7)
-
-
-def test_the_equations_of_freetime():
-    """Catches a velocity from t = 0, a duration without its square, a gate that moves with the camera."""
-    model = build("freetime")
-    raw = {"times": [[0.2]], "durations": [[math.log(0.5)]], "velocities": [[1.0, 0, -2]]}
-    query = CameraTime(torch.zeros(3), torch.tensor(0.7))
-    shift, opacity_factor = model.change({key: torch.tensor(value) for key, value in raw.items()}, query)
-    torch.testing.assert_close(shift, torch.tensor([[0.5, 0, -1.0]]))
-    torch.testing.assert_close(opacity_factor, torch.tensor([math.exp(-0.5)]))
 
 
 def test_a_share_of_an_opacity_lasts():

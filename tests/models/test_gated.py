@@ -27,7 +27,7 @@ from gsbench.models import CameraTime, GaussianModel, registry
 from gsbench.models.base import Raw
 from gsbench.models.cholesky import CholeskyModel
 from gsbench.models.effect_sets import EffectSets
-from gsbench.models.factors import rotation, rotation4d, turn_of_space
+from gsbench.models.factors import partner, rotation, rotation4d, turn_of_space
 from gsbench.models.gated import GatedModel, as_gated
 from gsbench.models.gaussian_batch import Conditioned, tensors_of
 from gsbench.models.gaussians3d import Gaussians3DModel
@@ -93,7 +93,7 @@ def freeze(model: GaussianModel) -> None:
             splats[kind].zero_()
         splats["log_diagonal"][:, model.rows["t"] + model.rows["d"]] = LOG_SIZE_MAX
     else:
-        splats["right_quats"].copy_(splats["left_quats"] * torch.tensor([1, -1, -1, 1]))
+        splats["right_quats"].copy_(partner(splats["left_quats"]))
         splats["scales"][:, 3] = LOG_SIZE_MAX
 
 
@@ -117,7 +117,7 @@ def test_a_static_row_is_a_frozen_one(variant, dtype):
 def test_turn_of_space():
     """Catches a sign or a place in the rotation of space that a left quaternion makes with its partner."""
     left = torch.randn(20, 4, generator=seeded(0), dtype=torch.float64)
-    both = rotation4d(left, left * torch.tensor([1, -1, -1, 1]))
+    both = rotation4d(left, partner(left))
     torch.testing.assert_close(both[:, :3, :3], rotation(turn_of_space(left)))
     torch.testing.assert_close(both[:, 3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(20, 4))
     assert torch.equal(turn_of_space(turn_of_space(left)), left)

@@ -8,7 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from scipy.special import sph_harm_y
 from torch import Tensor, nn
 
 from gsbench.models.appearance import (
@@ -22,12 +21,11 @@ from gsbench.models.appearance import (
     sh_time_colors,
 )
 from gsbench.models.camera_time import unit
-from gsbench.models.factors import OFF_DIAGONALS, CholeskyLayout, rotation, rotation4d
+from gsbench.models.factors import OFF_DIAGONALS, CholeskyLayout, rotation
 from gsbench.models.refinement import Refinement, encode_time
 
 PROPERTY = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**31)
-ORDERS = [(degree, m) for degree in range(4) for m in range(-degree, degree + 1)]  # 3DGS' order of coefficients
 
 
 def normal(seed: int, *shape: int) -> Tensor:
@@ -95,36 +93,6 @@ def test_rotation(seed):
     np.testing.assert_allclose(rotation(q).numpy(), expected, atol=1e-12)
 
 
-def hamilton(a: Tensor, b: Tensor) -> Tensor:
-    """Product of quaternions wxyz, [N, 4] and [N, 4]."""
-    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
-    return torch.cat([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])], -1)
-
-
-@PROPERTY
-@given(seeds)
-def test_rotation4d(seed):
-    """Catches a sign in M_left or M_right: their product is a rotation, v -> l v conj(r) as quaternions."""
-    left, right, v = normal(seed, 5, 4), normal(seed + 1, 5, 4), normal(seed + 2, 5, 4)
-    R = rotation4d(left, right)
-    torch.testing.assert_close(R @ R.mT, torch.eye(4, dtype=torch.float64).expand(5, 4, 4))
-    torch.testing.assert_close(torch.linalg.det(R), torch.ones(5, dtype=torch.float64))
-    left, right = left / left.norm(dim=-1, keepdim=True), right / right.norm(dim=-1, keepdim=True)
-    conjugate = right * torch.tensor([1.0, -1, -1, -1])
-    torch.testing.assert_close((R @ v[..., None])[..., 0], hamilton(hamilton(left, v), conjugate))
-
-
-def test_spherical_harmonics_are_scipy_s():
-    """Catches a wrong constant, order or sign. 3DGS' real basis is sqrt(2) Re / Im of Y_lm, phase (-1)^m included."""
-    d = directions(0, 50)
-    polar, azimuth = np.arccos(d[:, 2].numpy()), np.arctan2(d[:, 1].numpy(), d[:, 0].numpy())
-    expected = []
-    for degree, m in ORDERS:
-        Y = sph_harm_y(degree, abs(m), polar, azimuth)
-        expected.append(Y.real if m == 0 else math.sqrt(2) * (Y.real if m > 0 else Y.imag))
-    np.testing.assert_allclose(sh_basis(d, 3).numpy(), np.stack(expected, -1), atol=1e-12)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_colors(degree):
     """Catches coefficients above the degree in use that still show, a lost +0.5 and a clamp at another value."""
@@ -133,18 +101,6 @@ def test_colors(degree):
     expected = np.maximum(0, np.einsum("nk,nkc->nc", sh_basis(d, 3).numpy()[:, :n], coefficients.numpy()[:, :n]) + 0.5)
     np.testing.assert_allclose(sh_colors(coefficients, d, degree).numpy(), expected, atol=1e-12)
     assert (expected == 0).any()
-
-
-def test_time_colors():
-    """Catches 4DSH with another frequency, phase or period: sum over n of cos(2 pi n (t - mu_t)) beta_n Y."""
-    coefficients, d, offset = normal(3, 20, 3, 16, 3), directions(4, 20), normal(5, 20)
-    waves = np.stack([np.cos(2 * np.pi * n * offset.numpy()) for n in range(3)], -1)
-    sums = np.einsum("nm,nk,nmkc->nc", waves, sh_basis(d, 3).numpy(), coefficients.numpy())
-    colors = sh_time_colors(coefficients, d, 3, offset)
-    np.testing.assert_allclose(colors.numpy(), np.maximum(0, sums + 0.5), atol=1e-12)
-    torch.testing.assert_close(sh_time_colors(coefficients, d, 3, offset + 1), colors)
-    assert not torch.allclose(sh_time_colors(coefficients, d, 3, offset + 0.5), colors)
-    torch.testing.assert_close(sh_time_colors(coefficients[:, :1], d, 2, offset), sh_colors(coefficients[:, 0], d, 2))
 
 
 def test_orders_leave_out_what_is_above_them():

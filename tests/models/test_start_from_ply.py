@@ -8,7 +8,7 @@ from small import CAMERA, EVERY, MODELS, VARIANTS, Balls, covariances, seeded
 from torch import Tensor
 
 from gsbench.models import CameraTime, GaussianModel, build
-from gsbench.models.factors import partner, rotation, rotation4d, turn_of_space
+from gsbench.models.factors import rotation
 from gsbench.scenes.gaussian_ply import TrainedGaussians
 from gsbench.schedule import ActiveComponents
 
@@ -75,15 +75,6 @@ def test_a_flat_gaussian_has_a_triangle():
     gaussians.log_scales[:, 1] = -46
     for name in ("6dgs", "7dgs"):
         assert all(parameter.isfinite().all() for parameter in started_from(gaussians, name).splats.values())
-
-
-def test_a_turn_of_space_leaves_time():
-    """Catches a 4D rotation that turns time."""
-    quats = torch.nn.functional.normalize(trained().quats.double(), dim=1)
-    expected = torch.eye(4, dtype=torch.float64).repeat(N, 1, 1)
-    expected[:, :3, :3] = rotation(quats)
-    left = turn_of_space(quats)
-    torch.testing.assert_close(rotation4d(left, partner(left)), expected)
 
 
 def test_a_model_that_is_not_known_starts_with_spheres():
