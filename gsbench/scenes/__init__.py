@@ -132,8 +132,8 @@ def load(
         layouts = "; or ".join(f"{layout.marker}, of a scene laid out as {layout.expected}" for layout in _LAYOUTS)
         raise InputError(f"{root}: {why}: looked for {layouts}", docs="data.md#what-is-read")
     layout = present[0]  # the order of _LAYOUTS decides
-    given = {"frames": frames, "repair": repair, "leave_out": leave_out}
-    options = {name: _option(name, value, layout) for name, value in given.items() if value is not None}
+    asked = {"frames": frames, "repair": repair, "leave_out": leave_out}
+    options = {name: _option(name, value, layout) for name, value in asked.items() if value is not None}
     from gsbench.scenes.images import Rendition  # late, as the readers: it imports OpenCV
 
     module, function = layout.reader.split(".")

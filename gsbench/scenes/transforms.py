@@ -111,8 +111,8 @@ def load_nerfstudio(root: Path, name: str, rendition: Rendition) -> Scene:
     split = reader.read(NERFSTUDIO, _NERFSTUDIO_KEYS)
     if split.shots[0].time is None or times.table_of(root):
         _check_all_or_none([split])
-        given, digests = times.of_images(root, _named_images(root, split))
-        listed, lines = _with_times(split.shots, given.values), given.notes
+        of_images, digests = times.of_images(root, _named_images(root, split))
+        listed, lines = _with_times(split.shots, of_images.values), of_images.notes
     else:
         ((listed,), lines), digests = _timed(root, [split]), {}
     loaded = shots.read(listed, rendition)
