@@ -94,12 +94,13 @@ slice_static = Operation(  # 3DGS: F = R diag(exp scales)
 )
 
 
-def _cholesky_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
-    """Return the numbers of rows and of entries of a Cholesky factor over position, direction and time."""
+def _sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
+    """Return the numbers of parameters over position and the directions and times that are there."""
     k = 3 * ("directions" in tensors) + ("times" in tensors)  # dimensions beside position
     if k == 0:
         raise InputError("slice_triangular: expected directions, times or both, got neither")
-    return {"rows": k + 3, "moves": 3 * k, "couplings": k * (k - 1) // 2}
+    couplings = k * (k - 1) // 2  # between any two of the k
+    return {"rows": 3 + k, "moves": 3 * k, "couplings": couplings, "entries": 3 * k + couplings, "exponents": 1 + k}
 
 
 slice_triangular = _conditional_slice(  # 6DGS and 7DGS, whose opacities include f_temp and f_dir (7DGS, eq. 9 to 12)
@@ -125,7 +126,7 @@ slice_triangular = _conditional_slice(  # 6DGS and 7DGS, whose opacities include
         "subtracts": bool,  # whether covariances are subtracted, the method `cholesky`, for comparison (CPU only)
     },
     defaults={"half": 0.5, "form": 0, "subtracts": False},
-    derive=_cholesky_sizes,
+    derive=_sizes,
 )
 
 slice_rotated = (
@@ -159,16 +160,12 @@ _UNIVERSAL = {
 }
 
 
-def _universal_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
-    """Return the numbers of parameters over position, direction and, if it is observed, time."""
-    k = 3 + ("times" in tensors)  # dimensions beside position
-    # Entries: between the k and position, and between any two of the k.
-    sizes = {"rows": 3 + k, "entries": 3 * k + k * (k - 1) // 2, "exponents": 1 + k}
-    return sizes | _views("slice_universal", _UNIVERSAL, tensors)
-
-
 slice_universal = Operation(  # UBS
-    "slice_universal", inputs=_UNIVERSAL, outputs=BETA_SLICE, derive=_universal_sizes, memory=MEMORY
+    "slice_universal",
+    inputs=_UNIVERSAL,
+    outputs=BETA_SLICE,
+    derive=lambda tensors, numbers: _sizes(tensors, numbers) | _views("slice_universal", _UNIVERSAL, tensors),
+    memory=MEMORY,
 )
 
 slice_direct = _conditional_slice(  # dGS
@@ -189,12 +186,6 @@ slice_direct = _conditional_slice(  # dGS
 )
 
 
-def _direct_beta_sizes(tensors: dict[str, Tensor], _: dict[str, Any]) -> Sizes:
-    """Return the numbers of parameters over direction and, if it is observed, time."""
-    k = 3 + ("times" in tensors)  # dimensions beside position
-    return {"precisions": 3 + k, "couplings": 3 * k, "exponents": 1 + k}
-
-
 slice_direct_beta = _conditional_slice(  # dBS
     "slice_direct_beta",
     inputs={
@@ -203,15 +194,15 @@ slice_direct_beta = _conditional_slice(  # dBS
         "times": _parameter("N 1", "time"),
         "scales": _parameter("N 3"),  # sizes are their softplus
         "skew": _parameter("N 3"),
-        "precision": _parameter("N precisions"),
-        "coupling": _parameter("N couplings"),
+        "precision": _parameter("N rows"),
+        "coupling": _parameter("N moves"),
         "betas": _parameter("N exponents"),
         "opacities": OPACITIES,
         "center": _of_view("3"),
         "time": _of_view("", "time"),
     },
     outputs=BETA_SLICE,
-    derive=_direct_beta_sizes,
+    derive=_sizes,
 )
 
 slice_free_time = _conditional_slice(  # FreeTimeGS and, with plateaus, SharpTimeGS
