@@ -165,18 +165,12 @@ class GaussianModel(nn.Module, ABC):
         """
         return torch.diag_embed(self.scales()[rows, None].expand(-1, 3))
 
-    def durations(self) -> Tensor | None:
-        """Return each Gaussian's standard deviation in time, [N] (1 = the length of the scene); None without time."""
-        return None
-
     def lifetimes(self) -> tuple[Tensor, Tensor] | None:
         """Return the mean time mu_t [N] and the lifetime s [N] of each Gaussian; None without time.
 
-        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2), so s is the standard deviation in time divided by
-        sqrt(lambda_t).
+        The opacity is proportional to exp(-1/2 ((t - mu_t) / s)^2).
         """
-        deviations = self.durations()
-        return None if deviations is None else (self.splats["times"][:, 0], deviations / sqrt(self.lambda_of("time")))
+        return None
 
     @torch.no_grad()
     def visible_intervals(self) -> Tensor | None:

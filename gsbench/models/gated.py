@@ -17,6 +17,7 @@ from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.effect_sets import EffectSets
 from gsbench.models.gaussian_batch import Conditioned, Geometry, joined_exponents
+from gsbench.models.portable_math import sqrt
 from gsbench.models.slicing import reduce
 
 OPACITY_MARGIN = 1e-6  # least distance of a frozen Gaussian's opacity from 0 and 1, whose logits are infinite
@@ -150,10 +151,12 @@ class JointModel(GatedModel):
         """Return factors of the conditional 3D covariances of the Gaussians `rows` [M], [M, 3, 3]."""
         return reduce(self.factors(self.raw_of(rows))).T_pp
 
-    def durations(self) -> Tensor | None:
+    def lifetimes(self) -> tuple[Tensor, Tensor] | None:
+        """Return mean times [N] and lifetimes [N], which are standard deviations in time divided by sqrt(lambda_t)."""
         if "time" not in self.observes:
             return None
-        return self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1)
+        deviations = self.factors(dict(self.splats.items())).detach()[:, -1].norm(dim=-1)
+        return self.splats["times"][:, 0], deviations / sqrt(self.lambda_of("time"))
 
 
 def has_gates(model: GaussianModel) -> TypeGuard[GatedModel]:
