@@ -12,6 +12,7 @@ from gsbench.gates.gate import apply, choose
 from gsbench.gates.sensitivity import Sensitivity, probe
 from gsbench.kernels.backends import AUTO
 from gsbench.models import CameraTime, GaussianModel, build
+from gsbench.models.cameras import look_at
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
 from gsbench.scenes.scene import Camera, Points, Scene, View, scene_extent
@@ -26,12 +27,7 @@ def camera(azimuth: float, height: float, size: int = SIZE) -> Camera:
     tall = size + size // 5
     level = math.sqrt(max(0.0, 1 - height * height))
     center = 4 * torch.tensor([level * math.cos(azimuth), level * math.sin(azimuth), height])
-    forward = -center / center.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]))
-    right = right / right.norm()
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    viewmat = look_at(center, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, tall / 2], [0, 0, 1]])
     return Camera(viewmat, K, size, tall)
 

@@ -1,6 +1,7 @@
 """Small models for the tests: every registered one and its variants, fresh or in the midst of a training."""
 
 import inspect
+import math
 from typing import Any
 
 import torch
@@ -77,6 +78,13 @@ def doubles(*numbers: Any) -> Tensor:
 
 def row(*numbers: float) -> Tensor:
     return doubles(numbers)
+
+
+def layer_of_the_vectors(number: int, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+    """The weights [rows, columns] and the bias [rows] that vectors of other programs have in a layer, by its number."""
+    i, j = (torch.arange(n, dtype=torch.float64) for n in (rows, columns))
+    weight = torch.sin(0.37 * number + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
+    return weight, 0.05 * torch.cos(number + 0.3 * i)
 
 
 def seeded(seed: int) -> torch.Generator:

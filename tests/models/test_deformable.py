@@ -1,11 +1,10 @@
 """Deformable-3DGS: its equations by vectors of an independent numpy program, its warm-up, its bits and its rows."""
 
-import math
 from typing import Any
 
 import pytest
 import torch
-from small import CAMERA, DIGITS, covariances, doubles, lively, seeded
+from small import CAMERA, DIGITS, covariances, doubles, layer_of_the_vectors, lively, seeded
 from tiny_training import trainer
 from torch import Tensor
 
@@ -33,23 +32,17 @@ def test_the_encoding():
     torch.testing.assert_close(moment, doubles(*low, *high), **DIGITS)
 
 
-def weights_of(layer: int, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-    """The weights [rows, columns] and the bias [rows] that the vectors have in a layer, by its number."""
-    i, j = torch.arange(rows, dtype=torch.float64), torch.arange(columns, dtype=torch.float64)
-    weight = torch.sin(0.37 * layer + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
-    return weight, 0.05 * torch.cos(layer + 0.3 * i)
-
-
 def test_the_field():
     """Catches a layer that is lost or applied twice, a second input at another layer or in another order, a lost or
     further ReLU, and outputs in another order."""
     field = DeformationField(16, 8, 10, 6, True, seeded(0)).double()
     numbered = dict(enumerate(field.hidden.layers)) | {20: field.of_time[0], 21: field.of_time[1]}
     for number, layer in numbered.items():
-        for parameter, values in zip((layer.weight, layer.bias), weights_of(number, *layer.weight.shape), strict=True):
-            parameter.data.copy_(values)  # of equal shape
+        layer.weight.data, layer.bias.data = layer_of_the_vectors(number, *layer.weight.shape)
     for number, rows in ((10, slice(0, 3)), (11, slice(3, 6)), (12, slice(6, 10))):  # three layers of the vectors
-        field.head.weight.data[rows], field.head.bias.data[rows] = weights_of(number, rows.stop - rows.start, 16)
+        field.head.weight.data[rows], field.head.bias.data[rows] = layer_of_the_vectors(
+            number, rows.stop - rows.start, 16
+        )
     assert numbered[5].weight.shape == (16, 63 + 30 + 16)
     dp, ds, dr = (x.detach()[0] for x in field(POSITION, TIME))
     torch.testing.assert_close(dp, doubles(0.03395743, 0.06298777, 0.09373157), **DIGITS)

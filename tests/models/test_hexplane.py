@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import torch
-from small import CAMERA, DIGITS, doubles, lively, seeded
+from small import CAMERA, DIGITS, doubles, layer_of_the_vectors, lively, seeded
 from tiny_training import trainer
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -43,10 +43,7 @@ def planes_of_the_vectors(levels: int = 2) -> Planes:
 def network_of_the_vectors(*further: int) -> Network:
     network: Any = Network(4, 8, [3, 3, 4, 1, *further], seeded(0)).double()
     for number, layer in enumerate([network.first, *(head[i] for head in network.heads for i in (0, 1))]):
-        rows, columns = layer.weight.shape
-        i, j = torch.arange(rows).double(), torch.arange(columns).double()
-        layer.weight.data = torch.sin(0.37 * number + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
-        layer.bias.data = 0.05 * torch.cos(number + 0.3 * i)
+        layer.weight.data, layer.bias.data = layer_of_the_vectors(number, *layer.weight.shape)
     return network
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from interrupted import assert_resumes
-from small import CAMERA, DIGITS, covariances, fresh, lively, pinhole, raw, row, seeded
+from small import CAMERA, DIGITS, covariances, fresh, layer_of_the_vectors, lively, pinhole, raw, row, seeded
 from tiny_training import trainer
 from torch import Tensor
 
@@ -109,11 +109,6 @@ BASE, VIEW, TIME = row(0.1, 0.2, 0.3), row(0.4, 0.5, 0.6), row(-0.3, 0.2, 0.7)
 NINE = row(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, -0.066, 0.044, 0.154)
 
 
-def layer(number: int, rows: int, columns: int) -> Tensor:
-    i, j = (torch.arange(n, dtype=torch.float64) for n in (rows, columns))
-    return torch.sin(0.37 * number + 0.11 * i[:, None] + 0.23 * j) / math.sqrt(columns)
-
-
 def seen_along(x: float, y: float, z: float) -> Camera:
     """A camera of one pixel at (.1, -.2, .3), which looks along z and whose pixel lies in a direction."""
     viewmat, K = torch.eye(4).double(), torch.eye(3).double()
@@ -137,7 +132,8 @@ def test_the_features_of_the_vector():
 def test_the_decoded_vector(saturate, pixel):
     """Catches inputs in another order, rays of the camera's own space or of another length, and a bias."""
     model: Any = lively("stg_full", saturate=saturate)
-    model.decoder[0].weight.data, model.decoder[1].weight.data = layer(0, 6, 12), layer(1, 3, 6)
+    for number, layer in enumerate(model.decoder):
+        layer.weight.data, _ = layer_of_the_vectors(number, *layer.weight.shape)
     image = model.decode(NINE[None, None], seen_along(0.3, 0.1, 0.95))
     torch.testing.assert_close(image[0, 0], row(*pixel), **DIGITS)
 
