@@ -2,11 +2,10 @@
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,10 +14,8 @@ from gsbench.kernels.raster import Viewport
 from gsbench.measure.images import STEPS
 from gsbench.measure.quality import capped_psnr, evenly
 from gsbench.models import CameraTime, GaussianModel
-from gsbench.models.gated import JointModel
 from gsbench.models.gaussian_batch import Gaussians3D
 from gsbench.models.render import rasterize_slice
-from gsbench.models.slicing import reduce, subtract
 from gsbench.raster import EPS2D, FAR
 from gsbench.raster.exact import ORDERED, SKIPPED, STOPPED, ExactImage, U, exact_image
 from gsbench.raster.reference import project
@@ -26,7 +23,6 @@ from gsbench.scenes.scene import Camera, View
 
 VIEWS = 3  # of a run's `psnr_float32`, evenly spaced; a view takes ten to twenty times as long as a frame
 WORST = 10  # Gaussians that are listed
-PERCENTILES = (50, 90, 99, 99.9, 100)  # of condition numbers
 # What makes a Gaussian hard: the ratio of its axes, its opacity, and pixels by which rounding moves its mean.
 FLAT, OPAQUE, MOVED = 1e-3, 0.99, 1e-3
 BRANCHES = {"skipped": SKIPPED, "stopped": STOPPED, "order": ORDERED}
@@ -73,15 +69,6 @@ class Culprit:
 
 
 @dataclass(frozen=True)
-class Conditioning:
-    """How hard the covariances of 4DGS, 6DGS or 7DGS are in float32, for all Gaussians and without AGR."""
-
-    condition_numbers: dict[str, list[float]]  # PERCENTILES of those of the joint factor, and of the sliced one
-    indefinite: dict[str, float]  # share of the sliced covariances by schur and by cholesky, which subtract
-    error: dict[str, float]  # 99th percentile of their relative errors
-
-
-@dataclass(frozen=True)
 class Exactness:
     """The errors of float32 in all views of a model."""
 
@@ -89,7 +76,6 @@ class Exactness:
     gaussians: int
     views: list[ViewExactness]
     worst: list[Culprit]
-    conditioning: Conditioning | None  # None: the model has no covariance over time or direction
     shown: tuple[str, Tensor, ExactImage] = field(repr=False)  # the view with the largest bound: name, float32, exact
 
     @property
@@ -118,14 +104,14 @@ def measure(
         both = render_twice(model, double, shot.camera, shot.time, behind, antialias)
         views.append(compare(shot, both.image, both.exact))
         with torch.inference_mode():
-            culprits += blame(double, both.gaussians, shot, both.exact)
+            culprits += blame(both.gaussians, shot, both.exact)
         if shown is None or both.exact.bound.max() > shown[2].bound.max():
             shown = (shot.name, both.image, both.exact)
     assert shown is not None
     culprits.sort(key=lambda culprit: -culprit.bound)
     first = {culprit.index: culprit for culprit in reversed(culprits)}  # of each Gaussian its worst view
     worst = [culprit for culprit in culprits if first[culprit.index] is culprit][:WORST]
-    return Exactness(title, len(model), views, worst, conditioning(double), shown)
+    return Exactness(title, len(model), views, worst, shown)
 
 
 def compare(shot: Shot, image: Tensor, exact: ExactImage) -> ViewExactness:
@@ -267,8 +253,7 @@ def float64_image(
 
 
 def blame(
-    double: GaussianModel,
-    gaussians: Gaussians3D,  # its slice for this shot, float64
+    gaussians: Gaussians3D,  # of a shot, float64
     shot: Shot,
     exact: ExactImage,
 ) -> list[Culprit]:
@@ -279,10 +264,9 @@ def blame(
     sums = bounds.new_zeros(len(gaussians.means)).index_add_(0, ids, bounds)
     rows = sums.argsort(descending=True)[:WORST]
     rows = rows[sums[rows] > 0]
-    why, culprits = reasons(gaussians, shot.camera, rows), []
-    for row, words, negative in zip(rows.tolist(), why, by_published_formula(double, rows), strict=True):
+    culprits = []
+    for row, words in zip(rows.tolist(), reasons(gaussians, shot.camera, rows), strict=True):
         mask = ids == row
-        words += ["indefinite"] if negative else []
         words += [name for name, bit in BRANCHES.items() if bounds[mask & (branches & bit > 0)].sum() > sums[row] / 2]
         culprits.append(Culprit(row, shot.name, int(mask.sum()), STEPS * float(sums[row]), words))
     return culprits
@@ -308,37 +292,3 @@ def reasons(
         "opaque": opacities > OPAQUE,
     }
     return [[name for name, holds in named.items() if holds[i]] for i in range(len(rows))]
-
-
-def by_published_formula(double: GaussianModel, rows: Tensor) -> Iterable[bool]:
-    """Return of some Gaussians [M] whether the papers' formula makes their covariance indefinite in float32.
-
-    That formula, cov = S_pp - K S_pq^T, subtracts covariances (docs/stability.md). AGR is left out. A model without
-    such a covariance has none that is indefinite.
-    """
-    if not isinstance(double, JointModel) or not len(rows):
-        return [False] * len(rows)
-    return _is_indefinite(subtract(double.factors(double.raw_of(rows)).float(), "schur")[1].double()).tolist()
-
-
-@torch.inference_mode()
-def conditioning(double: GaussianModel) -> Conditioning | None:
-    """Return the condition numbers of a float64 model's covariance factors, and what subtraction makes of them."""
-    if not isinstance(double, JointModel):
-        return None
-    joint = double.factors(double.raw_of(torch.arange(len(double))))
-    sliced = reduce(joint).T_pp
-    exact = sliced @ sliced.mT
-    names = {f"joint factor, {joint.shape[-1]} x {joint.shape[-1]}": joint, "sliced factor, 3 x 3": sliced}
-    numbers = {name: np.percentile(np.linalg.cond(F.numpy()), PERCENTILES).tolist() for name, F in names.items()}
-    indefinite, errors = {}, {}
-    for scheme in ("schur", "cholesky"):
-        cov = subtract(joint.float(), scheme)[1].double()
-        indefinite[scheme] = float(_is_indefinite(cov).double().mean())
-        error = (cov - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))
-        errors[scheme] = float(np.quantile(error.numpy(), 0.99))
-    return Conditioning(numbers, indefinite, errors)
-
-
-def _is_indefinite(cov: Tensor) -> Tensor:
-    return torch.linalg.eigvalsh(cov)[:, 0] < 0

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.images import ROUNDING_SCALE, STEPS, to_bytes
-from gsbench.stability.float32_error import FLAT, MOVED, OPAQUE, PERCENTILES, Exactness, ViewExactness
+from gsbench.stability.float32_error import FLAT, MOVED, OPAQUE, Exactness, ViewExactness
 
 ROUNDING = 1 / math.sqrt(12)  # RMS error of rounding to 8 bits, in steps
 VIEW_TITLES = (
@@ -33,7 +33,6 @@ MEANINGS = {
     "far": f"rounding of world coordinates moves its mean by more than 1/{1 / MOVED:.0f} pixel",
     "huge": "it covers more than the image",
     "opaque": f"its opacity is above {OPAQUE}",
-    "indefinite": "the papers' formula makes its covariance indefinite in float32",
     "skipped": "rounding may decide whether its alpha reaches 1/255, in the pixels with most of its share",
     "stopped": "rounding may decide whether a pixel ends before it",
     "order": "its depth equals another one's within rounding",
@@ -41,7 +40,7 @@ MEANINGS = {
 
 
 def text(exactness: Exactness) -> str:
-    """Return the errors of all views, the ten worst Gaussians, the conditioning and the verdict as Markdown."""
+    """Return the errors of all views, the ten worst Gaussians and the verdict as Markdown."""
     parts = [
         f"{exactness.title}: {exactness.gaussians} Gaussians. Pixel values are in steps of 8 bits (1/255).",
         table(VIEW_TITLES, [_cells(view) for view in exactness.views]),
@@ -54,15 +53,6 @@ def text(exactness: Exactness) -> str:
         words = dict.fromkeys(word for worst in exactness.worst for word in worst.why)
         parts += [table(["Gaussian", "view", "pixels", "sum of their bounds", "why"], rows)]
         parts += ["\n".join(f"{word}: {MEANINGS[word]}." for word in words)] if words else []
-    if (hard := exactness.conditioning) is not None:
-        numbers = [[name, *(f"{x:.1e}" for x in values)] for name, values in hard.condition_numbers.items()]
-        schemes = [
-            [scheme, f"{100 * share:.2f} %", f"{hard.error[scheme]:.1e}"] for scheme, share in hard.indefinite.items()
-        ]
-        parts += [
-            table(["condition number of", *(f"{p:g} %" for p in PERCENTILES)], numbers),
-            table(["in float32", "indefinite", "99th percentile of the error"], schemes),
-        ]
     return "\n\n".join([*parts, verdict(exactness)])
 
 
