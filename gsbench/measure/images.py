@@ -29,12 +29,17 @@ def strip(rows: list[tuple[npt.ArrayLike, npt.ArrayLike]]) -> Pixels:
     """
     pairs = [(np.asarray(render, np.float32), np.asarray(truth, np.float32)) for render, truth in rows]
     width = pairs[0][0].shape[1]
-    factor = -(-LEAST_WIDTH // width)  # rounded up
+    factor = enlargement(width)
     picture = [_header(width * factor)]
     gap = np.full((GAP, picture[0].shape[1], 3), GREY, np.uint8)
     for render, truth in pairs:
         picture += [in_a_row([to_bytes(render), to_bytes(truth), error_image(render, truth)], factor), gap]
     return np.concatenate(picture[:-1])
+
+
+def enlargement(width: int) -> int:
+    """Return the factor by which `strip` enlarges images of a width in pixels."""
+    return -(-LEAST_WIDTH // width)  # rounded up
 
 
 def error_image(render: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Pixels:  # [H, W, 3], each

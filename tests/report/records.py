@@ -40,7 +40,14 @@ HOSTILE = (
 )
 STAGES = ("slice", "raster", "loss", "backward", "density", "optimizer")
 TIMES = RenderTimes(40.0, 50.0, 60.0)
-PROTOCOL = {"name": "gsbench", "background": "white", "downscale": 1, "eval_split": "test", "quantise": False}
+PROTOCOL = {
+    "name": "gsbench",
+    "background": "white",
+    "downscale": 1,
+    "eval_split": "test",
+    "quantise": False,
+    "resolution": "60x40",
+}
 BASE = Record(
     status="ok",
     reason=None,

@@ -224,12 +224,13 @@ def test_strips_are_cut_back_to_their_images(tmp_path):
     for shape, count in (((30, 50, 3), 3), ((300, 260, 3), 1)):
         pairs = random.random((count, 2, *shape))
         write_png(strip([*pairs]), tmp_path / "pictures.png")
-        rows = np.array([parts[:2] for parts in gallery.cut(tmp_path / "pictures.png")])
+        rows = np.array([parts[:2] for parts in gallery.cut(tmp_path / "pictures.png", f"{shape[1]}x{shape[0]}")])
         assert rows.shape == pairs.shape
         assert abs(rows[..., ::-1] - pairs * 255).max() <= 0.5 + 1e-4
+    for resolution in ("259x300", "260x299", "not loaded"):
+        assert gallery.cut(tmp_path / "pictures.png", resolution) == []
     (tmp_path / "pictures.png").write_bytes(b"no image")
-    write_png(np.zeros((20, 20, 3), np.uint8), tmp_path / "small.png")
-    assert [gallery.cut(tmp_path / name) for name in ("pictures.png", "small.png", "none.png")] == [[], [], []]
+    assert [gallery.cut(tmp_path / name, "260x300") for name in ("pictures.png", "none.png")] == [[], []]
 
 
 def test_the_gallery_has_every_model_on_the_same_view_with_its_score(tmp_path):

@@ -1,6 +1,7 @@
 """Images of models beside the ground truth, cut from the files of runs and small enough for a page."""
 
 import base64
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gsbench.errors import printable
-from gsbench.measure.images import GAP, HEADER, Pixels
+from gsbench.measure.images import GAP, HEADER, Pixels, enlargement, reduced
 from gsbench.measure.record import Record
 from gsbench.report.frame import Results
 from gsbench.report.section import EMPTY, Section, number, section
@@ -60,7 +61,8 @@ def gallery(chapter: Results, tests: pd.DataFrame) -> Section | None:
     runs = chapter.finished.runs
     for run in runs[runs.main].sort_values(["scene", "seed", "model"], kind="stable").itertuples():
         models = strips.setdefault(run.scene, {})
-        if run.model not in models and (strip := cut(run.path.parent / FILE_NAME)):
+        resolution = str(run.record.protocol.get("resolution"))
+        if run.model not in models and (strip := cut(run.path.parent / FILE_NAME, resolution)):
             models[run.model] = run.record, strip
     for side, quality, most in STEPS:
         shown = [v for scene, models in strips.items() if models for v in _views(scene, models, side, quality, most)]
@@ -93,43 +95,23 @@ def images(files: list[tuple[str, Path | None]]) -> list[Image]:
     return shown
 
 
-def cut(path: Path) -> Strip:
-    """Cut an image file into rows of (render, ground truth, error), and undo the enlargement of small images.
+def cut(path: Path, resolution: str) -> Strip:
+    """Cut an image file into rows of (render, ground truth, error), each in the size of a view, such as "400x300".
 
-    The list is empty if there is no file or if it has another layout.
+    The list is empty if there is no file, or if it is not what `gsbench.measure.images.strip` makes of such views.
     """
+    size = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", resolution)
     data = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if data is None:
+    if size is None or data is None:
         return []
-    image = np.asarray(data, np.uint8)
-    width = (image.shape[1] - 2 * GAP) // 3
-    body = image[HEADER:]
-    height = _row_height(body)
-    if width < 1 or height < 1 or 3 * width + 2 * GAP != image.shape[1]:
+    factor = enlargement(int(size[1]))
+    width, height = factor * int(size[1]), factor * int(size[2])
+    if data.shape[1] != 3 * width + 2 * GAP or (len(data) - HEADER + GAP) % (height + GAP):
         return []
-    rows = []
-    for top in range(0, len(body) - height + 1, height + GAP):
-        line = body[top : top + height]
-        panels = [line[:, left : left + width] for left in (0, width + GAP, 2 * (width + GAP))]
-        step = _enlargement(panels)
-        render, truth, error = (panel[::step, ::step] for panel in panels)
-        rows.append((render, truth, error))
-    return rows
-
-
-def _row_height(body: Pixels) -> int:
-    """Return the height of a row of images; a grey band separates it from the row below."""
-    grey = (body == body[:, :1, :1]).all((1, 2))
-    inside = [y for y in range(1, len(body) - GAP) if grey[y : y + GAP].all() and (body[y : y + GAP] == 200).all()]
-    return inside[0] if inside else len(body)
-
-
-def _enlargement(parts: list[Pixels]) -> int:
-    """Return the integer factor by which images were enlarged without interpolation; 1 if they were not."""
-    for factor in range(8, 1, -1):
-        if all(np.array_equal(p[::factor, ::factor].repeat(factor, 0).repeat(factor, 1), p) for p in parts):
-            return factor
-    return 1
+    rows = [data[top : top + height : factor] for top in range(HEADER, len(data), height + GAP)]
+    lefts = [column * (width + GAP) for column in range(3)]
+    panels = [[np.asarray(row[:, left : left + width : factor], np.uint8) for left in lefts] for row in rows]
+    return [(render, truth, error) for render, truth, error in panels]
 
 
 def _views(scene: str, models: dict[str, tuple[Record, Strip]], side: int, quality: int, most: int) -> list[View]:
@@ -171,8 +153,5 @@ def _score(record: Record, name: str) -> str:
 
 def _encode(image: Pixels, side: int, quality: int) -> str:
     """Encode an image as WebP in a data URL; its longer side is reduced to at most `side` pixels."""
-    scale = side / max(image.shape[:2])
-    if scale < 1:
-        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    _, data = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    _, data = cv2.imencode(".webp", reduced(image, side, by_longer_side=True), [cv2.IMWRITE_WEBP_QUALITY, quality])
     return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
