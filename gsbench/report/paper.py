@@ -99,7 +99,12 @@ def departure(record: Record) -> str:
     if record.scene not in protocol.scenes:
         return "scene"
     frames = value_at(record, "provenance.config.scene.frames")
-    settings: dict[str, tuple[Any, Any]] = _settings_of_images(record, protocol) | {
+    settings: dict[str, tuple[Any, Any]] = {
+        "size": (record.protocol.get("resolution"), protocol.size(record.scene)),
+        "filter": (record.protocol.get("resize"), None),
+        "split": (record.protocol.get("eval_split"), protocol.split(record.scene)),
+        "background": (record.protocol.get("background"), "black"),
+        "quantisation": (record.protocol.get("quantise"), False),
         "iterations": (iterations(record), protocol.iterations),
         "batch size": (value_at(record, "provenance.config.train.batch_size"), protocol.batch_size),
         "frames": (_count(frames), protocol.frames),
@@ -107,17 +112,6 @@ def departure(record: Record) -> str:
     if record.status != "ok" and record.protocol.get("resolution") == "not loaded":
         del settings["size"]  # a run that failed before it saw an image
     return ", ".join(name for name, (of_run, of_paper) in settings.items() if of_run != of_paper)
-
-
-def has_images_of_paper(record: Record) -> bool:
-    """Tell whether a run is measured on the images of the 7DGS paper, of the paper's size, split and background.
-
-    Only then can its PSNR be compared with the paper's. The training may be another one.
-    """
-    protocol = PROTOCOLS.get(record.dataset)
-    if protocol is None or record.protocol.get("paper_dataset") != record.dataset:
-        return False
-    return all(of_run == of_paper for of_run, of_paper in _settings_of_images(record, protocol).values())
 
 
 def relative_size(record: Record) -> str:
@@ -128,17 +122,6 @@ def relative_size(record: Record) -> str:
     if protocol is None or width is None:
         return printable(size)
     return str(Fraction(int(width[1]), int(protocol.size(record.scene).partition("x")[0])))
-
-
-def _settings_of_images(record: Record, protocol: Protocol) -> dict[str, tuple[Any, Any]]:
-    """Return the settings of the images on which a run is measured, by name, each beside that of the paper."""
-    return {
-        "size": (record.protocol.get("resolution"), protocol.size(record.scene)),
-        "filter": (record.protocol.get("resize"), None),
-        "split": (record.protocol.get("eval_split"), protocol.split(record.scene)),
-        "background": (record.protocol.get("background"), "black"),
-        "quantisation": (record.protocol.get("quantise"), False),
-    }
 
 
 def _count(frames: Any) -> int | None:

@@ -53,11 +53,9 @@ TEXT_1 = (
 )
 TEXT_OTHER = (
     "Measured otherwise than in the paper, or on scenes rendered for gsbench in place of the paper's, so the paper's "
-    "rows are not shown. Of each data set these are the runs nearest to the paper's protocol; all others are counted "
-    "in the last table."
+    "rows are not shown. Of each data set these are the runs nearest to the paper's protocol."
 )
 TEXT_SEEDS = "Finished seeds of each model at the paper's protocol. Valid intervals need three."
-TEXT_POOLS = "Runs with one protocol share a row. “Differs in”: the settings that are not the paper's."
 TEXT_2 = (
     "Rows of the paper's Table 2, and measured averages over all scenes of a data set at the paper's protocol; without "
     "all scenes, there is no average. Technicolor's images must be asked for from their authors. LPIPS of D-NeRF and "
@@ -344,10 +342,9 @@ def _protocol(record: Record) -> str:
 
 
 def sections(results: Results) -> dict[str, list[Section]]:
-    """Return the sections of each table by the name of its file; that of table1 also counts all runs."""
-    runs = of_the_paper(results)
+    """Return the sections of each table by the name of its file."""
     return {
-        "table1": [*_sections1(runs), pools(runs)],
+        "table1": list(_sections1(of_the_paper(results))),
         "table2": list(_sections2(results)),
         "table_successors": list(_sections_of_successors(results)),
     }
@@ -389,30 +386,6 @@ def seeds(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
     by_recipe = runs[runs.status == "ok"].groupby(["model", "scene", "recipe"]).seed.nunique()
     counts = by_recipe.groupby(["model", "scene"]).max().unstack().reindex(index=list(MODELS), columns=scenes)
     return counts.fillna(0).astype(int).rename_axis(index="model", columns=None).reset_index()
-
-
-def pools(runs: pd.DataFrame) -> Section:
-    """Count the runs of each protocol, and tell whether a table shows them."""
-    rows = []
-    shown = [set(pooled.index) for _, _, pooled in _tables(runs)]
-    for (pool, differs), pooled in runs.groupby(["pool", runs.departs != ""]):
-        _, dataset, experiment, _, resize, steps = pool
-        settings = sorted({word for departs in pooled.departs for word in departs.split(", ")}) if differs else []
-        rows.append(
-            {
-                "data": dataset,
-                "experiment": experiment,
-                "size": ", ".join(sorted(set(pooled["size"]))),
-                "filter": "" if resize == "None" else resize,
-                "iterations": steps,
-                "runs": len(pooled),
-                "failed": int((pooled.status != "ok").sum()),
-                "machines": pooled.machine.nunique(),
-                "differs in": ", ".join(settings),
-                "shown": any(set(pooled.index) <= table for table in shown),
-            }
-        )
-    return Section("pools", "All runs on the paper's data or stand-ins", TEXT_POOLS, pd.DataFrame(rows))
 
 
 def _heading(runs: pd.DataFrame) -> str:

@@ -141,15 +141,6 @@ def test_charts_hold_the_numbers_of_their_tables():
     json.dumps(drawn, allow_nan=False)
 
 
-@pytest.mark.parametrize(("size", "expected"), [("400x400", [30.72]), ("200x200", [])])
-def test_the_papers_points_are_marked_as_other_hardware(size, expected):
-    """Catches the paper's numbers among the measured ones, at other milliseconds, or for images of another size."""
-    protocol = {"paper_dataset": "D-NeRF", "background": "black", "resolution": size}
-    runs = [but(r, dataset="D-NeRF", scene="trex", protocol=protocol) for r in frontier(("7dgs",), seeds=1)]
-    (rows,) = charts_of(*runs)["g0-frontier-1"]["datasets"].values()
-    assert [row["psnr_db"] for row in rows if row["kind"] == "paper"] == expected
-
-
 def test_what_did_not_finish_is_on_the_page():
     """Catches a page without the reason of a failure, one failure that hides what finished, and lost faults."""
     runs = frontier(("3dgs", "7dgs"), lengths=(1000,))

@@ -16,7 +16,6 @@ from gsbench.report.paper_tables import (
     SOURCES,
     SUCCESSOR_SCENES,
     of_the_paper,
-    pools,
     published,
     sections,
     seeds,
@@ -71,7 +70,6 @@ def test_seconds_of_two_machines_are_never_averaged():
     runs = [at_paper(seed=0, psnr=30.0), at_paper(seed=1, psnr=31.0), elsewhere]
     line = first_table(*runs).iloc[0]
     assert (line["psnr_db"], line["train_min"]) == pytest.approx((31.0, (90 + 91) / 120))
-    assert pools(of_the_paper(results(*runs))).table.machines.tolist() == [2]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +120,7 @@ def test_finished_seeds_are_counted():
 
 def test_a_row_is_of_one_recipe_and_protocol():
     """Would catch the paper's learning rates averaged with gsbench's, images of another filter as more seeds of a row,
-    one training counted as two seeds, and runs left out without a word."""
+    and one training counted as two seeds."""
     recipes = [
         at_paper(psnr=30.0),
         at_paper(psnr=20.0, variant="recipe=paper"),
@@ -133,12 +131,6 @@ def test_a_row_is_of_one_recipe_and_protocol():
     runs = [at_paper(seed=0), at_paper(seed=1, **BY_DGS), at_paper(seed=2, batch_size=1)]
     runs.append(at_paper(seed=3, batch_size=1, variant="protocol=published"))
     assert first_table(*runs)[["table", "seeds"]].values.tolist() == [["paper", 1], ["other protocol", 2]]
-    of = pools(of_the_paper(results(*runs))).table
-    assert of[["filter", "runs", "differs in", "shown"]].values.tolist() == [
-        ["", 1, "", True],
-        ["", 2, "batch size", True],
-        ["pillow", 1, "filter, quantisation", False],
-    ]
 
 
 def test_a_row_names_its_experiment_where_a_table_has_two():
@@ -149,12 +141,11 @@ def test_a_row_names_its_experiment_where_a_table_has_two():
 
 
 def test_only_the_pool_nearest_to_the_paper_is_shown():
-    """Would catch pages of trials, runs that vanish without a word, and 7DGS-PBR split in two as heart1 is smaller."""
+    """Would catch pages of trials, and 7DGS-PBR split in two as heart1 is smaller."""
     trials = [at_paper(iterations=n, resolution="100x100", experiment=f"e{n}") for n in (500, 7000, 1000)]
-    page, of = shown(*trials), pools(of_the_paper(results(*trials))).table
+    page = shown(*trials)
     assert "# OTHER PROTOCOL, D-NeRF: experiment e7000, 100x100, 7,000 iterations" in page
     assert page.count("# OTHER PROTOCOL") == 1
-    assert dict(zip(of.iterations, of.shown, strict=True)) == {1000: False, 500: False, 7000: True}
     sizes = {"heart1": "250x250", "dust": "400x400", "cloud": "400x400"}
     runs = [at_paper(dataset="7DGS-PBR", scene=s, resolution=size, downscale=4) for s, size in sizes.items()]
     assert "7DGS-PBR: experiment dnerf, 250x250, 400x400, 30,000 iterations" in shown(*runs)

@@ -261,17 +261,6 @@ def test_targets_are_as_far_apart_as_gives_three(low, high, expected):
     assert round_numbers(low, high) == expected
 
 
-@pytest.mark.parametrize(
-    ("dataset", "size", "expected"), [("D-NeRF", "400x400", [30.72]), ("mini", "400x400", []), ("D-NeRF", "80x80", [])]
-)
-def test_the_papers_number_is_a_target_only_on_its_own_images(dataset, size, expected):
-    """Catches the paper's 30.72 dB of trex as a target of a stand-in of that name, and of images of another size."""
-    protocol = {"paper_dataset": "D-NeRF", "background": "black", "resolution": size}
-    (trex,) = runs_of("a", "", 31.0, 10.0, (0,), "trex")
-    rows = targets(chapter(but(trex, dataset=dataset, protocol=protocol)))
-    assert rows.dB[rows.target.str.contains("paper")].tolist() == expected
-
-
 # ---- other sections
 
 

@@ -97,7 +97,7 @@ def in_light_theme(chart: dict[str, Any]) -> str:
 
 
 def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerChart:
-    """Draw PSNR against a cost: means with intervals, a line through those on the frontier, single runs, the paper."""
+    """Draw PSNR against a cost: means with intervals, a line through those on the frontier, single runs."""
     halves = table.get("psnr_db ±", pd.Series(0.0, table.index)).fillna(0.0)
     table = table.assign(best=table[f"best {x}"], low=table.psnr_db - halves, high=table.psnr_db + halves)
     table = table.dropna(subset=[x, "psnr_db"])
@@ -110,7 +110,6 @@ def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerCh
     line = means.transform_filter("datum.best").mark_line(opacity=0.7, aria=False).encode(**at, color=colour)
     bars = means.mark_rule(aria=False).encode(at["x"], alt.Y("low:Q"), alt.Y2("high:Q"), colour)
     runs = base.transform_filter("datum.kind == 'run'").mark_point(size=10, filled=True, opacity=0.45, aria=False)
-    papers = base.transform_filter("datum.kind == 'paper'").mark_text(text="×", fontSize=16, dy=1, aria=False)
     hue = alt.Fill("series:N", title=None, scale=_hues(table, look))
     stroke = alt.Stroke("series:N", title=None, scale=_hues(table, look))
     fill = alt.when("datum.best").then(hue).otherwise(alt.value(PAPER))
@@ -119,7 +118,6 @@ def frontier(table: pd.DataFrame, look: Look, x: str, title: str) -> alt.LayerCh
         line,
         bars,
         runs.encode(**at, color=colour, shape=shape, tooltip=tip),
-        papers.encode(**at, color=colour, tooltip=tip),
         dots.encode(**at, fill=fill, stroke=stroke, shape=shape, tooltip=tip),
     ).properties(height=HEIGHT)
 

@@ -4,9 +4,8 @@ import math
 
 import pandas as pd
 
-from gsbench.report import paper, stats
+from gsbench.report import stats
 from gsbench.report.frame import Results, covered
-from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Asked, Column, Figure, Section, section
 
 COSTS = {"train_s": "training s", "frame_ms": "ms a frame", "model_mb": "MB"}
@@ -103,7 +102,7 @@ def frontier(chapter: Results, tests: pd.DataFrame) -> Section | None:
     table = pd.concat(by_scenes, ignore_index=True)
     if table.empty:
         return None
-    drawn = pd.concat([table.assign(kind="mean"), *_single_runs(chapter), *_of_paper(chapter)], ignore_index=True)
+    drawn = pd.concat([table.assign(kind="mean"), *_single_runs(chapter)], ignore_index=True)
     bests = [f"best {cost}" for cost in COSTS]
     drawn[bests] = drawn[bests] == True  # noqa: E712  # False where a row is no mean
     figures = tuple(
@@ -114,9 +113,9 @@ def frontier(chapter: Results, tests: pd.DataFrame) -> Section | None:
     order = ["scene", "model", "variant", "seeds", "psnr_db", "psnr_db ±", "psnr_val_db", *COSTS, "dominated"]
     text = (
         "A point is the mean over seeds; its interval is over seeds, on these scenes and views. The line of a model "
-        "joins its filled points, which no cheaper configuration of the model reaches. Small points are single runs, "
-        "× is the paper's number (other hardware, best on test). Dominated: another mean has at least the PSNR in at "
-        "most the seconds, which may be chance; “Is it a difference?” tests pairs."
+        "joins its filled points, which no cheaper configuration of the model reaches. Small points are single runs. "
+        "Dominated: another mean has at least the PSNR in at most the seconds, which may be chance; “Is it a "
+        "difference?” tests pairs."
     )
     return Section("frontier", "What accuracy costs", text, table[order], figures=figures)
 
@@ -138,18 +137,3 @@ def _single_runs(chapter: Results) -> list[pd.DataFrame]:
     is_drawn = len(runs) <= MOST_SINGLE * runs.scene.nunique() and (several["size"] > several["nunique"]).any()
     names = ["scene", "series", "model", "variant", "psnr_db", *COSTS]
     return [runs[names].assign(kind="run", seeds="seed " + runs.seed.astype(str))] if is_drawn else []
-
-
-def _of_paper(chapter: Results) -> list[pd.DataFrame]:
-    """Return the paper's numbers of models and scenes that were run on its images, with all effects of a Gaussian."""
-    runs = chapter.finished.runs
-    first = runs[~runs.groupby(["scene", "series"]).on_demand.transform("any")].drop_duplicates(["scene", "model"])
-    rows = []
-    for run in first.to_dict("records"):
-        numbers = paper.average(run["dataset"], [run["scene"]], run["model"])
-        if len(numbers) and has_images_of_paper(run["record"]):
-            cost = {"train_s": numbers.train_min * 60, "frame_ms": 1000 / numbers.fps}
-            rows.append(
-                {name: run[name] for name in ("scene", "series", "model")} | {"psnr_db": numbers.psnr_db} | cost
-            )
-    return [pd.DataFrame(rows).assign(kind="paper")] if rows else []

@@ -1,13 +1,10 @@
 """PSNR on the validation views while models train: mean curves, and the time to reach a quality."""
 
 import math
-from collections.abc import Iterator
 
 import pandas as pd
 
-from gsbench.report import paper
 from gsbench.report.frame import Results
-from gsbench.report.paper import has_images_of_paper
 from gsbench.report.section import Column, Figure, Section, section
 
 STEPS = (2.0, 1.0, 0.5, 0.2, 0.1)  # dB between two targets
@@ -45,22 +42,10 @@ def targets(chapter: Results) -> pd.DataFrame:
     rows = []
     for scene, ends_of_scene in ends.groupby("scene"):
         psnr = reached[reached.scene == scene]
-        for rule, target in _rules(runs[runs.scene == scene], ends_of_scene.psnr_val_db):
+        for target in round_numbers(ends_of_scene.psnr_val_db.min(), ends_of_scene.psnr_val_db.max()):
             needed = psnr.train_s.where(psnr.psnr_val_db >= target, math.inf).groupby(psnr.series).min()
-            rows.append({"scene": scene, "target": rule, "dB": target} | needed.to_dict())
+            rows.append({"scene": scene, "target": f"{target:g} dB", "dB": target} | needed.to_dict())
     return pd.DataFrame(rows, columns=["scene", "target", "dB", *sorted(ends.series.unique())])
-
-
-def _rules(runs: pd.DataFrame, ends: pd.Series) -> Iterator[tuple[str, float]]:
-    """Yield a scene's targets: round values between the lowest and the highest result, and the paper's 7dgs value.
-
-    The paper's value is a target only for runs on the paper's images.
-    """
-    for target in round_numbers(ends.min(), ends.max()):
-        yield f"{target:g} dB", target
-    numbers = paper.average(runs.dataset.iloc[0], [runs.scene.iloc[0]], "7dgs")
-    if len(numbers) and all(map(has_images_of_paper, runs.record)):
-        yield "paper's 7dgs", float(numbers.psnr_db)
 
 
 def round_numbers(low: float, high: float) -> list[float]:
@@ -85,9 +70,9 @@ def quality(chapter: Results, tests: pd.DataFrame) -> Section | None:
     models = [name for name in table if name not in ("scene", "target", "dB")]
     table = table.rename(columns={name: f"{name}, s" for name in models})
     text = (
-        "Targets are round values of PSNR on val between the lowest and the highest run of a scene; on the paper's "
-        "images, the paper's PSNR of 7DGS (best on test) is one too. Seconds are those after which the mean curve on "
-        "val of a model's runs, of any length, first has the target; the runs go on after that."
+        "Targets are round values of PSNR on val between the lowest and the highest run of a scene. Seconds are "
+        "those after which the mean curve on val of a model's runs, of any length, first has the target; the runs go "
+        "on after that."
     )
     columns = {f"{name}, s": Column(f"{name}, s", 1) for name in models} | {"dB": Column("dB", 2)}
     return Section("quality", "Time to quality", text, table, columns)
