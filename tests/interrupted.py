@@ -14,6 +14,12 @@ from gsbench.measure.record import Record
 from gsbench.train import checkpoint
 from gsbench.train.loop import Trainer
 
+# Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
+REPRODUCED = frozenset({"step", "model", "optimizer", "density", "hooks", "exact"})
+# Keys of measured times, and of what only saves time, at any depth of the state. They differ between two trainings with
+# one seed.
+TIMES = frozenset({"stages", "effort", "replay", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
+
 
 class Killed(BaseException):
     """The process ends here."""
@@ -65,16 +71,23 @@ def assert_resumes(start: Callable[[], Trainer], step: int) -> tuple[Trainer, Tr
     assert stopped.step == step
     resumed = start()
     resumed.load_state_dict(copy.deepcopy(stopped.state_dict()))
-    ends = [checkpoint.without_times(trainer.state_dict()) for trainer in (whole, train(resumed))]
+    ends = [without_times(trainer.state_dict()) for trainer in (whole, train(resumed))]
     assert_same_bits(*ends)
     return whole, stopped
+
+
+def without_times(state: Any) -> Any:
+    """Remove measured times from a training's state, so that two trainings with one seed can be compared bit by bit."""
+    if isinstance(state, dict):
+        return {key: without_times(value) for key, value in state.items() if key not in TIMES}
+    return [without_times(value) for value in state] if isinstance(state, (list, tuple)) else state
 
 
 def bits(folder: Path) -> dict[str, Any]:
     """The final state of a run without times and without what it chose on val, for `assert_same_bits`."""
     state = dict(checkpoint.read(folder / checkpoint.FILE_NAME).state)
     state["hooks"] = {name: hook for name, hook in state["hooks"].items() if name != "choices"}
-    comparable: dict[str, Any] = checkpoint.without_times(state)
+    comparable: dict[str, Any] = without_times(state)
     return comparable
 
 

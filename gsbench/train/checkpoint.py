@@ -19,11 +19,6 @@ MAGIC = b"gsbench checkpoint 5\n"  # then the SHA-256 of the rest in hex and a l
 FILE_NAME = CHECKPOINT
 DIGEST = 64  # hex digits
 MOST_STEPS = 10**9  # no training has more
-# Keys of a training's state whose values are bit-equal in all trainings with one seed, interrupted or not.
-REPRODUCED = frozenset({"step", "model", "optimizer", "density", "hooks", "exact"})
-# Keys of measured times, and of what only saves time, at any depth of the state. They differ between two trainings with
-# one seed.
-TIMES = frozenset({"stages", "effort", "replay", "curve", "seconds", "frame_ms_before", "frame_ms", "frame_ms_without"})
 
 
 @dataclass(frozen=True)
@@ -130,13 +125,6 @@ def check_plain(value: object, most: int) -> None:
             check_plain(inner, most)
     elif not (value is None or isinstance(value, str | int | float)):
         raise InputError(f"checkpoint: expected containers, numbers, text and tensors, got {type(value).__name__}")
-
-
-def without_times(state: Any) -> Any:
-    """Remove measured times from a training's state, so that two trainings with one seed can be compared bit by bit."""
-    if isinstance(state, dict):
-        return {key: without_times(value) for key, value in state.items() if key not in TIMES}
-    return [without_times(value) for value in state] if isinstance(state, (list, tuple)) else state
 
 
 def tensor(state: object, name: str, shape: Sequence[int], dtype: torch.dtype) -> Tensor:

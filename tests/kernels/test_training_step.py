@@ -13,7 +13,6 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 
 from gsbench.kernels import recording
 from gsbench.kernels.library import CudaLibrary
-from gsbench.train.checkpoint import without_times
 from gsbench.train.divergence import LOOK_EVERY, DivergedError
 
 _aten = torch.ops.aten
@@ -77,7 +76,7 @@ def start(cuda_device: str, monkeypatch: pytest.MonkeyPatch) -> Start:
 
 def assert_equal_ends(trainings: list[Training]) -> None:
     """Compare by bits, or on a GPU, where the order of sums varies, by the loss."""
-    from interrupted import assert_same_bits
+    from interrupted import assert_same_bits, without_times
 
     states = [without_times(fitted.state_dict()) for fitted in trainings]
     if trainings[0].config.device == "cpu":

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_resumes, assert_same_bits
+from interrupted import assert_resumes, assert_same_bits, without_times
 from small import fresh, raw, same, seeded
 from tiny_training import train, trainer
 from torch import Tensor
@@ -12,7 +12,6 @@ from torch import Tensor
 from gsbench.models import GaussianModel
 from gsbench.models.render import render
 from gsbench.models.scgs import Nodes
-from gsbench.train.checkpoint import without_times
 
 SHORT = "train.iterations=40"
 FIELDS = pytest.mark.parametrize("name", ["deformable", "hexplane", "scgs"])

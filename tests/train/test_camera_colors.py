@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from interrupted import assert_resumes, assert_same_bits
+from interrupted import assert_resumes, assert_same_bits, without_times
 from tiny_training import moving_square, train, trainer
 
 from gsbench.scenes import Scene
-from gsbench.train.checkpoint import without_times
 from gsbench.train.hooks.camera_colors import CameraColors, in_colors_of
 from gsbench.train.loop import Trainer
 

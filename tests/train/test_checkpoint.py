@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from forked import Forked
-from interrupted import assert_resumes, assert_same_bits
+from interrupted import REPRODUCED, TIMES, assert_resumes, assert_same_bits, without_times
 from test_early_stop import with_val
 from tiny_run import gsbench, overrides, run_here
 from tiny_training import trainer
@@ -39,7 +39,7 @@ def final_state(results: Path) -> dict[str, object]:
 
 
 def comparable_state(results: Path) -> object:
-    return checkpoint.without_times(final_state(results))
+    return without_times(final_state(results))
 
 
 def test_a_killed_run_ends_with_the_bits_of_an_unbroken_one(square, tmp_path):
@@ -102,9 +102,9 @@ def test_every_key_of_a_state_is_reproduced_or_a_time(square, tmp_path):
     for name in ("one", "two"):
         run_here(*overrides(square, tmp_path / name, *words))
     state = final_state(tmp_path / "one")
-    assert state.keys() <= checkpoint.REPRODUCED | checkpoint.TIMES
-    assert not checkpoint.REPRODUCED & checkpoint.TIMES
-    assert keys(state) >= checkpoint.REPRODUCED | checkpoint.TIMES, "a name that no state has any more"
+    assert state.keys() <= REPRODUCED | TIMES
+    assert not REPRODUCED & TIMES
+    assert keys(state) >= REPRODUCED | TIMES, "a name that no state has any more"
     assert_same_bits(comparable_state(tmp_path / "one"), comparable_state(tmp_path / "two"))
 
 

@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 import torch
-from interrupted import assert_same_bits
+from interrupted import assert_same_bits, without_times
 from tiny_training import near_and_far, train, trainer
 
-from gsbench.train.checkpoint import without_times
 from gsbench.train.divergence import DivergedError
 from gsbench.train.loop import Trainer
 from gsbench.train.step import Step
