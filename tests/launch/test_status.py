@@ -120,10 +120,7 @@ def only(experiment: Path, queue: Queue | None = None) -> RunStatus:
         ),
         (None, {"record_of": {"metrics": {"psnr": 60.0}}}, "failed", "record.json: metrics.psnr: expected 28"),
         (None, {"record_of": {"seed": "0"}}, "failed", "record.json: seed: expected int, got str"),
-        *(
-            (None, {"record_of": text}, "failed", "seed0/record.json")
-            for text in ("", "{", "[]", '{"status": "ok"}', '{"status": 1, "reason": 2, "metrics": 3}', "\0")
-        ),
+        *((None, {"record_of": text}, "failed", "seed0/record.json") for text in ("{", '{"status": "ok"}')),
         # the note of its end alone
         (None, {"plan_of": {}, "ended": Ended(None, "seed: expected >= 0, got -1")}, "failed", "seed: expected >= 0"),
         (
@@ -284,25 +281,20 @@ def test_no_file_moves_the_terminal(tmp_path, capsys):
     assert r"x=\x1b[2J" in shown
 
 
-def test_a_damaged_plan_is_named(tmp_path):
-    """Catches a plan of another version that stops the status of all runs, or that is left out in silence."""
-    traced(tmp_path, plan_of={}, record_of={})
+def test_damaged_files_hide_no_run(tmp_path):
+    """Catches a plan of another version, or a progress file read first, that stops the status of all runs, and a plan
+    that is left out in silence."""
+    folder = traced(tmp_path, plan_of={}, record_of={})
     (path,) = tmp_path.rglob(plan.FILE_NAME)
     path.write_text('{"launcher": "basic"}')
+    damaged = folder.parent / "another"
+    damaged.mkdir()
+    (damaged / progress.FILE_NAME).write_text("{")
+    assert damaged.name < folder.name
     experiment = status.read(tmp_path)
     (run,) = status.status(experiment)
     assert run.state == "done"
     assert f"a plan is left out: {tmp_path}" in lines(experiment, [run])[1]
-
-
-def test_a_damaged_progress_file_hides_no_other_run(tmp_path):
-    """Catches runs that are left out, because a file that is read before theirs is damaged."""
-    folder = traced(tmp_path, progress_of=HERE)
-    damaged = folder.parent / "another"  # its name comes first
-    damaged.mkdir()
-    (damaged / progress.FILE_NAME).write_text("{")
-    assert damaged.name < folder.name
-    assert only(tmp_path).state == "running"
 
 
 def test_only_what_differs_names_a_run():
@@ -386,22 +378,6 @@ def test_a_job_of_no_run_is_refused(number, tmp_path, capsys):
     plan.write(Plan("slurm", [["+exp=mini", "scene=dust"]], None), tmp_path)
     assert main(["job", str(tmp_path), number]) == 2
     assert f"{tmp_path}, 0 to 0, got {number}" in capsys.readouterr().err
-
-
-def test_the_help_says_what_each_command_does(capsys, monkeypatch):
-    """Catches commands without a word, an example for what the program does, and no command that is a stack trace."""
-    monkeypatch.setenv("COLUMNS", "200")
-    for words, status_of_exit in (["--help"], 0), ([], 2):
-        with pytest.raises(SystemExit, match=str(status_of_exit)):
-            main(words)
-    out = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert {
-        "Show the state of an experiment's runs and the time that they still need, or launch again what did not "
-        "finish.",
-        "status show the state of each run: done, running, stopped, failed, ...",
-        "retry launch again the runs that were stopped, failed, are lost or not started",
-        "job do one run of a plan; a job of Slurm calls it",
-    } <= set(out)
 
 
 def test_a_large_sweep_is_read_in_no_time_without_torch_or_hydra(tmp_path):
