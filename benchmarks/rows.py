@@ -1,9 +1,10 @@
 """List the rows of each section: a name, a call, the target if there is one, and the limit of the machine."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from benchmarks.scene import camera, gaussians, model
 from benchmarks.stages import loss_flops, refine_flops, stages
@@ -29,28 +30,39 @@ def raster() -> Iterator[Row]:
         yield from raster_rows(N, size, threads=2)
 
 
+def both_ways(
+    section: str,
+    name: str,  # with {} for forward or backward
+    forward: Callable[[], Any],
+    inputs: Sequence[Tensor],
+    limit: str,
+    amounts: tuple[float, float],  # of the limit, forward and backward
+    targets: tuple[float | None, float | None] = (None, None),  # ms
+    threads: int = 1,
+) -> Iterator[Row]:
+    """Yield the rows of a call, and of the gradients of its outputs by `inputs`, on a graph that is kept."""
+    outputs = forward()
+    upstream = [torch.ones_like(x) for x in outputs]
+    calls = {
+        "forward": forward,
+        "backward": lambda: torch.autograd.grad(outputs, inputs, upstream, retain_graph=True, allow_unused=True),
+    }
+    for (way, call), target, amount in zip(calls.items(), targets, amounts, strict=True):
+        yield Row(section, name.format(way), call, target, (limit, amount), threads)
+
+
 def raster_rows(N: int, size: int, threads: int = 1) -> Iterator[Row]:
     """Both directions at one size; the limit counts alphas of at least 1/255, the fewest any blender evaluates."""
     inputs = [x.requires_grad_() for x in gaussians(N)]
     viewmats, Ks = camera(size)
 
-    def forward() -> torch.Tensor:
-        return rasterize(*inputs, viewmats, Ks, size, size, backend="cpu").image
+    def forward() -> list[Tensor]:
+        return [rasterize(*inputs, viewmats, Ks, size, size, backend="cpu").image]
 
-    image = forward()
-    upstream = torch.ones_like(image)
     alphas = useful_alphas(N, size)
     targets = RASTER_TARGETS.get((N, size), (None, None)) if threads == 1 else (None, None)
     name = f"{N // 1000}k / {size}x{size}" + (f", {threads} threads" if threads > 1 else "")
-    yield Row("raster", f"{name} forward", forward, targets[0], ("alphas", alphas), threads)
-    yield Row(
-        "raster",
-        f"{name} backward",
-        lambda: torch.autograd.grad(image, inputs, upstream, retain_graph=True),
-        targets[1],
-        ("alphas", 2 * alphas),
-        threads,
-    )
+    yield from both_ways("raster", f"{name} {{}}", forward, inputs, "alphas", (alphas, 2 * alphas), targets, threads)
 
 
 @torch.no_grad()
@@ -72,22 +84,16 @@ def observing() -> Iterator[Row]:
             time = 0.4 if "time" in observed.observes else None
             parameters = [p for p in observed.parameters() if p.requires_grad]
             query = CameraTime.at(center, time)
-            out = tensors_of(observed.slice(query))
-            upstream = [torch.ones_like(x) for x in out]
             targets = (15.0, 25.0) if name == "7dgs" and backend == "cpu" else (None, None)
-            title = f"{name} 100k slice and colours, {backend}"
             values = sum(p.numel() for p in observed.splats.values())
-            yield Row(
-                "observe", f"{title} forward", lambda o=observed, q=query: o.slice(q), targets[0], ("bytes", 4 * values)
-            )
-            yield Row(
+            yield from both_ways(
                 "observe",
-                f"{title} backward",
-                lambda o=out, p=parameters, u=upstream: torch.autograd.grad(
-                    o, p, u, retain_graph=True, allow_unused=True
-                ),
-                targets[1],
-                ("bytes", 12 * values),
+                f"{name} 100k slice and colours, {backend} {{}}",
+                lambda o=observed, q=query: tensors_of(o.slice(q)),
+                parameters,
+                "bytes",
+                (4 * values, 12 * values),
+                targets,
             )
     yield from refining()
 
@@ -96,26 +102,17 @@ def refining() -> Iterator[Row]:
     """AGR's four perceptrons on 100k 7D Gaussians."""
     refinement = model("7dgs", 100_000, agr=True).refinement
     assert refinement is not None
-    widths = [3, 1, 3, 7, 21]
-    values = [torch.randn(100_000, width).requires_grad_() for width in widths]
-    for native in (True, False):
-        out = refinement(values, torch.tensor(0.3), by_kernel=native)
-        upstream = [torch.ones_like(x) for x in out]
-        inputs = [*values, *refinement.parameters()]
-        backend = "cpu" if native else "reference"
-        yield Row(
+    values = [torch.randn(100_000, width).requires_grad_() for width in (3, 1, 3, 7, 21)]
+    flops = refine_flops(100_000)
+    for backend, targets in (("cpu", (20.0, 60.0)), ("reference", (None, None))):
+        yield from both_ways(
             "agr",
-            f"AGR 100k forward, {backend}",
-            lambda n=native: refinement(values, torch.tensor(0.3), by_kernel=n),
-            20.0 if native else None,
-            ("flops", refine_flops(100_000)),
-        )
-        yield Row(
-            "agr",
-            f"AGR 100k backward, {backend}",
-            lambda o=out, u=upstream, i=inputs: torch.autograd.grad(o, i, u, retain_graph=True),
-            60.0 if native else None,
-            ("flops", 3 * refine_flops(100_000)),
+            f"AGR 100k {{}}, {backend}",
+            lambda native=backend == "cpu": refinement(values, torch.tensor(0.3), by_kernel=native),
+            [*values, *refinement.parameters()],
+            "flops",
+            (flops, 3 * flops),
+            targets,
         )
 
 
