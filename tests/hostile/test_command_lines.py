@@ -75,17 +75,6 @@ def test_a_reader_who_has_gone_costs_no_record(square, tmp_path, monkeypatch, ca
     capsys.readouterr()
 
 
-def test_a_training_that_diverges_without_harmonics_has_a_record(square, tmp_path, capsys):
-    """Catches the largest of no coefficients, which took the record with it."""
-    words = overrides(square, tmp_path, "model=3dgs", "model.sh_degree=0", "model.lr.means.start=1e38")
-    assert main_here(*words) == 1
-    (path,) = record.find(tmp_path)
-    written = record.read(path)
-    assert written.status == "diverged"
-    assert "the first is Gaussian " in str(written.reason) or "no Gaussian's gradient" in str(written.reason)
-    capsys.readouterr()
-
-
 def test_an_error_that_nobody_foresaw_is_a_record(square, tmp_path, monkeypatch, capsys):
     """Catches a fault of gsbench's own, as in a new model, that ends the sweep and leaves neither a row nor a stack."""
 

@@ -136,6 +136,8 @@ def test_what_differs_is_named_and_nothing_else_is_done(words, change, reason, r
     assert (record.metrics == run.first.metrics) == (record.protocol["quantise"] is False)
     assert record.protocol["quantise"] is ("protocol.quantise=true" in words)
     assert not reason.startswith(KEPT) or record == run.first
+    if words == ("protocol.quantise=true",) and change is not Finished.lose_checkpoint:  # what was trained stays
+        assert (record.cost.train_s, record.curve) == (run.first.cost.train_s, run.first.curve)
 
 
 @pytest.mark.usefixtures("trains")
