@@ -6,7 +6,7 @@ The module does not import torch.
 import errno
 import os
 import re
-import sys
+import resource
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -69,10 +69,6 @@ def _system() -> int | None:
 
 
 def _address_space_limit() -> int | None:
-    if sys.platform == "win32":  # it has no such limit
-        return None
-    import resource
-
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     return None if limit == resource.RLIM_INFINITY else limit
 

@@ -5,7 +5,6 @@ gsbench calls these functions before torch or the kernels are loaded.
 
 import ctypes
 import os
-import sys
 import threading
 from pathlib import Path
 
@@ -34,8 +33,6 @@ def keep_freed_memory() -> None:
     time of a training step of 4DGS with 150,000 Gaussians. All threads share one heap (arena), because glibc's heaps of
     further threads return large blocks to the system. Without glibc this function does nothing.
     """
-    if sys.platform != "linux":
-        return
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallopt"):  # as musl's
         return
@@ -72,8 +69,6 @@ def sleep_when_idle() -> None:
     if "OMP_WAIT_POLICY" in os.environ or "GOMP_SPINCOUNT" in os.environ:
         return
     os.environ["OMP_WAIT_POLICY"] = "passive"
-    if sys.platform != "linux":
-        return
     try:
         runtime = ctypes.CDLL(RUNTIME, mode=os.RTLD_NOLOAD)
     except OSError:  # it is not loaded yet, and will read the variable

@@ -4,9 +4,7 @@ import contextlib
 import errno
 import multiprocessing
 import os
-import shutil
 import subprocess
-from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -27,29 +25,6 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.fixture
-def mounts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[list[Path]]:
-    """Where processes see the folder `disk`: there, or on two mounts that cache as NFS does."""
-    disk, mounted = tmp_path / "disk", list[Path]()
-    disk.mkdir()
-    if request.param != "two mounts":
-        yield [disk]
-        return
-    if shutil.which("bindfs") is None or not os.access("/dev/fuse", os.W_OK):
-        pytest.skip("needs bindfs and FUSE")
-    try:
-        for mount in (tmp_path / "one", tmp_path / "other"):
-            mount.mkdir()
-            cached = "attr_timeout=5,entry_timeout=5"
-            if subprocess.run(["bindfs", "-o", cached, disk, mount], check=False).returncode:
-                pytest.skip("FUSE cannot be mounted here")
-            mounted.append(mount)
-        yield mounted
-    finally:
-        for mount in mounted:
-            subprocess.run(["fusermount", "-u", "-z", mount], check=True)
-
-
 def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
     """Claim a run in many rounds at the same moment as others do, and note who had it."""
     for number in range(ROUNDS):
@@ -61,11 +36,9 @@ def compete(folder: Path, start: Barrier, ended: Barrier) -> None:
 
 
 @pytest.mark.parametrize("left", ["nothing", "a dead claim", "half a claim"])
-@pytest.mark.parametrize("mounts", ["one folder", "two mounts"], indirect=True)
-def test_of_many_processes_one_has_the_run(left, mounts, tmp_path):
-    """Catches a claim that is looked for and then made, so that several make it, one that nobody takes over, and a run
-    that two hosts do, as their mounts show each other's files late."""
-    folders = [tmp_path / "disk" / str(number) for number in range(ROUNDS)]
+def test_of_many_processes_one_has_the_run(left, tmp_path):
+    """Catches a claim that is looked for and then made, so that several make it, and one that nobody takes over."""
+    folders = [tmp_path / str(number) for number in range(ROUNDS)]
     for folder in folders:
         folder.mkdir()
         if left == "a dead claim":
@@ -74,7 +47,7 @@ def test_of_many_processes_one_has_the_run(left, mounts, tmp_path):
             (folder / FILE_NAME).write_text('{"overrides": [')
     fork = multiprocessing.get_context("fork")
     start, ended = fork.Barrier(CROWD), fork.Barrier(CROWD)
-    crowd = [fork.Process(target=compete, args=(mounts[i % len(mounts)], start, ended)) for i in range(CROWD)]
+    crowd = [fork.Process(target=compete, args=(tmp_path, start, ended)) for _ in range(CROWD)]
     for process in crowd:
         process.start()
     for process in crowd:
