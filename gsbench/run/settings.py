@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gsbench.config import Config, LearningRate, ModelConfig
 from gsbench.config_roles import facts, flat
 from gsbench.errors import InputError, did_you_mean
-from gsbench.train.hooks import hook_types
+from gsbench.train.hooks import check_step, hook_types
 
 AUTO = "auto"
 CANDIDATES = ("moving", "static")  # with and without time, of which model=auto trains one
@@ -74,7 +74,7 @@ def check_values(config: Config) -> None:
     for dotted, value in flat(dataclasses.asdict(config)):
         facts(dotted).check(dotted, value)
     check_device_name(config.device)
-    _check_steps(config)
+    check_step("train.cooldown_from", config.train.cooldown_from, config)
     for hook in hook_types(elsewhere=()):  # others import torch
         hook.check(config)
     _check_coarse(config.train.coarse or [])
@@ -98,16 +98,6 @@ def _check_keys(value: Any, place: str = "") -> None:
         if fields is not None and name not in fields:
             raise InputError(f"config key '{dotted}' is not known. {did_you_mean(name, fields)}")
         _check_keys(member, dotted)
-
-
-def _check_steps(config: Config) -> None:
-    """Raise InputError if learning rates are to fall after the last step."""
-    step, length = config.train.cooldown_from, config.train.recipe_iterations
-    if step is not None and step >= length:
-        raise InputError(
-            f"train.cooldown_from: expected a step below train.recipe_iterations={length}, the length for "
-            f"which steps are given, got {step}"
-        )
 
 
 def _check_rate(key: str, rate: LearningRate) -> None:

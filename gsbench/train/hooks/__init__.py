@@ -174,6 +174,15 @@ class Hook:
         return {}
 
 
+def check_step(key: str, step: int | None, config: Config) -> None:
+    """Raise InputError if a step of the recipe is not before its end; None: the key is not set."""
+    if step is not None and step >= config.train.recipe_iterations:
+        raise InputError(
+            f"{key}: expected a step below train.recipe_iterations={config.train.recipe_iterations}, the length for "
+            f"which steps are given, got {step}"
+        )
+
+
 def check_excludes(key: str, config: Config, excluded: dict[str, str]) -> None:
     """Raise InputError if another key is set too; `excluded` maps the keys that `key` excludes to reasons."""
     for other, reason in excluded.items():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from gsbench.config_key import joins, key
 from gsbench.errors import InputError
 from gsbench.measure.exact_views import rank
-from gsbench.train.hooks import Hook, Training
+from gsbench.train.hooks import Hook, Training, check_step
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,12 +51,7 @@ class Average(Hook):
 
     @classmethod
     def check(cls, config: Config) -> None:
-        step, length = cast(AverageKey, config.train).average_from, config.train.recipe_iterations
-        if step is not None and step >= length:
-            raise InputError(
-                f"train.average_from: expected a step below train.recipe_iterations={length}, the length "
-                f"for which steps are given, got {step}"
-            )
+        check_step("train.average_from", cast(AverageKey, config.train).average_from, config)
 
     def acts(self, step: int) -> bool:
         return self.start is not None and step >= self.start and (step - self.start) % EVERY == 0
