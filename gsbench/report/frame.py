@@ -92,9 +92,10 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
         names = f"{record_files.FILE_NAME} or {study.RUNS_FILE}"
         raise InputError(f"{root}: expected results, found no {names} in it or below")
     records = []
+    views = plausible.views_of_data(record for _, record in read)
     for path, record in read:
         try:
-            plausible.check(record, f"{path}: {record.path}")
+            plausible.check(record, f"{path}: {record.path}", views)
             records.append((path, record))
         except InputError as error:
             faults.append(printable(error))

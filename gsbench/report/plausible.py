@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +29,7 @@ RANGES = (  # of a number by its name; the first pattern that fits counts
     ("z", -math.inf, math.inf),
     (".*", 0.0, 1e15),  # seconds, counts, bytes, shares
 )
+Views = Mapping[str, frozenset[str]]  # names of views by data and settings
 OF_PIXELS = ("psnr_moving", "psnr_object")  # views without such pixels have none
 ROUNDING = 1e-6  # by which a mean may differ from that of its views, and a sum from its parts, relative to it
 
@@ -39,10 +41,42 @@ def read(path: Path) -> Record:
     return record
 
 
-def check(record: Record, where: str) -> None:
-    """Raise InputError if something of a record cannot be; the message begins with `where`."""
-    if why := _implausible(record):
+def views_of_data(records: Iterable[Record]) -> Views:
+    """Return which views finished runs evaluate, by their data and settings: those that most runs have, or the most."""
+    counts: dict[str, Counter[frozenset[str]]] = defaultdict(Counter)
+    for record in records:
+        if record.status == "ok":
+            counts[_data(record)][_names(record)] += 1
+    return {data: max(sets, key=lambda names: (sets[names], len(names))) for data, sets in counts.items()}
+
+
+def check(record: Record, where: str, views: Views | None = None) -> None:
+    """Raise InputError if something of a record cannot be.
+
+    Args:
+        record: the record.
+        where: the beginning of the message.
+        views: those of `views_of_data`.
+    """
+    why = _implausible(record)
+    if not why and views and record.status == "ok":
+        expected, names = views[_data(record)], _names(record)
+        if names != expected:
+            lacking, extra = sorted(expected - names), sorted(names - expected)
+            what = lacking[0] if lacking else f"no {extra[0]}"
+            why = f"per_view: expected {what}, as in other runs on these data"
+    if why:
         raise InputError(f"{where}: {why}: was it edited? delete it, and run again")
+
+
+def _data(record: Record) -> str:
+    """Return what decides which views are evaluated: the data, the split, and the settings of the scene."""
+    scene = (record.provenance.config or {}).get("scene")
+    return repr((record.dataset, record.scene, record.provenance.data_hash, record.protocol.get("eval_split"), scene))
+
+
+def _names(record: Record) -> frozenset[str]:
+    return frozenset(view.name for view in record.per_view)
 
 
 def _implausible(record: Record) -> str:

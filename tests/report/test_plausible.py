@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from records import but, elsewhere, make, on_demand, run, write_all
+from records import but, elsewhere, lost, make, on_demand, run, write_all
 
 from gsbench.measure.curve import Point
 from gsbench.measure.record import LengthChoice, Region, Stop
@@ -67,14 +67,30 @@ GATED = on_demand([make(seed=9)])[0]
 )
 def test_what_cannot_be_is_left_out_in_a_line(edited, reason, tmp_path):
     """Catches a record that was changed by hand and ranks among others, also where it is a row of a study."""
-    write_all([make(), edited], tmp_path / "results")
-    study.write([make(), edited], tmp_path / "study")
+    write_all([run(), edited], tmp_path / "results")
+    study.write([run(), edited], tmp_path / "study")
     for folder, file in (("results", edited.path / "record.json"), ("study", "runs.csv")):
         results = load(tmp_path / folder)
         assert results.runs.seed.tolist() == [0]
         (fault,) = results.faults
         assert fault.startswith(f"{tmp_path / folder / file}: {edited.path}: ")
         assert reason in fault
+
+
+def test_views_that_other_runs_have_must_not_be_missing(tmp_path):
+    """Catches a hard view that was deleted by hand, with a mean that is that of the others."""
+    without = but(replace(RUN, per_view=[SECOND], seed=1), metrics={"psnr": SECOND.psnr})
+    results = load(write_all([RUN, without], tmp_path / "same"))
+    assert results.runs.seed.tolist() == [9]
+    (fault,) = results.faults
+    assert "per_view: expected test/r_000, as in other runs on these data: was it edited?" in fault
+    with_one_more = replace(RUN, per_view=[FIRST, SECOND, replace(FIRST, name="test/r_9")], seed=1)
+    with_one_more = but(with_one_more, metrics={"psnr": (2 * FIRST.psnr + SECOND.psnr) / 3})
+    (fault,) = load(write_all([RUN, replace(RUN, seed=2), with_one_more], tmp_path / "more")).faults
+    assert "per_view: expected no test/r_9, as in other runs on these data" in fault
+    other_split = but(without, protocol={"eval_split": "val"})
+    assert load(write_all([RUN, other_split], tmp_path / "split")).faults == ()
+    assert load(write_all([RUN, lost(make(seed=2))], tmp_path / "failed")).faults == ()
 
 
 def test_what_can_be_is_kept(tmp_path):
@@ -86,4 +102,4 @@ def test_what_can_be_is_kept(tmp_path):
         per_view=[replace(FIRST, psnr_moving=20.0), SECOND],
         seed=1,
     )
-    assert load(write_all([gained, moving], tmp_path)).faults == ()
+    assert all(load(write_all([r], tmp_path / str(r.seed))).faults == () for r in (gained, moving))
