@@ -126,8 +126,8 @@ def table1(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the measured rows of Table 1 by scene and on average, with the paper's numbers and the differences.
 
     Args:
-        runs: the runs of `of_the_paper`. Those at the paper's protocol come first; then those nearest to it; then those
-            nearest to it on data that stand in for the paper's.
+        runs: the runs of `of_the_paper`. Those at the paper's protocol come first; then other ones on
+            the paper's data; then those on data that stand in for it.
     """
     numbers = [name + end for name in TABLE_1 for end in ("", " ±", " paper", " difference")]
     names = ["table", "dataset", "experiment", "scene", "scenes", "model", "recipe", "seeds", *numbers]
@@ -138,14 +138,14 @@ def table1(runs: pd.DataFrame) -> pd.DataFrame:
 def _tables(runs: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
     """Yield the kind, the data set and the runs of each table.
 
-    "paper" has the runs at the paper's protocol. "other protocol" has the runs nearest to it on the paper's data, and
-    "other data" those on data that stand in for the paper's.
+    "paper" has the runs at the paper's protocol. "other protocol" has runs of the most scenes of the paper's data; if
+    several pools have as many, those nearest to its protocol. "other data" has the nearest on data that stand in.
     """
     for dataset in paper.PROTOCOLS:
         yield "paper", dataset, _at_paper(runs, dataset)
     nearest: dict[tuple[str, str], pd.DataFrame] = {}
     pools = [pool for _, pool in runs[runs.departs != ""].groupby("pool")]
-    for pool in sorted(pools, key=lambda pool: -_effort(pool)):  # equal ones stay in order of their names
+    for pool in sorted(pools, key=_effort, reverse=True):  # equal ones stay in order of their names
         if (pool.status == "ok").any():
             nearest.setdefault(pool.pool.iloc[0][:2], pool)  # by (data of the paper, data)
     for kind in ("other protocol", "other data"):
@@ -159,10 +159,13 @@ def _at_paper(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
     return runs[(runs.departs == "") & (runs.dataset == dataset)]
 
 
-def _effort(runs: pd.DataFrame) -> int:
-    """Return the pixels of the largest image times the iterations: the more, the nearer to the paper's protocol."""
+def _effort(runs: pd.DataFrame) -> tuple[int, int]:
+    """Return the number of scenes of the paper's data; and the pixels of the largest image times the iterations."""
     sizes = [size.split("x") for size in runs["size"] if re.fullmatch(r"[0-9]{1,6}x[0-9]{1,6}", size)]
-    return int(runs.pool.iloc[0][-1]) * max((int(width) * int(height) for width, height in sizes), default=0)
+    pixels = max((int(width) * int(height) for width, height in sizes), default=0)
+    of_paper, dataset, *_, iterations = runs.pool.iloc[0]
+    scenes = runs[runs.status == "ok"].scene.nunique() if dataset == of_paper else 0
+    return scenes, iterations * pixels
 
 
 def _rows(kind: str, dataset: str, runs: pd.DataFrame) -> pd.DataFrame:

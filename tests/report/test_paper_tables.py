@@ -140,12 +140,16 @@ def test_a_row_names_its_experiment_where_a_table_has_two():
     assert "| 7dgs mine |" in shown(*two)
 
 
-def test_only_the_pool_nearest_to_the_paper_is_shown():
-    """Would catch pages of trials, and 7DGS-PBR split in two as heart1 is smaller."""
+def test_only_the_pool_of_most_scenes_nearest_to_the_paper_is_shown():
+    """Would catch pages of trials, one long trial in place of all scenes, and 7DGS-PBR split in two by heart1."""
     trials = [at_paper(iterations=n, resolution="100x100", experiment=f"e{n}") for n in (500, 7000, 1000)]
     page = shown(*trials)
     assert "# OTHER PROTOCOL, D-NeRF: experiment e7000, 100x100, 7,000 iterations" in page
     assert page.count("# OTHER PROTOCOL") == 1
+    two_scenes = [
+        at_paper(scene=scene, iterations=1000, resolution="100x100", experiment="two") for scene in ("hook", "trex")
+    ]
+    assert "experiment two, 100x100, 1,000 iterations" in shown(*trials, *two_scenes)
     sizes = {"heart1": "250x250", "dust": "400x400", "cloud": "400x400"}
     runs = [at_paper(dataset="7DGS-PBR", scene=s, resolution=size, downscale=4) for s, size in sizes.items()]
     assert "7DGS-PBR: experiment dnerf, 250x250, 400x400, 30,000 iterations" in shown(*runs)
