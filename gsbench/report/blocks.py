@@ -50,7 +50,7 @@ CHOICES = {
 }
 POINTS = "initial_points=100000"  # trained with as many as in the paper, before D-NeRF had 10,000
 LAMBDA_T = f"lambda_t=0.05,{POINTS}"  # trained before lambda_t started at 0.5 on D-NeRF
-# Rows of trex at the paper's resolution, batch size and, but for recipe=quick, iterations: title, model and variant.
+# Rows of trex at the paper's resolution, batch size and iterations: title, model and variant.
 TREX = {
     "7dgs, λ_t from 0.05, H200": ("7dgs", f"device=cuda,{LAMBDA_T},best_on_test=true"),
     "7dgs, λ_t from 0.05, CPU": ("7dgs", f"{LAMBDA_T},best_on_test=true"),
@@ -59,9 +59,6 @@ TREX = {
     "4dgs, CPU": ("4dgs", f"{POINTS},best_on_test=true"),
     "7dgs_noagr, `+recipe=paper`, CPU": ("7dgs_noagr", "recipe=paper,best_on_test=true"),
     "7dgs_noagr, `+recipe=authors`, CPU": ("7dgs_noagr", "recipe=authors,best_on_test=true"),
-    "7dgs, λ_t from 0.05, `+recipe=quick`, CPU": ("7dgs", f"recipe=quick,{LAMBDA_T}"),
-    "4dgs, `+recipe=quick`, CPU": ("4dgs", f"recipe=quick,{POINTS}"),
-    "7dgs_noagr, λ_t from 0.05, `+recipe=quick`, CPU": ("7dgs_noagr", f"recipe=quick,{LAMBDA_T}"),
 }
 OF_TABLE_1 = list(paper_tables.NAMES)  # its models, in its order
 NEAR = 0.1  # dB below the best model
@@ -279,18 +276,13 @@ def lengths(published: Path) -> str:
 LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
 
 
-def _at_paper(published: Path) -> pd.DataFrame:
-    """Return the rows of Table 1 that were trained on D-NeRF at the paper's protocol, and the paper's numbers."""
-    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
-    return rows[(rows.table == "paper") & (rows.recipe == POINTS)]
-
-
 def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str:
     """Return PSNR on D-NeRF at the paper's protocol, by scene and on average; `quantities` are of LAST, BEST, OF_PAPER.
 
     Each model has a column for each quantity. Scenes that lack one of them are left out.
     """
-    rows = _at_paper(published)
+    rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
+    rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)]
     table = _psnr_by_model(rows.set_index(["scene", "model"]), models, quantities)
     table = table.reindex([*paper.PROTOCOLS[DNERF].scenes, paper.AVERAGE]).dropna()
     scenes = rows.scenes[rows.scene == paper.AVERAGE].max()
@@ -309,23 +301,10 @@ def _psnr_by_model(scores: pd.DataFrame, models: list[str], quantities: dict[str
     )
 
 
-def dnerf_sizes(published: Path) -> str:
-    """Return SSIM and Gaussians of the trainings of `dnerf` and in the paper, on average."""
-    rows = _at_paper(published)
-    rows = rows[rows.scene == paper.AVERAGE].set_index("model")
-    columns = {
-        "ssim": Column("SSIM", 3),
-        "ssim paper": Column("SSIM, paper", 3),
-        "gaussians": Column("Gaussians", 0),
-        "gaussians paper": Column("Gaussians, paper", 0),
-    }
-    return block(rows[list(columns)].astype(float), **columns)
-
-
 def dnerf400(published: Path, models: list[str], quantities: dict[str, str]) -> str:
     """Return the table of `dnerf` for trainings with `+recipe=quick`, with all scenes of the study dnerf400."""
-    runs = only(published, "dnerf400").runs.set_index(["scene", "model"])
-    scores = runs.join(paper.table1().loc[DNERF].psnr_db.rename("psnr_best_on_test_db paper"))
+    averages = only(published, "dnerf400").runs.groupby(["scene", "model"]).mean(numeric_only=True)
+    scores = averages.join(paper.table1().loc[DNERF].psnr_db.rename("psnr_best_on_test_db paper"))
     table = _psnr_by_model(scores, models, quantities)
     table = pd.concat([table, table.mean().to_frame(f"mean of {len(table)}").T]).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
@@ -460,6 +439,5 @@ RESULTS: dict[str, Callable[[Path], str]] = {
     "dnerf400": lambda published: dnerf400(published, OF_TABLE_1, LAST | BEST | OF_PAPER),
     "dnerf400_costs": dnerf400_costs,
     "dnerf": lambda published: dnerf(published, OF_TABLE_1, LAST | BEST | OF_PAPER),
-    "dnerf_sizes": dnerf_sizes,
     **{write.__name__: write for write in _OF_RESULTS},
 }
