@@ -131,11 +131,16 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
     names, viewmats = [image.name for image in posed_images], np.stack([image.viewmat for image in posed_images])
     keys = [lenses[image.camera].key for image in posed_images]
     timed, digests = times.of_images(root, times.NamedImages(names, viewmats, keys, posed.path))
-    listed_shots, finder = [], ImageFinder(root)
+    listed_shots, finder, named = [], ImageFinder(root), dict[str, str]()
     for image, time in zip(posed_images, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"
         path = finder.find(f"{IMAGES}/{image.name}", where)
         name = files.without_suffix(path.relative_to(root / IMAGES).as_posix())
+        if (other := named.setdefault(name, image.name)) != image.name:
+            raise InputError(
+                f"{where}: expected a file of its own, and a name that differs in more than its suffix, got "
+                f"{path.relative_to(root).as_posix()[:80]!a}, and {other[:80]!a} is there too: rename or remove one"
+            )
         mask = files.find_inside(root, f"{MASKS}/{name}.png", where) if (root / MASKS).is_dir() else None
         viewmat = torch.from_numpy(image.viewmat)
         named_by = f"{path} (named {image.name[:80]!a} in {posed.path.name})"
@@ -235,7 +240,7 @@ def read_points(file: ModelFile) -> Points:
     rows = _text_points(file) if path.suffix == ".txt" else _binary_points(file)
     values = np.array(rows, np.float64).reshape(-1, 6)  # x y z, r g b from 0 to 255
     if not len(values):
-        raise InputError(f"{path}: expected at least one point")
+        raise InputError(f"{path}: expected at least one point, where Gaussians start: run `colmap point_triangulator`")
     if not (np.abs(values[:, :3]) <= np.finfo(np.float32).max).all():
         raise InputError(f"{path}: expected finite positions, some are not")
     if values[:, 3:].min() < 0 or values[:, 3:].max() > 255:

@@ -116,7 +116,7 @@ def is_turned(data: bytes) -> bool:  # of an image that was checked
     """Return whether an image has an EXIF orientation by which other programs turn or mirror it."""
     with suppress(InputError), _opened(data, "EXIF") as image:  # nothing is read of a damaged part
         # The method of a PNG would decode the pixels, to find what stands behind them.
-        return Image.Image.getexif(image).get(_ORIENTATION, 1) != 1  # 1: stored as it is shown
+        return Image.Image.getexif(image).get(_ORIENTATION) in range(2, 9)  # 1: stored as it is shown; 0: unknown
     return False
 
 

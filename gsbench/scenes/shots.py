@@ -149,7 +149,8 @@ def check_rigid(
     if error > _RIGID_TOLERANCE or determinant < 0:
         raise InputError(
             f"{where}: expected a rigid {what} matrix (R^T R = I to {_RIGID_TOLERANCE}, det R = +1), got an "
-            f"error of {error:.2g} and a determinant of {determinant:.6g}: take out scale, shear and mirroring"
+            f"error of {error:.2g} and a determinant of {determinant:.6g}: take out scale, shear and mirroring, or "
+            "write more digits"
         )
 
 

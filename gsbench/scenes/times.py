@@ -8,7 +8,7 @@ Times that cannot be determined raise `InputError`.
 import csv
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -159,7 +159,7 @@ def of_names(images: NamedImages) -> Times:
         note = f"times: none, as the names have only the number of the camera; write {TABLE} if the scene moves"
         return Times([*none], [note])
     check_distinct(images, column.values, images.source)
-    return Times([*_scaled(column.values)], [_described(column, images.names)])
+    return Times([*_scaled(column.values)], [_described(column, images.names), *_apart(column, images.places)])
 
 
 def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of times.csv
@@ -482,6 +482,18 @@ def _described(column: _Column, names: Sequence[str]) -> str:
     ends = f"{last - first:.10g} seconds" if column.numbers[0].is_moment else f"{first:.16g} to {last:.16g} ({unit})"
     at = column.order[0]
     return f"times: {what} in each name, {ends}, scaled to [0, 1]; {names[at][:80]!a} is the first"
+
+
+def _apart(column: _Column, places: Sequence[Hashable]) -> list[str]:
+    """Return a sentence if fixed cameras have no time in common, and the number seems to count the images of all."""
+    fixed, values = sum(count > 1 for count in Counter(places).values()), column.values
+    is_count = all(value.denominator == 1 for value in values) and max(values) - min(values) < 2 * len(values)
+    if fixed < 2 or len({*values}) < len(values) or not is_count:
+        return []
+    return [
+        f"times: no two images of the {fixed} fixed cameras have the same time: if the number counts the images of all "
+        f"cameras, write {TABLE}"
+    ]
 
 
 def _loose(name: str) -> str:

@@ -45,6 +45,8 @@ _LENS_KEYS = frozenset(
     (*_AXES[0], *_AXES[1], "cx", "cy", "w", "h", *_DISTORTION, "distortion_params", *_MODEL_KEYS, *_FLAGS)
 )
 _UNDISTORT = "undistort the images, for example by `colmap image_undistorter`"
+_ON_LENSES = "data.md#cameras-and-images"  # in the docs
+_UNREAD = ("points3d.ply", "fused.ply")  # random points, which 3DGS and 4DGS write beside these data sets
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def load_blender(root: Path, name: str, rendition: Rendition) -> Scene:
       in pixels of the full image. A frame may have its own.
 
     Times outside of [0, 1] are scaled over all splits together. transforms_val.json may be missing. A file points3d.ply
-    is ignored, because in these data sets it has random points.
+    is not read, because in these data sets it has random points; a note says so.
 
     An optional folder `masks` beside the images has an 8-bit grey PNG for each image, with the number of the object in
     each pixel (`View.regions`). Masks are measured with (`psnr_object`), not trained with.
@@ -85,6 +87,7 @@ def load_blender(root: Path, name: str, rendition: Rendition) -> Scene:
     digests = loaded.by_path(root) | {split.source.name: split.digest for split in splits.values()}
     if times.table_of(root):
         notes.append(f"{times.TABLE} is not read: the times are those of transforms_*.json")
+    notes += [f"{ply} is not read: the initial points are random" for ply in _UNREAD if (root / ply).exists()]
     notes += [*(note for split in splits.values() for note in split.notes), *reader.finder.notes(), *loaded.notes]
     return standard_scene(
         name=name,
@@ -164,12 +167,13 @@ class _Reader:
         if not frames:
             raise InputError(f"{source}: frames: expected at least one frame, got an empty list")
         listed = [self._shot(content, frame, source, index) for index, frame in enumerate(frames)]
-        index_of: dict[Path, int] = {}
+        index_of: dict[str, int] = {}  # by the name of the view
         for index, shot in enumerate(listed):
-            if index_of.setdefault(shot.path, index) != index:
+            if (first := index_of.setdefault(shot.name, index)) != index:
                 raise InputError(
-                    f"{source}: frames[{index}].file_path: expected each image once, frames[{index_of[shot.path]}] "
-                    f"has {shot.path_in(self._root)[:80]!a} too: remove one of the two"
+                    f"{source}: frames[{index}].file_path: expected each image once, frames[{first}] has "
+                    f"{listed[first].path_in(self._root)[:80]!a} too: remove one of the two, or rename it if it is "
+                    "another image"
                 )
         unread = (content.keys() - _LENS_KEYS - {"frames", *keys}) | (
             {key for frame in frames for key in frame} - _LENS_KEYS - _FRAME_KEYS
@@ -373,17 +377,22 @@ def _check_pinhole(values: Mapping[str, Any], where: str) -> None:
         model = values.get(key, _MODELS[0])
         if not isinstance(model, str) or model.upper() not in _MODELS:
             raise InputError(
-                f"{where}: {key}: expected a pinhole camera ({', '.join(_MODELS)}), got {_brief(model)}: {_UNDISTORT}"
+                f"{where}: {key}: expected a pinhole camera ({', '.join(_MODELS)}), got {_brief(model)}: {_UNDISTORT}",
+                docs=_ON_LENSES,
             )
     for key in _FLAGS:
         if values.get(key, False) not in (False, 0):
-            raise InputError(f"{where}: {key}: expected a pinhole camera, got {_brief(values[key])}: {_UNDISTORT}")
+            raise InputError(
+                f"{where}: {key}: expected a pinhole camera, got {_brief(values[key])}: {_UNDISTORT}", docs=_ON_LENSES
+            )
     coefficients = [(key, values[key]) for key in _DISTORTION if key in values]
     params = values.get("distortion_params", [])
     coefficients += [("distortion_params", value) for value in (params if isinstance(params, list) else [params])]
     for key, value in coefficients:
         if (coefficient := _number(value, f"{where}: {key}")) != 0:
-            raise InputError(f"{where}: {key}: expected a pinhole camera, got {coefficient}: {_UNDISTORT}")
+            raise InputError(
+                f"{where}: {key}: expected a pinhole camera, got {coefficient}: {_UNDISTORT}", docs=_ON_LENSES
+            )
 
 
 def _number(value: object, where: str) -> float:

@@ -113,6 +113,11 @@ FAULTS: dict[str, tuple[Break, str, str]] = {  # what is done, the file the mess
     "split empty": (change(frames=[]), JSON, "got an empty list"),
     "val file there but empty": (write(VAL, b'{"camera_angle_x": 0.8, "frames": []}'), VAL, "got an empty list"),
     "an image twice": (change_frame(file_path="train/r_0.png"), JSON, "frames[0] has 'train/r_0.png' too"),
+    "two images of one name": (
+        lambda root: [(root / "train/r_0.jpg").touch(), change_frame(file_path="train/r_0.jpg")(root)],
+        JSON,
+        "frames[0] has 'train/r_0.png' too: remove one of the two, or rename it",
+    ),
     "test missing": (lambda root: (root / TEST).unlink(), TEST, "found none"),
     "frame is a number": (change(frames=[7]), JSON, "frames[0]"),
     # the intrinsics

@@ -193,11 +193,11 @@ def test_images_that_colmap_did_not_register_are_told(taken):
 def test_an_exif_orientation_is_told(taken, kind):
     """Catches pixels that other programs turn, and gsbench does not, in silence."""
     exif = Image.Exif()
-    exif[274] = 6
     for i, path in enumerate(sorted((taken / "images").rglob("*.png"))):
         with Image.open(path) as image:
             pixels = image.convert("RGB")
-        pixels.save(path, kind, **({"exif": exif} if i < 3 else {}))
+        exif[274] = 6 if i < 3 else i % 2  # 1: as stored, 0: unknown
+        pixels.save(path, kind, **({"exif": exif} if i < 6 else {}))
     assert any(f"3 of {COUNT} images have an EXIF orientation" in note for note in scenes.load(taken).notes)
 
 
@@ -319,7 +319,10 @@ def link(target: str) -> Callable[[Path], object]:
 ROWS = "".join(f"{name},{i}\n" for i, name in enumerate(NAMES))
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no cameras": (lambda taken: (taken / "sparse/0/cameras.txt").unlink(), r"cameras\.bin or cameras\.txt"),
-    "no points": (lambda taken: (taken / "sparse/0/points3D.txt").write_text("# none\n"), "at least one point"),
+    "no points": (
+        lambda taken: (taken / "sparse/0/points3D.txt").write_text("# none\n"),
+        "at least one point.*triangulator",
+    ),
     "fisheye": (text("cameras", "PINHOLE", "OPENCV_FISHEYE"), "OPENCV_FISHEYE.*colmap image_undistorter"),
     "unknown model": (text("cameras", "PINHOLE", "LENS\t"), "got 'LENS'"),
     "too few parameters": (text("cameras", " 9.5", ""), "PINHOLE with fx fy cx cy"),
@@ -332,6 +335,17 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such camera": (text("images", "7 frame_000", "8 frame_000"), "a camera of the model, got number 8"),
     "line cut": (text("images", " 7 frame_000.png", ""), "line 2: expected an image's id"),
     "name twice": (text("images", "frame_001", "frame_000"), "frame_000.png' appears twice"),
+    "two names of one file": (
+        text("images", "frame_001.png", "frame_000.JPG"),
+        "'frame_000.JPG': .* a file of its own",
+    ),
+    "two files of one name": (
+        lambda taken: [
+            (taken / "images/frame_000.jpg").touch(),
+            text("images", "frame_001.png", "frame_000.jpg")(taken),
+        ],
+        "in more than its suffix, got 'images/frame_000.jpg', and 'frame_000.png' is there too: rename",
+    ),
     "name leaves": (text("images", "frame_001", "../../../etc/1"), "expected a path inside"),
     "no number": (text("images", "frame_001.png", "x.png"), "expected a number in its name"),
     "fewer images than the split needs": (lambda taken: small_model(taken, NAMES[:7]), "at least 8 images"),

@@ -116,3 +116,9 @@ def test_a_second_layout_is_not_read_in_silence(tiny):
     """Catches a folder of two layouts of which one is read without a word."""
     (tiny / "transforms.json").write_text("{}")
     assert scenes.load(tiny).notes == ("transforms_train.json is read, and not transforms.json",)
+
+
+def test_points_beside_a_blender_scene_are_told(tiny):
+    """Catches points of one's own that random ones replace in silence."""
+    (tiny / "points3d.ply").write_bytes(b"")
+    assert scenes.load(tiny).notes == ("points3d.ply is not read: the initial points are random",)

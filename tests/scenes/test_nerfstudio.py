@@ -102,8 +102,8 @@ def test_fingerprint(root):
 
 
 FAULTS: list[tuple[dict[str, Any] | Callable[[Path], None], str]] = [
-    ({"camera_model": "OPENCV_FISHEYE"}, "transforms.json: camera_model: expected a pinhole"),
-    ({"k1": 0.02}, "transforms.json: k1: .*undistort"),
+    ({"camera_model": "OPENCV_FISHEYE"}, "transforms.json: camera_model: expected a pinhole.*data.md#cameras"),
+    ({"k1": 0.02}, "transforms.json: k1: .*undistort.*data.md#cameras"),
     ({"ply_file_path": "../x.ply"}, "ply_file_path: expected a path inside"),
     ({"ply_file_path": 3}, "ply_file_path: expected the path of a PLY"),
     ({"ply_file_path": "none.ply"}, "none.ply"),

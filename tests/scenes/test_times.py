@@ -71,6 +71,16 @@ def test_the_time_of_a_rig(form, moves):
     assert "scaled to [0, 1]" in note
 
 
+@pytest.mark.parametrize("form", ["", "cam"])
+@pytest.mark.parametrize("unit", [1, 40])
+def test_a_number_that_counts_the_images_of_all_fixed_cameras_is_asked_about(form, unit):
+    """Catches 4 films numbered one after another that are read as one film in silence, and clocks that differ told."""
+    names, viewmats, _ = fixed(lambda c, f: f"{f'cam{c}/' if form else ''}{unit * (c * FRAMES + f):05d}.png")
+    notes = of_names(names, viewmats).notes[1:]
+    assert len(notes) == (unit == 1)
+    assert all("no two images of the 4 fixed cameras have the same time" in note for note in notes)
+
+
 def clock(form: str, seconds: float = 1.0, cut: int = 0) -> Callable[[int], str]:
     """Names with a date or time of day that pass midnight; `cut`: decimals to leave out."""
     start = datetime(2023, 4, 30, 23, 59, 55)
