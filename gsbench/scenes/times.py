@@ -8,7 +8,7 @@ Times that cannot be determined raise `InputError`.
 import csv
 import os
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -49,6 +49,7 @@ _MOMENTS = (
     re.compile(_DATE + r"(?:[-_ T]| at )?" + _LETTERS, re.ASCII),  # 2023-05-01-12h30m59s123
     re.compile(r"(?<!\d)" + _CLOCK.format("[-:]"), re.ASCII),  # 12-30-59
     re.compile(r"(?<!\d)" + _LETTERS, re.ASCII),  # 12h30m59s
+    re.compile(_DATE + r"(?!\d)", re.ASCII),  # 2023-05-01
 )
 _CAMERA_WORDS = ("cam", "camera")
 _TIME_WORDS = ("frame", "f", "time", "timestamp", "t")
@@ -68,7 +69,7 @@ class _Number:
 
     value: Fraction
     label: str  # the text before it, from the number before or from the folder on
-    is_moment: bool = False  # a date and time of day, or a time of day, in seconds
+    is_moment: bool = False  # a date or a time of day, or both, in seconds
 
     @property
     def word(self) -> str:
@@ -159,7 +160,8 @@ def of_names(images: NamedImages) -> Times:
         note = f"times: none, as the names have only the number of the camera; write {TABLE} if the scene moves"
         return Times([*none], [note])
     check_distinct(images, column.values, images.source)
-    return Times([*_scaled(column.values)], [_described(column, images.names), *_apart(column, images.places)])
+    apart = _apart(column, [other for other in changing if other is not column], images)
+    return Times([*_scaled(column.values)], [_described(column, images.names), *apart])
 
 
 def of_table(data: bytes, path: Path, images: NamedImages) -> Times:  # data: of times.csv
@@ -290,7 +292,7 @@ def _columns(images: NamedImages) -> list[_Column]:
 def _numbers(names: Sequence[str], source: Path) -> list[list[_Number]]:
     """Return the numbers in the name of each image, such as 3 and 12 of cam3/frame_12.png, in their order.
 
-    If every name has one date and time of day, its digits together are one number, in seconds.
+    If every name has one date or time of day, or both, its digits together are one number, in seconds.
     """
     plain = [without_suffix(name.replace("\\", "/")) for name in names]
     moments: list[re.Match[str] | None] = [None] * len(names)
@@ -336,7 +338,7 @@ def _have_decimals(names: Sequence[str]) -> bool:
 
 
 def _seconds(moment: re.Match[str], source: Path) -> Fraction:
-    """Return a date and time of day, or a time of day, in seconds."""
+    """Return a date or a time of day, or both, in seconds."""
     fields = moment.groupdict()
     digits = fields.get("f") or fields.get("g") or ""  # of the fraction of a second
     fraction = Fraction(int(digits or 0), 10 ** len(digits))
@@ -348,10 +350,10 @@ def _seconds(moment: re.Match[str], source: Path) -> Fraction:
             f"{source}: image {moment.group()[:40]!a}: expected a date: rename it, or write {TABLE}",
             docs="data.md#times",
         ) from None
-    hour = int(fields["H"])
+    hour, minute, second = (int(fields.get(key) or 0) for key in "HMS")  # 0: the names have dates alone
     if half := fields.get("half"):
         hour = hour % 12 + 12 * (half in "Pp")
-    return days * 86400 + hour * 3600 + int(fields["M"]) * 60 + int(fields["S"]) + fraction
+    return days * 86400 + hour * 3600 + minute * 60 + second + fraction
 
 
 def _exact(text: str, where: str) -> Fraction:
@@ -430,8 +432,8 @@ def _step(column: _Column, others: list[_Column], images: NamedImages) -> float 
     None: no two names differ in this number alone.
     """
     groups: dict[Hashable, list[int]] = defaultdict(list)
-    for i, name in enumerate(images.names):
-        groups[(re.sub("[0-9]+", "#", name), *(other.values[i] for other in others))].append(i)
+    for i, key in enumerate(_rest_of_names(others, images)):
+        groups[key].append(i)
     values, distances = column.values, []
     for group in groups.values():
         ordered = sorted(group, key=values.__getitem__)
@@ -484,15 +486,29 @@ def _described(column: _Column, names: Sequence[str]) -> str:
     return f"times: {what} in each name, {ends}, scaled to [0, 1]; {names[at][:80]!a} is the first"
 
 
-def _apart(column: _Column, places: Sequence[Hashable]) -> list[str]:
-    """Return a sentence if fixed cameras have no time in common, and the number seems to count the images of all."""
-    fixed, values = sum(count > 1 for count in Counter(places).values()), column.values
+def _apart(column: _Column, others: list[_Column], images: NamedImages) -> list[str]:
+    """Return a sentence if cameras have no time in common, as where each has its own count, or one count is of all."""
+    values = column.values
     is_count = all(value.denominator == 1 for value in values) and max(values) - min(values) < 2 * len(values)
-    if fixed < 2 or len({*values}) < len(values) or not is_count:
-        return []
+    for keys in (images.places, _rest_of_names(others, images)):  # fixed cameras, or those that names tell apart
+        groups: dict[Hashable, list[Fraction]] = defaultdict(list)
+        for key, value in zip(keys, values, strict=True):
+            groups[key].append(value)
+        ends = sorted((min(group), max(group)) for group in groups.values() if len(group) > 1)
+        are_apart = all(last < first for (_, last), (first, _) in pairwise(ends))
+        is_count_of_all = keys is images.places and is_count and len({*values}) == len(values)
+        if len(ends) > 1 and (are_apart or is_count_of_all):
+            return [
+                f"times: no two of {len(ends)} cameras or takes have the same time: if each camera counts its own "
+                f"images, or one count goes over all cameras, write {TABLE}"
+            ]
+    return []
+
+
+def _rest_of_names(others: list[_Column], images: NamedImages) -> list[Hashable]:
+    """Return a key of each name, equal for names that differ in the number alone that is not among `others`."""
     return [
-        f"times: no two images of the {fixed} fixed cameras have the same time: if the number counts the images of all "
-        f"cameras, write {TABLE}"
+        (re.sub("[0-9]+", "#", name), *(other.values[i] for other in others)) for i, name in enumerate(images.names)
     ]
 
 

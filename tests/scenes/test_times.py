@@ -71,14 +71,22 @@ def test_the_time_of_a_rig(form, moves):
     assert "scaled to [0, 1]" in note
 
 
-@pytest.mark.parametrize("form", ["", "cam"])
-@pytest.mark.parametrize("unit", [1, 40])
-def test_a_number_that_counts_the_images_of_all_fixed_cameras_is_asked_about(form, unit):
-    """Catches 4 films numbered one after another that are read as one film in silence, and clocks that differ told."""
-    names, viewmats, _ = fixed(lambda c, f: f"{f'cam{c}/' if form else ''}{unit * (c * FRAMES + f):05d}.png")
-    notes = of_names(names, viewmats).notes[1:]
-    assert len(notes) == (unit == 1)
-    assert all("no two images of the 4 fixed cameras have the same time" in note for note in notes)
+COUNTS: dict[str, tuple[Callable[[int, int], str], bool]] = {  # names, and whether poses of a camera differ
+    "films one after another": (lambda c, f: f"{c * FRAMES + f:05d}.png", False),
+    "moments one after another": (lambda c, f: f"{f * CAMERAS + c:05d}.png", False),
+    "each camera its own": (lambda c, f: f"cam{c}/IMG_{1000 * c + f:04d}.png", True),
+    "clocks that differ by 1 ms": (lambda c, f: f"cam{c}/{1683000000000 + 40 * f + c}.png", False),
+}
+
+
+@pytest.mark.parametrize("kind", COUNTS)
+def test_counts_that_cameras_do_not_share_are_asked_about(kind):
+    """Catches films that are read as one after another in silence, and a question where clocks differ a little."""
+    form, moves = COUNTS[kind]
+    names, viewmats, _ = fixed(form)
+    notes = of_names(names, nudged(viewmats) if moves else viewmats).notes[1:]
+    assert len(notes) == ("clocks" not in kind)
+    assert all("no two of 4 cameras or takes have the same time" in note for note in notes)
 
 
 def clock(form: str, seconds: float = 1.0, cut: int = 0) -> Callable[[int], str]:
@@ -105,6 +113,7 @@ MOVING: dict[str, Callable[[int], str]] = {
     "PXL_20230501_123059500": clock("PXL_%Y%m%d_%H%M%S%f", 0.75, cut=3),
     "2023-05-01_12-30-59": clock("2k_%Y-%m-%d_%H-%M-%S"),
     "2023-05-01T12:30:59.500000": clock("%Y-%m-%dT%H:%M:%S.%f", 0.25),
+    "2023-05-01": clock("plant 1 %Y-%m-%d", 86400),
     "at 12.30.59": clock("Shot %Y-%m-%d at %H.%M.%S"),
     "12-30-59": lambda i: f"12-{29 + (i + 55) // 60}-{(i + 55) % 60:02d}.png",
     "negative": lambda i: f"t={i - 4}.png",
