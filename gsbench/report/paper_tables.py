@@ -228,8 +228,7 @@ def _measured(runs: pd.DataFrame, dataset: str) -> pd.DataFrame:
     lacking = [model for model in OWED if model not in set(rows.model)]
     counts = [finished[finished.model == model].scene.nunique() for model in lacking]
     reasons = [
-        f"not measured: {model}, {count} of {len(scenes)} scenes finished"
-        for model, count in zip(lacking, counts, strict=True)
+        f"not measured: {model}, {count} of {len(scenes)} scenes" for model, count in zip(lacking, counts, strict=True)
     ]
     rows = pd.concat([rows, pd.DataFrame({"model": lacking, "source": reasons})], ignore_index=True)
     return rows.assign(dataset=dataset, method=[(OWED | NAMES).get(model, model) for model in rows.model])

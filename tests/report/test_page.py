@@ -124,8 +124,8 @@ def test_every_colour_is_defined():
 
 
 def test_charts_hold_the_numbers_of_their_tables():
-    """Catches a figure of other numbers than those of its table, one that goes as one run lacks its cost, and infinity
-    in its JSON."""
+    """Catches a figure of other numbers than those of its table, one that goes as one run lacks its cost, infinity in
+    its JSON, and numbers of a logarithmic axis that touch."""
     drawn, of = charts_of(*frontier(**SMALL)), sections(*frontier(**SMALL))
     (rows,) = drawn["g0-frontier-0"]["datasets"].values()
     means = [row["psnr_db"] for row in rows if row["kind"] == "mean"]
@@ -139,6 +139,7 @@ def test_charts_hold_the_numbers_of_their_tables():
     best = {(row["model"], row["variant"]) for row in rows if row["best"] is True and row["kind"] == "mean"}
     assert best == {("a", ""), ("a", "iterations=4"), ("b", ""), ("b", "iterations=9")}
     json.dumps(drawn, allow_nan=False)
+    assert all(chart["config"]["axis"]["labelSeparation"] >= 4 for chart in drawn.values())
 
 
 def test_what_did_not_finish_is_on_the_page():
@@ -306,6 +307,14 @@ def test_latex_is_balanced_and_every_row_has_every_column():
     assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in rows} == {columns}
     assert r"\textbf{25.50} {\scriptsize $\pm$ 6.35}" in written
     assert r"\underline{23.00}" in written
+    assert "Underlined: the second best." in written
+    assert "With *:" in text.terminal(output.shown_sections(results(*every_row())))
+
+
+def test_a_table_without_rows_has_no_head_in_a_terminal():
+    """Catches titles of columns, and a list of those that do not fit, above nothing."""
+    empty = Section("a", "Title", "Words.", pd.DataFrame({"a" * 50: [], "b" * 50: [], "c" * 50: []}))
+    assert text.terminal([empty]).split("\n") == ["Title", "", "Words.", ""]
 
 
 @pytest.mark.parametrize("width", [120, 80, 40])
@@ -323,6 +332,7 @@ def test_the_terminal_form_fits(width):
     assert all(any(f"{name[:21]}..{name[-21:]}"[: width - 2] in line for line in lines) for name in names)
     printed = "".join("".join(lines).split())
     words = [part for section in sections for part in (section.title, section.text, *section.notes)]
+    words = [part.replace("Bold: ", "With *: ") for part in words]
     assert all("".join(part.split()) in printed for part in words)
 
 

@@ -14,6 +14,7 @@ from records import (
     every_row,
     frontier,
     lost,
+    make,
     on_demand,
     run,
     runs_of,
@@ -354,6 +355,14 @@ def test_the_papers_rows_stand_below_their_models():
     assert rows.model[places].tolist() == ["paper, other data"] * 2
     assert rows.model[places - 1].tolist() == ["4dgs", "7dgs"]
     assert not rows["psnr_db rank"][places].fillna(0).any()
+
+
+def test_the_papers_rows_are_explained_where_they_are():
+    """Catches words on rows that a table does not have, as in a report on a capture of the user's own."""
+    explained = sections(make("4dgs"))["experiment"].text
+    assert "“paper, other data”" in explained
+    assert "“paper”" not in explained
+    assert "paper" not in sections(make("4dgs", "mine"))["experiment"].text
 
 
 # ---- renders of other programs

@@ -61,6 +61,7 @@ def spec(
         "labelFontSize": 12,
         "titleFontSize": 12,
         "labelLimit": 220,
+        "labelSeparation": 6,  # pixels between the numbers of a logarithmic axis
     }
     shown = {"labelColor": INK, "titleColor": INK, "labelFontSize": 12} if legend else {"disable": True}
     chart = chart.configure(background="transparent", font=FONT, axis=axis, legend=shown, view={"stroke": None})

@@ -52,15 +52,16 @@ def _terminal(section: Section, width: int) -> Iterator[str]:
         padded = (text.rjust(widths[name]) if numeric[name] else text.ljust(widths[name]) for name, text in texts)
         return f"  {'  '.join(padded)}"[:width].rstrip()
 
-    yield from (*_wrapped(section.title, width), "", line(shown))
+    yield from (*_wrapped(section.title, width), "", *([line(shown)] if len(table) else []))
     for scene in scenes:
         rows = table[table.scene == scene] if has_scenes else table
         if scene:
             yield scene[:width]
         yield from map(line, rows[shown].to_numpy().tolist())
-    words = [section.text, *(f"- {note}" for note in section.notes)]
-    words += [f"- for lack of width: {', '.join(names[len(shown) :])}"] if len(shown) < len(names) else []
-    yield from ("", *(part for text in words for part in _wrapped(text, width)), "")
+    words = [section.text.replace("Bold: ", "With *: "), *(f"- {note}" for note in section.notes)]
+    left_out = names[len(shown) :] if len(table) else []
+    words += [f"- left out for lack of width: {', '.join(left_out)}"] if left_out else []
+    yield from (*([""] if len(table) else []), *(part for text in words for part in _wrapped(text, width)), "")
 
 
 def _narrow(text: str) -> str:
@@ -114,7 +115,8 @@ def _latex(section: Section, number: int) -> list[str]:
     names = section.shown_columns
     shown = section.shown()
     titles = [tex(section.column(name).title) + ARROWS[section.column(name).better] for name in names]
-    ranks = zip(*(section.rank(name) for name in names), strict=True)
+    ranks = list(zip(*(section.rank(name) for name in names), strict=True))
+    underlined = " Underlined: the second best." if any(2 in row for row in ranks) else ""
     rows = [
         " & ".join(_cell(text, rank) for text, rank in zip(texts, places, strict=True))
         for texts, places in zip(shown.to_numpy().tolist(), ranks, strict=True)
@@ -123,7 +125,7 @@ def _latex(section: Section, number: int) -> list[str]:
         *(f"% {printable(note)}" for note in section.notes),
         r"\begin{table*}",
         r"\centering\small",
-        rf"\caption{{{tex(f'{section.title}. {section.text}')}}}",
+        rf"\caption{{{tex(f'{section.title}. {section.text}{underlined}')}}}",
         rf"\label{{tab:gsbench-{number}}}",
         rf"\begin{{tabular}}{{{''.join('r' if section.is_number(name) else 'l' for name in names)}}}",
         r"\toprule",

@@ -5,7 +5,7 @@ import pandas as pd
 from gsbench.report import stats
 from gsbench.report.frame import Results
 from gsbench.report.section import Asked, Column, Figure, Section, section
-from gsbench.report.sections.pairs import scope, verdict
+from gsbench.report.sections.pairs import corrected, scope, verdict
 
 FACTORS = ("time", "direction", "AGR")
 HAS = ["effect_time", "effect_direction", "effect_refinement"]
@@ -79,7 +79,7 @@ def effects(chapter: Results, tests: pd.DataFrame) -> Section | None:
         "report. “Nested” rows have 7dgs_nodir (7dgs without direction) in place of 4dgs, which also differs from "
         "7dgs_noagr in how it parametrises a Gaussian. “± over scenes”: half the interval for scenes like these."
     )
-    notes = (scope(gains), f"Corrected for {gains.comparisons.iloc[0]} comparisons in dB.", *_absent(chapter))
+    notes = (scope(gains), corrected(gains, "dB"), *_absent(chapter))
     return Section(
         "effects", "The price of each effect", text, table.reset_index(drop=True), columns, tuple(figures), notes
     )

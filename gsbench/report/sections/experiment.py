@@ -30,12 +30,16 @@ WITH_TRAIN = (SHOWN[0], "psnr_train_db", *SHOWN[1:])  # for --train
 ALWAYS = ("psnr_db", "psnr_train_db", "ssim", "lpips_alex", "train_min", "fps", "gaussians")
 ORIGIN = ["contributor", "machine", "git_commit"]  # in a merged set, all runs of a row have the same
 TEXT = (
-    "Mean over seeds ± half the width of the 95 % interval over seeds. Bold (in a terminal *): the best mean of a "
-    "scene and every mean that does not differ from it: the interval of their paired difference contains zero, or they "
-    "look equal. “paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a "
-    "V100, and whose LPIPS does not name its network. “paper, other data”: the scene here is a stand-in of the same "
-    "name, so the two rows cannot be compared."
+    "Mean over seeds ± half the width of the 95 % interval over seeds. Bold: the best mean of a scene and every mean "
+    "that does not differ from it: the interval of their paired difference contains zero, or they look equal."
 )
+PAPER, STAND_IN = "paper", "paper, other data"  # rows, and what the text says of them
+OF_ROWS = {
+    PAPER: " “paper”: Table 1 of the 7DGS paper, whose PSNR is the best on test (leaks), whose times are of a V100, "
+    "and whose LPIPS does not name its network.",
+    STAND_IN: " “paper, other data”: Table 1 of the 7DGS paper; the scene here is a stand-in of the same name, so "
+    "the two rows cannot be compared.",
+}
 MERGED = (
     "Mean over the seeds of one contributor, machine and commit ± half the width of the 95 % interval over seeds. "
     "Bold: the best mean of a scene and every mean that does not differ from it. Minutes and FPS are those of the "
@@ -74,8 +78,11 @@ def table(chapter: Results, asked: Sequence[str]) -> Section:
     order = ["scene", "label", *origin[:1], *shown, "seeds", *origin[1:]]
     rows = rows.reindex(columns=order).rename(columns={"label": "model"}).reset_index(drop=True)
     title, notes = f"Results: {title_of(runs)}", tuple(_notes(chapter))
+    words = (
+        MERGED if origin else TEXT + "".join(sentence for name, sentence in OF_ROWS.items() if name in set(rows.model))
+    )
     columns = {"git_commit": Column("commit")}
-    return Section("experiment", title, MERGED if origin else TEXT, rows, columns, notes=notes, sortable=bool(origin))
+    return Section("experiment", title, words, rows, columns, notes=notes, sortable=bool(origin))
 
 
 def _by_row(runs: pd.DataFrame) -> pd.DataFrame:
@@ -113,7 +120,7 @@ def _paper_rows(rows: pd.DataFrame, runs: pd.DataFrame, averaged: list[str]) -> 
         named = measured.protocol_paper_dataset.iloc[0] if "protocol_paper_dataset" in measured else None
         numbers = paper.average(str(named), scenes, measured.model.iloc[0])
         if len(numbers):
-            title = "paper" if (measured.dataset == named).all() else "paper, other data"
+            title = PAPER if (measured.dataset == named).all() else STAND_IN
             yield pd.DataFrame([numbers.to_dict() | {"scene": scene, "label": title}], index=[i])
 
 

@@ -45,12 +45,12 @@ def pairs(chapter: Results, tests: pd.DataFrame) -> Section | None:
         )
     table = pd.DataFrame(rows).sort_values("dB", ascending=False, kind="stable").reset_index(drop=True)
     text = (
-        "The runs of two models are paired by scene, seed and view. Significant: p is below 5 % after Holm's "
-        "correction for all comparisons of this report. The intervals are not corrected, so an interval without zero "
-        "may still be chance. “Ahead”: the probability that a run of the first model has a higher PSNR than a run of "
-        "the second on the same view."
+        "The runs of two models are paired by scene, seed and view. Significant, with a filled point: p is below 5 % "
+        "after Holm's correction for all comparisons of this report. The intervals are not corrected, so an interval "
+        "without zero may still be chance. “Ahead”: the probability that a run of the first model has a higher PSNR "
+        "than a run of the second on the same view."
     )
-    notes = [scope(tests), f"Corrected for {tests.comparisons.iloc[0]} comparisons."]
+    notes = [scope(tests), corrected(tests)]
     if len(table) > MOST_DRAWN:
         notes.append(f"The figure has the {MOST_DRAWN} largest of {len(table)} differences.")
     figure = Figure("Difference in PSNR, dB", "intervals", table.head(MOST_DRAWN), {"label": "pair", "value": "dB"})
@@ -63,6 +63,12 @@ COLUMNS = {"dB": Column("dB", 2, signed=True), "ahead": Column("ahead on % of vi
 def verdict(test: dict[str, object]) -> str:
     """Return whether a difference is significant; a single seed does not say."""
     return "unknown" if test["p_holm"] != test["p_holm"] else "yes" if test["significant"] else "no"
+
+
+def corrected(tests: pd.DataFrame, unit: str = "") -> str:
+    """Say for how many comparisons p-values are corrected."""
+    count = tests.comparisons.iloc[0]
+    return f"Corrected for {count} comparison{'s' if count != 1 else ''}{unit and f' in {unit}'}."
 
 
 def scope(tests: pd.DataFrame) -> str:
