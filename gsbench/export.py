@@ -22,7 +22,6 @@ from gsbench.view.slice_ply import SlicePly, write_clip, write_ply
 from gsbench.view.video import check_file, check_parent
 
 PATHS = {"orbit": video.orbit, "spiral": video.spiral}
-WRITTEN = ("ply", "plys", "video", "images")  # options that name what is written
 READERS = {  # for each option, the outputs that read it
     "time": ("ply", "video", "images"),
     "direction": ("ply", "plys"),
@@ -52,18 +51,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         export = prepare(parser().parse_args(arguments))
         options = export.options
-        notes = [*(export_ply(export) if options.ply else []), *(export_clip(export) if options.plys else [])]
-        if notes and not options.json:
-            print("\n".join(notes))
-        if options.video:
-            shots = shots_of(export, VIDEO_SIDE)
-            with closing(video.frames(export.run, shots, options.supersample)) as images:  # closes the progress bar too
-                video.write_video(images, options.video, options.fps)
-        if options.images:
-            with closing(video.frames(export.run, shots_of(export), options.supersample)) as images:
-                video.write_images(images, options.images)
+        notes = []
+        for name, write in WRITERS.items():
+            if getattr(options, name):
+                lines = write(export)
+                notes += lines
+                if not options.json:
+                    print("\n".join(lines))
         if options.json:
-            print(as_json({"written": {name: getattr(options, name) for name in WRITTEN}, "notes": notes}))
+            print(as_json({"written": {name: getattr(options, name) for name in WRITERS}, "notes": notes}))
     except (InputError, OSError, MemoryError, RuntimeError) as error:  # RuntimeError: torch has no memory
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
@@ -101,7 +97,7 @@ def parser() -> argparse.ArgumentParser:
 
 def prepare(options: argparse.Namespace) -> Export:
     """Check the options of the export and load the run and its data set; raise InputError if this fails."""
-    if not any(getattr(options, name) for name in WRITTEN):
+    if not any(getattr(options, name) for name in WRITERS):
         raise InputError("expected --ply OUT.ply, --plys FOLDER, --video OUT.mp4 or --images FOLDER, got none of them")
     check_read(options)
     if options.time is not None and not 0 <= options.time <= 1:
@@ -213,6 +209,32 @@ def export_clip(export: Export) -> list[str]:
         f"Gaussians each, colours {colours(export, keep)}"
     )
     return [text, *differences(export, folder, plys[0])]
+
+
+def export_video(export: Export) -> list[str]:
+    """Write a video; return the number, size and rate of its frames in words."""
+    path, fps, shots = export.options.video, export.options.fps, shots_of(export, VIDEO_SIDE)
+    with closing(video.frames(export.run, shots, export.options.supersample)) as images:  # closes the progress bar too
+        video.write_video(images, path, fps)
+    return [f"{path}: {frames_in_words(shots)}, {fps:g} a second"]
+
+
+def export_images(export: Export) -> list[str]:
+    """Write the frames of a video as images; return their number and size in words."""
+    folder, shots = export.options.images, shots_of(export)
+    with closing(video.frames(export.run, shots, export.options.supersample)) as images:
+        video.write_images(images, folder)
+    return [f"{folder}: {frames_in_words(shots)}"]
+
+
+def frames_in_words(shots: list[video.Shot]) -> str:
+    """Return the number of frames and the size of the first."""
+    camera = shots[0][0]
+    return f"{len(shots)} frames of {camera.width} x {camera.height} pixels"
+
+
+# Options that name what is written, and the functions that write it and return what to print.
+WRITERS = {"ply": export_ply, "plys": export_clip, "video": export_video, "images": export_images}
 
 
 def colours(export: Export, keep_harmonics: bool) -> str:

@@ -28,8 +28,7 @@ THIN = 15_600
 GATE = 18_000
 STEPS_TO_RECOVER = 300
 # The share of the steps after which model=auto compares its candidates on val (effects.compare). The number of
-# Gaussians no longer grows then. A choice after 50 % of the steps lost 0.16 dB more, after 100 % 0.07 dB less
-# (docs/results.md).
+# Gaussians no longer grows then. A choice after 50 % of the steps lost 0.16 dB more, after 100 % 0.07 dB less.
 COMPARE = 0.7
 
 

@@ -14,7 +14,8 @@ from gsbench.config_key import declared
 from gsbench.errors import InputError, did_you_mean
 
 WIDTH = 118  # characters of a line
-_INDENT = 16  # of the sentences, characters
+_INDENT = 16  # of the sentences, characters, at least
+_MOST_INDENT = 30
 _KEY_INDENT = 36  # of the meaning of keys, characters
 _SENTENCE_END = re.compile(r"\.\s+(?!\d)|[.:]$")  # not that of "et al. 2023"
 USAGE = """\
@@ -54,9 +55,11 @@ def text(words: Sequence[str]) -> str:
     lines = [USAGE]
     for group, title in DESCRIBED.items():
         lines += [f"{title}:"]
-        for path in _files(folders, group):
-            name, sentence = f"  {path.stem} ".ljust(_INDENT), first_sentence(path)
-            lines += textwrap.wrap(sentence, WIDTH, initial_indent=name, subsequent_indent=" " * _INDENT) or [name]
+        paths = _files(folders, group)
+        indent = min(_MOST_INDENT, max([_INDENT, *(len(path.stem) + 4 for path in paths)]))
+        for path in paths:
+            name = f"  {path.stem}  ".ljust(indent)
+            lines += textwrap.wrap(name + first_sentence(path), WIDTH, subsequent_indent=" " * indent)
         lines += [""]
     scenes = ", ".join(path.stem for path in _files(folders, "scene"))
     lines += ["Scenes, scene=NAME (all of the experiment; custom: any folder, with scene.name=FOLDER):"]

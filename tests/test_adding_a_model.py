@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 import subprocess
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -25,11 +24,13 @@ def blocks() -> dict[str, str]:
     return dict(results)
 
 
-def methods_for_gates() -> str:
-    """The methods that the page adds to the example so that gates can simplify it."""
-    page = (ROOT / "docs" / "adding_a_model.md").read_text()
-    (results,) = re.findall(r"^```py\n(def static.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
-    return textwrap.indent(results.replace("\n\n\n", "\n\n"), "    ")
+METHODS_FOR_GATES = """
+    def static(self, raw: Raw) -> Conditioned:
+        return self.condition(raw, CameraTime(raw["means"].new_zeros(3), None))
+
+    def frozen(self, raw: Raw, queries: Sequence[CameraTime], weights: Tensor) -> dict[str, Raw]:
+        return {}
+"""
 
 
 # An editable install finds gsbench by a hook that goes before PYTHONPATH; the copy is what is to be run.
@@ -38,7 +39,7 @@ START = f"import runpy, sys\n{WITHOUT_EDITABLE}\nrunpy.run_module(sys.argv.pop(1
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the project with the page's two files; `gated_balls`, which have the page's two methods for gates, and
+    """A copy of the project with the page's two files; `gated_balls`, which have the two methods for gates, and
     `blinks`, which are balls that are said to observe time."""
     project = tmp_path_factory.mktemp("project")
     shutil.copytree(ROOT / "gsbench", project / "gsbench", ignore=shutil.ignore_patterns("moving-matte"))
@@ -52,7 +53,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
         gated = gated.replace("import math\n", "import math\nfrom collections.abc import Sequence\n")
         gated = gated.replace("GaussianModel, Raw\n", "Raw\nfrom gsbench.models.gated import GatedModel\n")
         gated = gated.replace("(GaussianModel)", "(GatedModel, gates=True)")
-        more = "\n" + methods_for_gates() if path.endswith(".py") else ""
+        more = METHODS_FOR_GATES if path.endswith(".py") else ""
         (project / path.replace("balls", "gated_balls")).write_text(gated + more)
     return project
 

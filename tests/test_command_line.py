@@ -18,7 +18,8 @@ from gsbench.usage import DESCRIBED, first_sentence
 
 
 def test_help_describes_what_there_is_without_torch():
-    """Catches a help that imports torch or composes a config, describes no model or experiment, or lists trials."""
+    """Catches a help that imports torch or composes a config, describes no model or experiment, or lists trials, and
+    a long name that moves its sentence out of the column."""
     code = (
         "import sys; sys.argv = ['gsbench', '--help']\n"
         "import hydra._internal.hydra as composer; composer.Hydra.create_main_hydra2 = None\n"
@@ -28,7 +29,8 @@ def test_help_describes_what_there_is_without_torch():
     )
     done = python("-c", code, cwd=ROOT)
     assert done.stderr == "no torch"
-    assert "  4dgs          4DGS (Yang et al. 2023): Gaussians in space and time\n" in done.stdout
+    assert "  4dgs               4DGS (Yang et al. 2023): Gaussians in space and time\n" in done.stdout
+    assert "\n  deformable_narrow  Deformable-3DGS with" in done.stdout
     assert "  mini          The three embedded scenes, on a laptop\n" in done.stdout
     for word in ("suzanne", "+recipe=NAME", "agr=true|false", "gsbench doctor"):
         assert word in done.stdout

@@ -31,11 +31,11 @@ from gsbench.train.hooks import Hook, Training
 from gsbench.train.hooks.choices import Choices
 
 # Largest loss of PSNR on val, in dB, when Gaussians are simplified in training. Of 0.5, 0.2 and 0.1 these are the
-# largest losses from which the rest of the training recovers on every scene tried (docs/effects.md).
+# largest losses from which the rest of the training recovers on every scene tried.
 LOSS_IN_TRAINING = 0.1
 LOSS_WITH_AGR = 0.5
 # A model with fewer Gaussians than this is not simplified in training. With 300 and 600 Gaussians, models of four of
-# five scenes lost 0.2 to 0.5 dB on val by that (docs/tuning.md).
+# five scenes lost 0.2 to 0.5 dB on val by that.
 LEAST_IN_TRAINING = 1_000
 VIEWS_IN_TRAINING = 30  # views from which errors are predicted; more would cost more time than simplification saves
 # AGR's learning rate does not decay by itself. With fewer Gaussians the last steps are then too large: on trex a

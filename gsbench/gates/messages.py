@@ -59,9 +59,9 @@ def _of_gate(gate: Gate) -> str:
     by_effects = ", ".join(f"{gate.rows[name]} {words}" for name, words in EFFECT_SETS.items() if gate.rows.get(name))
     text = f"gate {when}: {left} of {left + gate.rows.get('removed', 0)} Gaussians are left"
     text += f" ({by_effects})" if by_effects else ""
-    text += f"; PSNR on {gate.checked_on} {-gate.measured_db:+.3f} dB"  # a loss as a negative change
+    text += f"; PSNR on {gate.checked_on} {_signed(-gate.measured_db, 3)} dB"  # a loss as a negative change
     if gate.eval_loss_db is not None:
-        text += f", on the evaluated views {-gate.eval_loss_db:+.3f} dB"
+        text += f", on the evaluated views {_signed(-gate.eval_loss_db, 3)} dB"
     if gate.frame_ms_before and gate.frame_ms:
         text += f", a frame {gate.frame_ms_before:.2f} -> {gate.frame_ms:.2f} ms"
     text += f", {gate.bytes_before / 1e6:.2f} -> {gate.bytes / 1e6:.2f} MB"
@@ -73,6 +73,12 @@ def _of_gate(gate: Gate) -> str:
 def _of_direction(direction: Direction) -> str:
     return (
         f"direction: {direction.kept:.0%} of the Gaussians depend on it; if none did, PSNR would change by "
-        f"{-direction.loss_db:+.2f} dB and a frame from {direction.frame_ms:.2f} to "
+        f"{_signed(-direction.loss_db, 2)} dB and a frame from {direction.frame_ms:.2f} to "
         f"{direction.frame_ms_without:.2f} ms"
     )
+
+
+def _signed(value: float, digits: int) -> str:
+    """Write a number with its sign; what rounds to zero has none."""
+    text = f"{value:+.{digits}f}"
+    return text if float(text) else text[1:]

@@ -33,13 +33,18 @@ class NoGaussianError(InputError):
     """A training has pruned all Gaussians."""
 
 
-def trainer_of(model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None) -> Trainer:
-    """Initialise the Gaussians of a model, from trained ones or from points, and return the trainer at step 0."""
+def trainer_of(
+    model: GaussianModel, scene: Scene, config: Config, start: TrainedGaussians | None, *, quiet: bool = False
+) -> Trainer:
+    """Initialise the Gaussians of a model, from trained ones or from points, and return the trainer at step 0.
+
+    With `quiet`, nothing is printed about the points.
+    """
     random = generator(config.seed)
     if start is not None:
         model.start_from(start, scene.extent, random)
     else:
-        model.initialise(initial_points(config.data, scene, random), scene.extent, random)
+        model.initialise(initial_points(config.data, scene, random, quiet=quiet), scene.extent, random)
     model.to(config.device)
     return Trainer(model, scene, evaluated_views(scene, config.scene.eval_split), config)
 
@@ -131,11 +136,11 @@ def _check_fitted(trainer: Trainer) -> None:
         )
 
 
-def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> Points:
+def initial_points(data: DataConfig, scene: Scene, random: torch.Generator, *, quiet: bool = False) -> Points:
     """Return the points of a data set, or sample some in a cube or in the frustum that all cameras share.
 
     The share of sampled points that at least one training camera sees is printed, and that of others if `data.near`
-    hides most of them.
+    hides most of them, unless `quiet`.
 
     Raises:
         InputError: cameras see none of the points beyond `data.near`, or too few of sampled ones.
@@ -146,7 +151,7 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
         where = f"of {len(scene.points.means)} initial points, training cameras see {share:.1%} beyond"
         if share == 0:
             raise InputError(f"{scene.name}: data.near: {where} {data.near:g}: lower it")
-        if share < LEAST_SEEN:
+        if share < LEAST_SEEN and not quiet:
             print(f"{scene.name}: {where} data.near={data.near:g}", file=sys.stderr)
         return scene.points
     if data.initial_half_width is None:
@@ -166,5 +171,6 @@ def initial_points(data: DataConfig, scene: Scene, random: torch.Generator) -> P
             f"{share:.1%}: {near}set data.initial_half_width (cameras are {STANDARD:g} away from what they look "
             f"at), or null for points that all cameras see{axes if away else ''}"
         )
-    print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
+    if not quiet:
+        print(f"{scene.name}: {where}; {share:.0%} are seen by at least one camera", file=sys.stderr)
     return points

@@ -65,10 +65,10 @@ class Candidates:
     start: TrainedGaussians | None  # trained Gaussians to start from; None: start from points
     settings: dict[str, Config]
 
-    def trainer(self, name: str) -> Trainer:
-        """Return the trainer of a candidate at step 0."""
+    def trainer(self, name: str, *, quiet: bool) -> Trainer:
+        """Return the trainer of a candidate at step 0; with `quiet`, nothing is printed about its initial points."""
         config = self.settings[name]
-        return fitting.trainer_of(build(config), self.scene, config, self.start)
+        return fitting.trainer_of(build(config), self.scene, config, self.start, quiet=quiet)
 
     def chosen(self, model: "ChosenModel") -> Trainer:
         """Train the candidates, print which is the best, and return its trainer with the costs of all."""
@@ -105,7 +105,7 @@ class Candidates:
         Raises:
             InputError: the checkpoint is gone or damaged.
         """
-        run, trainer = self._run(chosen.candidate.name), self.trainer(chosen.candidate.name)
+        run, trainer = self._run(chosen.candidate.name), self.trainer(chosen.candidate.name, quiet=True)
         resumed = replace(run, config=replace(run.config, resume=True))  # its checkpoint is of this command
         state = fitting.saved_state(resumed, self.scene)
         if state is None:
@@ -131,7 +131,11 @@ class Candidates:
             InputError: the checkpoint is damaged.
             Stopped: a signal asked the process to end; the checkpoint is saved.
         """
-        spec, run, trainer = self.spec, self._run(name), self.trainer(name)
+        spec, run, trainer = (
+            self.spec,
+            self._run(name),
+            self.trainer(name, quiet=bool(before)),
+        )  # all start from the same points
         done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
         error = frame_ms = None  # frame_ms stays None if the training fails or takes too long
         try:
@@ -296,7 +300,7 @@ def best_on_val(spec: RunSpec, scene: Scene, start: TrainedGaussians | None, mod
         trainer = trainings.chosen(model)
         fitting.save(trainer.state_dict(), spec, scene, plain(spec, trainer.config))
     elif name in settings:
-        trainer = trainings.trainer(name)
+        trainer = trainings.trainer(name, quiet=False)
         fitting.resume(trainer, spec, state)
     else:
         raise InputError(

@@ -51,7 +51,8 @@ def text(exactness: Exactness) -> str:
             for worst in exactness.worst
         ]
         words = dict.fromkeys(word for worst in exactness.worst for word in worst.why)
-        parts += [table(["Gaussian", "view", "pixels", "sum of their bounds", "why"], rows)]
+        titles = ["Gaussian", "view", "pixels", "sum of their bounds", "why"]
+        parts += ["Gaussians that add most to the bounds:", table(titles, rows)]
         parts += ["\n".join(f"{word}: {MEANINGS[word]}." for word in words)] if words else []
     return "\n\n".join([*parts, verdict(exactness)])
 
@@ -97,8 +98,11 @@ def draw(exactness: Exactness, path: Path) -> None:
     scale = LogNorm(*ROUNDING_SCALE)
     for pane, values in zip(axes[1:], (error, STEPS * exact.bound), strict=True):
         drawn = pane.imshow(np.clip(values.numpy(), *ROUNDING_SCALE), norm=scale, cmap="inferno")
-    for pane, title in zip(axes, (f"{exactness.title}, {name}", "error of float32", "bound"), strict=True):
-        pane.set(title=title, xticks=[], yticks=[])
+    for pane, title in zip(axes, (f"{exactness.title}\n{name}", "error of float32", "bound"), strict=True):
+        pane.set_title(
+            title, fontsize=min(12, 450 / max(map(len, title.splitlines())))
+        )  # a long one stays over its pane
+        pane.set(xticks=[], yticks=[])
     figure.colorbar(drawn, ax=axes[1:], label="steps of 8 bits")
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=110)

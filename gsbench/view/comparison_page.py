@@ -37,7 +37,10 @@ input { width: 100%; margin: 0 }
 Errors and differences are means of RGB: black is 0, yellow {{ scale }} or more.</p>
 {% for view, left, right, difference in views %}
 <h2>{{ view.name }}{% if view.time is not none %}, time {{ "%.2f" % view.time }}{% endif %}:
-{{ (right if right.psnr > left.psnr else left).name }} is {{ "%.2f" % (right.psnr - left.psnr) | abs }} dB better</h2>
+{% set ahead = "%.2f" % (right.psnr - left.psnr) | abs %}
+{% if ahead == "0.00" %}equal PSNR
+{% else %}{{ (right if right.psnr > left.psnr else left).name }} is {{ ahead }} dB better
+{% endif %}</h2>
 <section><figure><div class="wipe">{{ picture(left.render, names[0]) }}{{ picture(right.render, names[1]) }}</div>
 <input type="range" value="50" aria-label="border"
 oninput="this.previousElementSibling.style.setProperty('--at', this.value + '%')">

@@ -80,13 +80,13 @@ def trained_of(model: GaussianModel, query: CameraTime, *, keep_harmonics: bool 
     """
     if model.decodes:
         raise InputError(
-            f"expected a model whose Gaussians have colours, {type(model).__name__} decodes features after they are "
-            f"blended, for which a PLY has no field: use --images or --video",
+            "expected a model whose Gaussians have colours, this one decodes features after they are "
+            "blended, for which a PLY has no field: use --images or --video",
             docs="viewing.md#export",
         )
     if keep_harmonics and not has_harmonics(model):
         raise InputError(
-            f"expected --camera I or --direction X,Y,Z: a slice of {type(model).__name__} depends on it",
+            "expected --camera I or --direction X,Y,Z: the model's Gaussians depend on the view direction",
             docs="viewing.md#export",
         )
     with torch.no_grad():

@@ -88,6 +88,12 @@ def test_the_answer_in_words(decision, kept):
     assert of_screen(TimeScreen(decision, "why", None, None, None, 0.0)) == f"time is {decision}{kept}: why"
 
 
+def test_no_change_has_no_sign():
+    """Catches a change of PSNR by "-0.00 dB"."""
+    (line,) = lines(OnDemand(direction=Direction(kept=0.25, loss_db=0.001, frame_ms=2.0, frame_ms_without=1.5)))
+    assert "PSNR would change by 0.00 dB" in line
+
+
 def test_a_gate_in_words():
     """Catches removed Gaussians that count as left, and a loss in PSNR that reads as a gain."""
     rows = {"refined": 1, "conditioned": 2, "static": 3, "removed": 4}

@@ -335,15 +335,16 @@ def test_each_length_is_twice_the_one_before():
     ] == [(18, None), (37, None), (75, None)]
 
 
-def test_the_longest_is_kept_if_each_is_better(square, tmp_path, monkeypatch):
+def test_the_longest_is_kept_if_each_is_better(square, tmp_path, monkeypatch, capsys):
     """Catches trainings that end before the longest although PSNR on val still rises, lengths of another model than
-    the screen of model=auto chose, and seconds of the screen that are lost."""
+    the screen of model=auto chose, seconds of the screen that are lost, and the same points told for each length."""
     for length, loss in ((10, 1.0), (40, -1.0), (80, -2.0)):
         monkeypatch.setitem(LOSS, length, loss)
     monkeypatch.setattr(selection, "screen_time", lambda *_: screen("off", seconds=5.0))
     record, folder = run_here(*overrides(square, tmp_path, *LENGTHS.words, "model=auto"))
     best, _, tried = chosen_in(record)
     assert (best, len(tried)) == ("iterations=80", 4)
+    assert capsys.readouterr().err.count("seen by at least one camera") == 1
     assert not record.effects.time
     assert record.cost.stage_s["screen"] == 5.0
     assert load.load_run(folder).config.model.name == "6dgs"

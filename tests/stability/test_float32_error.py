@@ -42,6 +42,8 @@ changed by float32 | at most |
 | front | 5.0e-01 | 2.5e-04 | 1.0e+00 | 1.2e-01 | 25.00 % | 30.0000 | -1.0e-04 | 2.0e-04 |
 | back | 1.0e-01 | 5.0e-05 | 2.0e-01 | 1.0e-02 | 0.00 % | - | - | - |
 
+Gaussians that add most to the bounds:
+
 | Gaussian | view | pixels | sum of their bounds | why |
 | --- | ---: | ---: | ---: | ---: |
 | 7 | front | 12 | 3.5 | flat, far, huge, opaque, skipped, stopped, order |

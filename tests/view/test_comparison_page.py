@@ -44,7 +44,7 @@ def test_names_are_escaped(folder, other_folder, tmp_path):
 
 
 def test_a_view_rendered_exactly_leaves_the_mean_finite(folder, tmp_path, monkeypatch):
-    """Catches one empty view by which the mean of all is infinite."""
+    """Catches one empty view by which the mean of all is infinite, and a model that is "0.00 dB better"."""
     run = load_run(folder)
     views = evaluated_views(scene_of(run), run.config.scene.eval_split)
     renderer = FrameRenderer(run, "7dgs", 1.0)
@@ -54,6 +54,8 @@ def test_a_view_rendered_exactly_leaves_the_mean_finite(folder, tmp_path, monkey
     text = (tmp_path / "a.html").read_text()
     assert f"{MOST_PSNR:.2f} dB" in text
     assert not re.search(r"\b(inf|nan)\b", text)
+    assert text.count("equal PSNR") == len(views)
+    assert "better" not in text
 
 
 def test_what_cannot_be_compared_is_refused(folder, other_folder, tmp_path):

@@ -228,6 +228,15 @@ def test_images_are_what_the_model_renders(folder):
         assert (cv2.imread(str(file))[:, :, ::-1] == to_bytes(rendered.numpy())).all()
 
 
+def test_a_video_and_images_say_what_they_are(folder, capsys):
+    """Catches files whose size and number only the files tell."""
+    assert exports(folder, "--video", "a.mp4", "--images", "a", "--seconds", "1", "--fps", "2", "--width", "32")
+    assert capsys.readouterr().out.splitlines() == [
+        "a.mp4: 2 frames of 32 x 32 pixels, 2 a second",
+        "a: 2 frames of 32 x 32 pixels",
+    ]
+
+
 def test_images_of_a_longer_clip_are_told(tmp_path, capsys):
     """Catches a clip whose last images are those of an earlier export, in silence."""
     for count, is_told in ((3, False), (2, True), (3, False)):
