@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 from gsbench import usage
 from gsbench.config import CONF, HERE, register_schema
+from gsbench.config_roles import in_order
 from gsbench.errors import InputError, one_line
 from gsbench.launch import command, processes, sweep
 from gsbench.process.ending import end_with
@@ -59,6 +60,7 @@ def _run(parsed: command.Command) -> int:
     """Do the runs of a command line, or let Hydra answer its question about the config; return the exit status."""
     if parsed.asks:
         register_schema()
+        sys.argv[1:] = in_order(sys.argv[1:])
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # makes Hydra raise its errors
         try:
             answer()

@@ -14,6 +14,7 @@ from gsbench.config_key import Key, described
 
 Plain = dict[str, Any]  # a resolved config in plain JSON
 
+ADDED = ("exp", "recipe", "trial", "ablation")  # config groups that a command line adds; a later one replaces values
 OWN_NAMES = ("exp", "model", "scene")  # the config groups that have a place in a run's path
 _MOST_NAMED = 5  # the most differences that a message contains
 
@@ -98,6 +99,20 @@ def launches(override: str) -> bool:
 def key_of(override: str) -> str:
     """Return the dotted key of an override of a command line, such as "seed" of "+seed=3"."""
     return override.partition("=")[0].lstrip("+~")
+
+
+def in_order(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with added configs in the order of ADDED, and then by name.
+
+    So the order in which they were typed does not matter. A record has it no more, and its words repeat the run.
+    """
+
+    def place(word: str) -> tuple[int, str]:
+        name = key_of(word)
+        return (ADDED.index(name), "") if name in ADDED else (len(ADDED), name)
+
+    added = sorted((word for word in words if word.startswith("+")), key=place)
+    return [*added, *(word for word in words if not word.startswith("+"))]
 
 
 def _decided(keys: Plain) -> Plain:

@@ -7,6 +7,7 @@ import argparse
 import copy
 import dataclasses
 import itertools
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gsbench.config import CONF, PATHS, Config, register_schema
-from gsbench.config_roles import config_hash, facts, key_of, names_variant, training_hash
+from gsbench.config_roles import ADDED, config_hash, facts, in_order, key_of, names_variant, training_hash
 from gsbench.errors import InputError, deleted_key, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
 from gsbench.run.settings import check_settings
@@ -91,10 +92,14 @@ def hydra_with(config_dir: Path | None) -> Iterator[None]:
     """Let Hydra compose gsbench's configs, and those of the user, while the block runs.
 
     Raises:
-        InputError: the folder of the user's configs does not exist.
+        InputError: the folder of the user's configs does not exist, or has a file in whose place gsbench's is read.
     """
     if config_dir is not None and not config_dir.is_dir():
-        raise InputError(f"--config-dir: expected a folder of YAML files, got '{config_dir}', which does not exist")
+        raise InputError(f"--config-dir: expected a folder of YAML files, got '{config_dir}', which is none")
+    for own in CONF.rglob("*.yaml") if config_dir else ():
+        file = Path(config_dir or "", own.relative_to(CONF))
+        if file.is_file() and file.read_bytes() != own.read_bytes():
+            raise InputError(f"--config-dir: {file}: expected another name than that of a file of gsbench's: rename it")
     register_schema()
     Plugins.instance().register(UserConfigs)
     UserConfigs.folder = config_dir.absolute() if config_dir else None
@@ -115,6 +120,8 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
         check_override(word)
         name, _, choices = word.lstrip("+").partition("=")
         _check_group(name, choices)
+        if re.split(r"[./]", name.lstrip("~"))[0] == "hydra":
+            raise InputError(f"{name}: expected a key of gsbench's, which reads none of Hydra's own: leave it out")
     parser = OverridesParser.create(GlobalHydra.instance().config_loader())
     pairs = list(map(_values, parser.parse_overrides(command.overrides)))
     values = dict(pairs)
@@ -124,14 +131,18 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
     _check_once([name for name, _ in pairs])
     if "protocol.name" in keys:
         raise InputError("protocol.name: expected protocol=NAME, which sets what is measured too, not its name alone")
-    all_scenes = keys.get("scene", ["scene=all"]) == ["scene=all"] and "exp" in keys  # all is the default
+    scenes = keys.get("scene", ["scene=all"])  # all is the default
+    all_scenes = "scene=all" in scenes and "exp" in keys
+    if all_scenes and len(scenes) > 1:
+        raise InputError("scene: expected all or names of scenes, got both: leave all or the names out")
     base = _compose([words[0] for name, words in values.items() if name != "scene"])
     _check_launcher(list(keys), base.launch)
     axes = [f"{name}={text}" for name, text in (base.hydra.sweeper.params or {}).items()]
+    words_by_key = dict(map(_values, parser.parse_overrides(axes))) | values
+    _check_models(words_by_key)
     if not (command.multirun or all_scenes or axes or base.launch.by != "local"):
         _check_single(values)
-        return [command.overrides], False
-    words_by_key = dict(map(_values, parser.parse_overrides(axes))) | values
+        return [[word for (word,) in values.values()]], False  # of a key that comes twice, the last word
     if all_scenes:
         if not base.data.scenes:
             raise InputError(
@@ -141,6 +152,22 @@ def runs_of(command: Command) -> tuple[list[list[str]], bool]:
         words_by_key.pop("scene", None)  # to be the last
         words_by_key["scene"] = [f"scene={quoted_value(scene)}" for scene in base.data.scenes]
     return [list(run) for run in itertools.product(*words_by_key.values())], True
+
+
+def _check_models(words_by_key: Mapping[str, Sequence[str]]) -> None:
+    """Raise InputError if a model is named beside an added config that chooses one, such as +ablation=time_only."""
+    models = {word.partition("=")[2] for word in words_by_key.get("model", ())}
+    added = [word for name in ADDED[1:] for word in words_by_key.get(f"+{name}", ())]
+    if not models or not added:
+        return
+    experiment = words_by_key.get("+exp", ())
+    default = _compose(experiment).hydra.runtime.choices.model
+    for word in added:
+        chosen = _compose([*experiment, word]).hydra.runtime.choices.model
+        if chosen != default and models != {chosen}:
+            raise InputError(
+                f"{word}: expected no other model beside it than {chosen}, which it chooses: leave one out"
+            )
 
 
 def _check_once(names: Sequence[str]) -> None:
@@ -171,6 +198,8 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
     choices: Any = OmegaConf.to_container(config.hydra.runtime.choices)
     with read_write(config), open_dict(config):
         del config["hydra"]
+        if not (OmegaConf.is_interpolation(config, "results") or OmegaConf.is_missing(config, "results")):
+            config.results = os.path.expanduser(config.results)
     check_complete(config)
     try:
         check_settings(OmegaConf.to_object(_with_paths(config)))  # type: ignore[arg-type]
@@ -231,7 +260,7 @@ def check_complete(config: DictConfig) -> None:
         experiments = ", ".join(sorted(path.stem for path in (CONF / "exp").glob("*.yaml")))
         raise InputError(
             f"expected an experiment: add +exp=NAME, for instance python -m gsbench +exp=mini. Valid: "
-            f"{experiments}. What each is: python -m gsbench --help"
+            f"{experiments}. What each is: python -m gsbench --help. One of your own needs a line experiment: NAME"
         )
     if OmegaConf.is_missing(config.scene, "name"):
         raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
@@ -250,26 +279,41 @@ def explain(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return f"{group} '{name}' is not known. {did_you_mean(name, error.options)}"
-    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    if isinstance(error, UnicodeDecodeError):
+        return f"--config-dir: expected YAML files in UTF-8, one is not: {error}: save it as UTF-8"
+    file = re.match("In '(.+)': ", str(error))  # the error is in this config, and its context is OmegaConf's
+    where, raised = (f"{file[1]}.yaml: ", error.__context__) if file else ("", error.__cause__)
+    cause = raised if isinstance(raised, OmegaConfBaseException) else error
     if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
         keys = [str(key) for key in cause.parent_node] if isinstance(cause.parent_node, DictConfig) else []
+        if file and file[1].split("/")[-2:-1] == [cause.key]:
+            return f"{where}expected `# @package _global_` as its first line, as it has keys of several groups: add it"
         if keys and cause.key not in keys:
-            return f"config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
-        message = str(cause).splitlines()[0]
-        if "is not a subclass of" in message:
-            inner = ", ".join(cause.parent_node[cause.key])
-            return f"config key '{cause.full_key}': expected values of its keys, {inner}, got a value of the group"
-        if message.startswith("Cannot convert 'dict'"):
-            return f"config key '{cause.full_key}': expected a value, it has no keys"
-        return f"config key '{cause.full_key}': {message}"
+            return f"{where}config key '{cause.full_key}' is not known. {did_you_mean(str(cause.key), keys)}"
+        return f"{where}config key '{cause.full_key}': {_explain_value(cause, str(cause).splitlines()[0])}"
     if "is not a subclass of LearningRate" in str(cause):
-        return f"{error}: expected the name of a rate of the model, or a new rate as +model.lr.NAME={{start: 1e-3}}"
-    return " ".join(str(error).split())
+        return (
+            f"{error}: expected the name of a rate of the model, or a new rate as '+model.lr={{NAME: {{start: 1e-3}}}}'"
+        )
+    return " ".join(str(error).split()) + (f": {str(cause).splitlines()[0]}" if cause is not error and not file else "")
+
+
+def _explain_value(error: OmegaConfBaseException, message: str) -> str:
+    """Explain what is wrong with the value of a key that is known, by the first line of OmegaConf's message."""
+    if "is not a subclass of" in message:
+        return f"expected values of its keys, {', '.join(error.parent_node[error.key])}, got a value of the group"
+    if message.startswith("Cannot convert 'dict'"):
+        return "expected a value, it has no keys"
+    if "missing mandatory value" in message:
+        return "expected a value, got none: set it"
+    if message.endswith("is not in struct"):
+        return f"expected + before a key that you add: type +{error.full_key}"
+    return message
 
 
 def _compose(overrides: Sequence[str]) -> DictConfig:
     try:
-        config = compose("config", list(overrides), return_hydra_config=True)
+        config = compose("config", in_order(overrides), return_hydra_config=True)
     except Exception as error:  # Hydra and OmegaConf raise errors of many types for a wrong word
         raise InputError(explain(error)) from None
     for field in dataclasses.fields(Config):

@@ -75,9 +75,11 @@ def import_models(
     except Exception as error:  # whatever the code of another package raises
         place = traceback.extract_tb(error.__traceback__)[-1]  # in importlib if there is no such module
         where = "" if "importlib" in place.filename else f"{Path(place.filename).name}, line {place.lineno}: "
+        is_absent = isinstance(error, ModuleNotFoundError) and error.name == module
+        advice = ": run the command in its folder, or add this to PYTHONPATH" if is_absent else ""
         raise InputError(
             f"{named_by}: expected a Python module that can be imported: {where}"
-            f"{type(error).__name__}: {one_line(error)}",
+            f"{type(error).__name__}: {one_line(error)}{advice}",
             docs="adding_a_model.md",
         ) from None
 

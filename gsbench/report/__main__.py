@@ -35,6 +35,8 @@ def main(arguments: list[str] | None = None) -> int:
     differs = False
     try:
         selection = select.parse(options.select)
+        if options.train and "column" in selection:
+            raise InputError("--train: expected no column= beside it: add psnr_train_db to those of --select")
         results = select.selected(merge.read(options.merge) if options.merge else load(options.results), selection)
         if options.publish:
             print(output.publish(options.results, options.publish))
@@ -142,6 +144,12 @@ def _against(results: Results, options: argparse.Namespace) -> bool:
     """Print and write the comparison with another folder, and return whether PSNR differs."""
     reference = load(options.against)
     _print_faults(reference)
+    same = {path.resolve() for path in results.runs.path} & {path.resolve() for path in reference.runs.path}
+    if same:
+        raise InputError(
+            f"--against {printable(options.against)}: expected other runs than those of {printable(options.results)}, "
+            f"both have {printable(min(same))}, and a run agrees with itself: name another folder"
+        )
     compared = reproduction.compare(results, reference)
     if not _answered_in_json(options, lambda: reproduction.content(compared, results, reference)):
         sections, shown = reproduction.sections(compared, str(options.against)), output.shown_sections(results)

@@ -73,7 +73,7 @@ def records_in(root: Path) -> tuple[Records, list[str]]:
         InputError: the folder is missing or has no record, not even a damaged one.
     """
     if not root.is_dir():
-        raise InputError(f"{root}: expected a folder of results, found none")
+        raise InputError(f"{root}: expected a folder of results, such as results/mini, found none")
     read: Records = []
     faults = []
     for path in record_files.find(root):

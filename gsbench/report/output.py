@@ -6,7 +6,7 @@ from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
 
-from gsbench.errors import InputError, one_line
+from gsbench.errors import InputError, one_line, printable
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.report import contributors, merge, study
@@ -116,10 +116,16 @@ def publish(folder: Path, to: Path) -> str:
     function returns a line that describes the result.
 
     Raises:
-        InputError: a record of either is damaged or a duplicate, a run did not finish, or its code was not a clean git
-            commit; nothing is written.
+        InputError: a record of either is damaged or a duplicate, a run did not finish, its code was not a clean git
+            commit, or `folder` would have each run twice; nothing is written.
     """
     results = load(folder)
+    inner, outer = to.resolve(), folder.resolve()
+    if inner.is_relative_to(outer) and files.PUBLISHED not in inner.relative_to(outer).parts:
+        raise InputError(
+            f"--publish {printable(to)}: expected a folder outside of {printable(folder)}, whose report would have "
+            f"each run twice: name another, or one in {printable(folder / files.PUBLISHED)}, which reports pass by"
+        )
     earlier = load(to) if (to / study.RUNS_FILE).exists() else None
     faults = [*results.faults, *(earlier.faults if earlier else ())]
     for record in results.runs.record:

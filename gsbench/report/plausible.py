@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from gsbench.config_roles import flat
 from gsbench.errors import InputError
 from gsbench.measure import record as files
 from gsbench.measure.exact_views import MOST_PSNR
@@ -29,6 +30,13 @@ RANGES = (  # of a number by its name; the first pattern that fits counts
     ("z", -math.inf, math.inf),
     (".*", 0.0, 1e15),  # seconds, counts, bytes, shares
 )
+NAMES = {  # what names a run, and the same in its settings
+    "experiment": "experiment",
+    "dataset": "data.dataset",
+    "scene": "scene.name",
+    "model": "model.name",  # without _agr or _noagr
+    "seed": "seed",
+}
 Views = Mapping[str, frozenset[str]]  # names of views by data and settings
 OF_PIXELS = ("psnr_moving", "psnr_object")  # views without such pixels have none
 ROUNDING = 1e-6  # by which a mean may differ from that of its views, and a sum from its parts, relative to it
@@ -87,7 +95,19 @@ def _implausible(record: Record) -> str:
         low, high = _range(place.rpartition(".")[2])
         if not low <= number <= high:
             return f"{place}: expected {low:g} to {high:g}, got {number:g}"
-    return _of_views(record) or _of_seconds(record)
+    return _of_names(record) or _of_views(record) or _of_seconds(record)
+
+
+def _of_names(record: Record) -> str:
+    """Return which name of a record is not that of its settings; "" if all are."""
+    settings = dict(flat(record.provenance.config))
+    for name, key in NAMES.items():
+        here, there = (str(value) for value in (getattr(record, name), settings.get(key)))
+        if name == "model":
+            here, there = (text.removesuffix("_noagr").removesuffix("_agr") for text in (here, there))
+        if key in settings and here != there and not (name == "model" and record.rendered_elsewhere):
+            return f"{name}: expected {there:.80}, as in provenance.config, got {here:.80}"
+    return ""
 
 
 def _of_views(record: Record) -> str:
@@ -124,6 +144,8 @@ def _of_seconds(record: Record) -> str:
     for place, (number, expected, rule) in follow.items():
         if number is not None and expected is not None and not abs(number - expected) <= ROUNDING * expected:
             return f"{place}: expected {expected:g}, the {rule}, got {number:g}"
+    if ends and cost.train_s is not None and ends[-1] > cost.train_s * (1 + ROUNDING):
+        return f"curve: expected at most {cost.train_s:g} seconds, as cost.train_s, got {ends[-1]:g}"
     return ""
 
 

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gsbench.errors import InputError, printable
+from gsbench.errors import InputError, did_you_mean, printable
 from gsbench.measure import record as files
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import Record
@@ -74,8 +74,8 @@ def read(folder: Path) -> tuple[list[Record], list[str]]:
         InputError: a file is missing or damaged, or the files are not of one study.
     """
     runs = _rows(read_file(folder / RUNS_FILE, str(folder / RUNS_FILE), MAX_TABLE), folder / RUNS_FILE)
-    views = _rows(_unpacked(folder / VIEWS_FILE), folder / VIEWS_FILE)
-    curves = _rows(_unpacked(folder / CURVES_FILE), folder / CURVES_FILE)
+    views = _rows(_unpacked(folder / VIEWS_FILE), folder / VIEWS_FILE, ("view", *VIEWS))
+    curves = _rows(_unpacked(folder / CURVES_FILE), folder / CURVES_FILE, CURVES)
     records, faults = [], []
     for result in _records(runs, views, curves, str(folder / RUNS_FILE)):
         if isinstance(result, Record):
@@ -176,14 +176,19 @@ def _csv(rows: list[Row], columns: list[str]) -> bytes:
     return file.getvalue().encode()
 
 
-def _rows(data: bytes, path: Path) -> list[Row]:
-    """Return the rows of a CSV file, in which every row has all cells."""
+def _rows(data: bytes, path: Path, known: Iterable[str] = ()) -> list[Row]:
+    """Return the rows of a CSV file, in which every row has all cells; `known`: all columns that it may have."""
     try:
-        columns, *rows = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        lines = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        columns, *rows = list(lines) or [[]]
         if len(set(columns)) < len(columns):
             raise ValueError("two columns have one name")
         if "run" not in columns:
             raise ValueError("no column is named run: are cells separated by commas?")
+        if known and (others := set(columns) - {"run", *known}):
+            raise ValueError(f"column {min(others)[:80]!a} is not known. {did_you_mean(min(others), known)}")
+        if short := [n for n, row in enumerate(rows, 2) if len(row) != len(columns)]:
+            raise ValueError(f"row {short[0]} has not the {len(columns)} cells of the first")
         return [dict(zip(columns, row, strict=True)) for row in rows]
     except (ValueError, csv.Error) as error:  # also bad UTF-8, and a row with another number of cells
         raise InputError(f"{path}: expected a CSV table: {error}") from None

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsbench.config import CONF, Config
-from gsbench.config_roles import OWN_NAMES, Plain, flat, names_variant, recorded, repeating, training_keys
+from gsbench.config_roles import OWN_NAMES, Plain, flat, in_order, names_variant, recorded, repeating, training_keys
 from gsbench.errors import InputError, deleted_key
 from gsbench.measure import record as records
 from gsbench.reading import read_file
@@ -78,7 +79,7 @@ def hash_of(ply: str) -> str:
     Raises:
         InputError: the file cannot be read.
     """
-    return digest(read_file(Path(ply).expanduser(), f"init.ply={ply!a:.200}", MAX_FILE))
+    return digest(read_file(Path(os.path.expanduser(ply)), f"init.ply={ply!a:.200}", MAX_FILE))
 
 
 def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
@@ -101,7 +102,7 @@ def name_variant(plain: Plain, choices: Mapping[str, str]) -> str:
     ]
     base += [f"seed={plain['seed']}", f"agr={str(plain['agr']).lower()}"]
     base += [f"scene.name={quoted_value(plain['scene']['name'])}"]
-    before = dict(flat(OmegaConf.to_container(hydra.compose("config", base), resolve=True)))  # type: ignore[arg-type]
+    before = dict(flat(OmegaConf.to_container(hydra.compose("config", in_order(base)), resolve=True)))  # type: ignore[arg-type]
     after = dict(flat(plain))
     for key in before:
         if key.startswith("model.") and key not in after:

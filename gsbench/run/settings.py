@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -178,4 +179,4 @@ def label_of(config: Config) -> str:
 def lpips_weights(config: Config) -> dict[str, Path]:
     """Return the weight files of LPIPS networks in the settings, by network ("alex", "vgg")."""
     files = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
-    return {backbone: Path(file).expanduser() for backbone, file in files.items() if file}
+    return {backbone: Path(os.path.expanduser(file)) for backbone, file in files.items() if file}

@@ -1,6 +1,7 @@
 """Build the model and load the scene that settings name, and check that they and this machine can do the run."""
 
 import importlib.resources
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -139,7 +140,7 @@ def data_root(root: str) -> Path:
     if "\0" in root:
         raise InputError(f"data.root: expected a path, got {root!r:.200}")
     if not root.startswith(PACKAGE):
-        return Path(root).expanduser()
+        return Path(os.path.expanduser(root))
     try:
         return Path(str(importlib.resources.files(root.removeprefix(PACKAGE))))
     except (ImportError, ValueError, TypeError) as error:
@@ -157,7 +158,7 @@ def trained_start(config: Config) -> TrainedGaussians | None:
         if config.init.ply_sha256 is not None:
             raise InputError("init.ply_sha256: expected it beside init.ply, got no file: add +init.ply=FILE")
         return None
-    path = Path(config.init.ply).expanduser()
+    path = Path(os.path.expanduser(config.init.ply))
     trained = read_trained(path)
     if len(trained) < LEAST_GAUSSIANS:
         raise InputError(f"{path}: expected at least {LEAST_GAUSSIANS} Gaussians, found {len(trained)}")

@@ -2,16 +2,20 @@
 
 import functools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
+from tiny_run import main_here
 
 from gsbench.config import CONF
 from gsbench.config_roles import flat
 from gsbench.errors import InputError
 from gsbench.launch.command import check_runs, compose_run, hydra_with, parse, runs_of
 from gsbench.launch.plan import identity
+from gsbench.run.identity import identify
 
 JOB = "+exp=mini scene=suzanne +launch=slurm"
 MINI = ("moving-matte", "pendulum", "suzanne")
@@ -86,6 +90,17 @@ def test_the_runs_of_a_command(words, runs):
         ("+exp=mini data.scenes=[new] scene=newer", "scene 'newer' is not known"),
         ("+exp=mini scene.name=suzanne", "one run in one folder: .* scene=moving-matte' and .*: add scene=custom"),
         ("+exp=mini -m scene=dust data.root=a,b", "one run in one folder: .*: leave one of them out"),
+        ("+exp=mini -m scene=all,dust", "scene: expected all or names of scenes, got both"),
+        ("+exp=mini scene=dust hydra.run.dir=x", "hydra.run.dir: expected a key of gsbench's"),
+        ("+exp=mini scene=dust hydra/launcher=basic", "hydra/launcher: expected a key of gsbench's"),
+        (
+            "+exp=mini scene=dust +ablation=time_only model=7dgs",
+            "time_only: expected no other model beside it than 4dgs",
+        ),
+        ("+exp=ablation scene=dust model=6dgs", "time_only: expected no other model beside it than 4dgs"),
+        ("+exp=mini scene=dust train.coarse=[4,300]", r"coarse=\[4,300\]: Invalid value assigned: int is not"),
+        ("+exp=mini scene=dust ~protocol", "'protocol.name': expected a value, got none: set it"),
+        (f"{JOB} launch.sbatch.qos=x", r"'launch.sbatch.qos': expected \+ .*: type \+launch.sbatch.qos"),
         *(
             (f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d")
             for word in (
@@ -103,7 +118,8 @@ def test_the_runs_of_a_command(words, runs):
 def test_a_command_without_runs_is_refused(words, message):
     """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
     silence, a key without the one that it needs, a scene that is no scene, one folder that several runs share, and a
-    job that is submitted and fails, or is never requeued, for a number out of its range."""
+    job that is submitted and fails, or is never requeued, for a number out of its range; an ablation without its model,
+    and a scene called all."""
     with pytest.raises(InputError, match=message):
         check_runs([compose_run(run) for run in runs_of(parse(words.split()))[0]])
 
@@ -114,6 +130,35 @@ def test_a_sweep_of_different_runs_is_allowed():
     for words in several:
         runs = runs_of(parse(["+exp=mini", "-m", "scene=dust", *words.split()]))[0]
         check_runs([compose_run(run) for run in runs])
+
+
+def composed(*words: str) -> dict[str, Any]:
+    """The settings of the one run of a command."""
+    (run,), _ = runs_of(parse(["+exp=mini", "scene=dust", *words]))
+    return dict(flat(OmegaConf.to_container(compose_run(run).config, resolve=True)))
+
+
+def test_the_order_of_words_does_not_matter(capsys):
+    """Catches an experiment that takes back what a recipe says, as it was typed last, and a record, whose words are
+    sorted, that repeats another run: that of a recipe which takes an ablation back, or of the first of two seeds."""
+    for added in ("+recipe=quick", "+ablation=row_scaled +recipe=paper"):
+        words = ["+exp=mini", "scene=dust", *added.split()]
+        first, second = (compose_run(order) for order in (words, words[::-1]))
+        assert first.config == second.config
+        assert identify(first.config, first.choices).variant == added.replace("+", "").replace(" ", ",")
+    assert first.config.model.options.off_diagonal == "row_scaled"
+    assert main_here("+recipe=quick", "+exp=mini", "scene=dust", "--cfg", "job") == 0
+    assert "  iterations: 7500\n" in capsys.readouterr().out
+    with hydra_with(None):
+        assert runs_of(parse(["seed=2", "+exp=mini", "scene=dust", "seed=1"]))[0] == [
+            ["seed=1", "+exp=mini", "scene=dust"]
+        ]
+
+
+def test_what_a_message_advises_works():
+    """Catches a new rate that the advised words do not add, and a home that is a folder called ~ in this one."""
+    assert composed("+model.lr={new: {start: 1e-3}}")["model.lr.new.start"] == 1e-3
+    assert composed("results='~/a b'")["results"] == str(Path.home() / "a b")
 
 
 def test_a_question_is_left_to_hydra():
@@ -128,18 +173,48 @@ def test_scenes_of_the_user_are_choices():
 
 def test_configs_of_the_user_are_found_in_their_folder(tmp_path):
     """Catches --config-dir that is read for the help alone, that stays for the next command, or that is mistyped."""
-    from hydra.core.global_hydra import GlobalHydra
-
     (tmp_path / "launch").mkdir()
     (tmp_path / "launch" / "cluster.yaml").write_text("# @package _global_\nlaunch: {by: slurm, partition: gpu}\n")
     words = ["+exp=mini", "scene=suzanne", "+launch=cluster"]
     GlobalHydra.instance().clear()
     with hydra_with(tmp_path):
         assert compose_run(words).config.launch.partition == "gpu"
-    with pytest.raises(InputError, match="which does not exist"), hydra_with(tmp_path / "none"):
+    with pytest.raises(InputError, match="which is none"), hydra_with(tmp_path / "none"):
         pass
     with hydra_with(None), pytest.raises(InputError, match="launch 'cluster' is not known"):
         compose_run(words)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"name: x\nsh_degre: 2\n", r"^model/mine.yaml: config key 'model.sh_degre' is not known. Did you mean 'sh_d"),
+        (b"name: x\nlr: {a: {start: fast}}\n", r"^model/mine.yaml: config key 'model.lr.a.start': Value 'fast' of"),
+        (b"model: {name: x}\n", r"^model/mine.yaml: expected `# @package _global_` as its first line"),
+        ("name: x\n".encode("utf-16"), r"^--config-dir: expected YAML files in UTF-8"),
+    ],
+)
+def test_a_wrong_config_of_the_user_is_explained(content, message, tmp_path):
+    """Catches lines of OmegaConf's without the key that was meant, or the line that is missing."""
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "mine.yaml").write_bytes(content)
+    GlobalHydra.instance().clear()
+    with hydra_with(tmp_path), pytest.raises(InputError, match=message):
+        compose_run(["+exp=mini", "scene=dust", "model=mine"])
+
+
+def test_a_config_of_the_user_is_not_passed_by(tmp_path):
+    """Catches an edited copy of a model's YAML in whose place gsbench's own was read, without a word."""
+    name = Path("model", "7dgs.yaml")
+    (tmp_path / "model").mkdir()
+    (tmp_path / name).write_bytes((CONF / name).read_bytes())
+    GlobalHydra.instance().clear()
+    with hydra_with(tmp_path):
+        pass
+    with (tmp_path / name).open("a") as file:
+        file.write("sh_degree: 0\n")
+    with pytest.raises(InputError, match=r"model/7dgs.yaml: expected another name than"), hydra_with(tmp_path):
+        pass
 
 
 @functools.cache

@@ -93,7 +93,11 @@ def test_a_name_that_is_taken(folder):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "model.module='models_of_none': expected a Python module that can be imported: ModuleNotFoundError"),
+        (
+            None,
+            "model.module='models_of_none': expected a Python module that can be imported: ModuleNotFoundError: "
+            "No module named 'models_of_none': run the command in its folder",
+        ),
         ("x = 1\ny = x / 0\n", "models_of_none.py, line 2: ZeroDivisionError"),
         ("def broken(:\n", "SyntaxError"),
     ],

@@ -386,6 +386,8 @@ def test_other_forms_are_printed_and_nothing_is_written(folder, tmp_path, capsys
     assert (row["psnr_db"], row["seeds"]) == (25.5, 2)
     assert [run["seed"] for run in of["runs"]].count(2) == 1
     assert {run["data_hash"][:4] for run in of["runs"]} == {"5e5e", "3a3a"}
+    assert main([str(folder), "--train", "--select", "column=psnr_db"]) == 2
+    assert "--train: expected no column= beside it" in capsys.readouterr().err
     assert main([str(folder), "--json", str(tmp_path / "x.json")]) == 0
     assert json.loads((tmp_path / "x.json").read_text()) == of
     assert (folder / "report.html").exists()

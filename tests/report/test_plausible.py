@@ -54,6 +54,10 @@ GATED = on_demand([make(seed=9)])[0]
             "cost.fps: expected 20, the 1000 / render_ms.p50, got 200",
         ),
         (replace(RUN, curve=[CURVE[0], CURVE[1]._replace(seconds=4.0)]), "curve: expected rising seconds"),
+        (replace(RUN, curve=[Point(1000, 91.0, 20.0)]), "curve: expected at most 90 seconds, as cost.train_s, got 91"),
+        (but(RUN, provenance={"config": {"seed": 3}}), "seed: expected 3, as in provenance.config, got 9"),
+        (but(RUN, provenance={"config": {"model": {"name": "4dgs"}}}), "model: expected 4dgs, as in provenance.config"),
+        (but(RUN, provenance={"config": {"data": {"dataset": "x"}}}), "dataset: expected x, as in provenance.config"),
         (replace(RUN, stop=Stop(-5, 1)), "stop.iteration: expected 0 to 1e+15, got -5"),
         (replace(RUN, length_choice=LengthChoice(-5, [])), "length_choice.kept: expected 0 to 1e+15, got -5"),
         (replace(RUN, regions={"moving": Region("masks", -5, 0.1, "")}), "regions.moving.views: expected 0 to"),
@@ -94,7 +98,8 @@ def test_views_that_other_runs_have_must_not_be_missing(tmp_path):
 
 
 def test_what_can_be_is_kept(tmp_path):
-    """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a negative z."""
+    """Catches a range that is too narrow: views without such pixels, a removal that gains PSNR, a negative z,
+    AGR in a name."""
     screen = replace(GATED.on_demand.screen, z=-1.7)
     gained = but(GATED, on_demand={"gates": [replace(GATED.on_demand.gates[0], measured_db=-0.3)], "screen": screen})
     moving = replace(
@@ -102,4 +107,9 @@ def test_what_can_be_is_kept(tmp_path):
         per_view=[replace(FIRST, psnr_moving=20.0), SECOND],
         seed=1,
     )
-    assert all(load(write_all([r], tmp_path / str(r.seed))).faults == () for r in (gained, moving))
+    named = but(make("7dgs_noagr", seed=2), provenance={"config": {"seed": 2, "model": {"name": "7dgs"}}})
+    other = replace(
+        elsewhere(replace(RUN, seed=3), "other"),
+        provenance=replace(named.provenance, config={"model": {"name": "7dgs"}}),
+    )
+    assert all(load(write_all([r], tmp_path / str(r.seed))).faults == () for r in (gained, moving, named, other))

@@ -219,9 +219,13 @@ def test_the_command(tmp_path, capsys):
     assert f"Against {reference}" in (new / "report.html").read_text()
     assert {path: path.read_bytes() for path in reference.rglob("*") if path.is_file()} == before
     hostile = {"provenance": {"device": "\x1b[31m\nowned"}, "dataset": "x\x1b\ny"}
-    write_all(runs(0, change=lambda r: but(moved(r, 2.0), **hostile)), tmp_path / "ours")
-    assert main([str(new), "--against", str(new)]) == 0
+    for name in ("ours", "same"):
+        write_all(runs(0, change=lambda r: but(moved(r, 2.0), **hostile)), tmp_path / name)
+    assert main([str(new), "--against", str(tmp_path / "same")]) == 0
     assert "\x1b" not in capsys.readouterr().out
+    for folder in (new, tmp_path / "ours"):
+        assert main([str(new), "--against", str(folder)]) == 2
+        assert "expected other runs than those of" in capsys.readouterr().err
     write_all(runs(0, change=by(2.0)), tmp_path / "ours")
     assert main(words) == 1
     rows = [row for row in json.loads((tmp_path / "a.json").read_text())["rows"] if row["quantity"] == "psnr_db"]

@@ -82,6 +82,9 @@ def packed(name: str, text: bytes) -> Callable[[Path], object]:
         (lambda folder: (folder / study.VIEWS_FILE).unlink(), "views.csv.gz: expected a file"),
         (lambda folder: (folder / study.VIEWS_FILE).write_bytes(b"no"), "views.csv.gz: expected a gzip file"),
         (packed(study.CURVES_FILE, b"run\n99\n"), "expected the run '99'"),
+        (packed(study.CURVES_FILE, b"run,psnr\n"), "column 'psnr' is not known. Did you mean 'psnr_val_db'?"),
+        (packed(study.VIEWS_FILE, b"run,view\n0\n"), "views.csv.gz: expected a CSV table: row 2 has not the 2 cells"),
+        (lambda folder: (folder / study.RUNS_FILE).write_bytes(b""), "no column is named run"),
         (packed(study.CURVES_FILE, b"\xff"), "curves.csv.gz: expected a CSV table"),
         (packed(study.CURVES_FILE, b"0" * (study.MAX_TABLE + 1)), "expected one whole gzip file of at most"),
         (edited("\n1,", "\n0,"), "run: expected another number in each row"),
@@ -120,6 +123,12 @@ def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_p
         with pytest.raises(InputError, match="expected finished runs of clean commits"):
             published(bad)
     assert {path: path.read_bytes() for path in to.iterdir()} == before
+    for inside in (folder, folder / "x"):
+        with pytest.raises(InputError, match="expected a folder outside of"):
+            publish(folder, inside)
+    files.write(make(), folder / "3" / files.FILE_NAME)
+    (folder / "0" / files.FILE_NAME).unlink()
+    assert "3 runs in" in publish(folder, folder / files.PUBLISHED / "x")
 
 
 def test_a_study_that_a_spreadsheet_saved_is_read(tmp_path):
