@@ -97,7 +97,11 @@ def launch(configs: Sequence["RunConfig"], planned: Plan, folder: Path) -> None:
     if isinstance(answer, str) or answer.returncode:
         reason = answer if isinstance(answer, str) else answer.stderr
         raise InputError(f"Slurm refused the jobs: {printable(' '.join(reason.split()))}")
-    job = answer.stdout.strip().partition(";")[0]
+    job = (answer.stdout.split() or [""])[-1].partition(";")[0]  # lines of the cluster's own may come first
+    if not job.isdigit():
+        raise InputError(
+            f"sbatch --parsable: expected the number of a job, got {printable(answer.stdout)!r:.80}: squeue lists jobs"
+        )
     plan.write(replace(planned, job=job), folder)
     while (waiting := queue([job])).states or waiting.silent:
         time.sleep(POLL)
@@ -174,8 +178,9 @@ def queue(jobs: Iterable[str]) -> Queue:
     if answer.returncode and "Invalid job id" not in answer.stderr:
         return Queue({}, (answer.stderr.splitlines() or ["squeue failed without a message"])[-1])
     states = {}
-    for line in answer.stdout.splitlines():
-        job, task, state, reason = line.split(maxsplit=3)
+    lines = [line for line in answer.stdout.splitlines() if line[:1].isdigit()]  # of jobs; not "CLUSTER: east"
+    for job, task, state, *reasons in (line.split(maxsplit=3) for line in lines):
+        reason = "".join(reasons)
         states[job if task == "N/A" else f"{job}_{task}"] = f"{state} {reason}" if state == "PENDING" else state
     return Queue(states)
 

@@ -57,9 +57,19 @@ def write(records: Iterable[Record], folder: Path) -> None:
             raise InputError(f"{folder}: {old.path}: expected a record that tables can hold, got {new}"[:500])
     first = ["run", *_BY_NAME]
     rest = sorted({name for run in runs for name in run} - set(first))
-    write_atomically(folder / RUNS_FILE, _csv(runs, first + rest))
+    tables = {RUNS_FILE: _csv(runs, first + rest)}
     for name, rows, columns in ((VIEWS_FILE, views, ["view", *VIEWS]), (CURVES_FILE, curves, list(CURVES))):
-        write_atomically(folder / name, gzip.compress(_csv(rows, ["run", *columns]), mtime=0))
+        tables[name] = gzip.compress(_csv(rows, ["run", *columns]), mtime=0)
+    new = {folder / f"{name}.new": table for name, table in tables.items()}
+    try:  # all before the first is replaced: an earlier study stays whole if the disk is full
+        for path, table in new.items():
+            write_atomically(path, table)
+    except BaseException:
+        for path in new:
+            path.unlink(missing_ok=True)
+        raise
+    for path in new:
+        path.replace(path.with_suffix(""))
 
 
 def find(root: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import stat
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -77,6 +78,10 @@ def read(path: Path, device: str = "cpu") -> Checkpoint:
             payload = file.read()
         if digest != hashlib.sha256(payload).hexdigest().encode() + b"\n":
             raise _fault(path, "a damaged one: its SHA-256 is not the one written with it")
+        with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > len(payload):  # a few bytes could fill the memory; torch.save packs nothing
+            raise _fault(path, f"one that is packed, of {size} bytes")
         plain = torch.load(io.BytesIO(payload), map_location=device, weights_only=True)
         check_plain(plain, len(payload))
         content = Checkpoint(**plain)

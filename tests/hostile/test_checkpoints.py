@@ -187,6 +187,19 @@ def test_any_byte_of_a_pickle_is_one_line(folder, tmp_path):
         is_refused(tmp_path, f"case {case}")
 
 
+def test_a_packed_checkpoint_is_not_unpacked(tmp_path):
+    """Catches a file that fills a thousand times its size of memory before its tensors are checked."""
+    buffer, packed = io.BytesIO(), io.BytesIO()
+    torch.save({"training": "", "data": "", "state": {"x": torch.zeros(10**6)}}, buffer)
+    with zipfile.ZipFile(buffer) as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as other:
+        for name in archive.namelist():
+            other.writestr(name, archive.read(name))
+    digest = hashlib.sha256(packed.getbuffer()).hexdigest().encode()
+    (tmp_path / "x.pt").write_bytes(b"".join((checkpoint.MAGIC, digest, b"\n", packed.getvalue())))
+    with pytest.raises(InputError, match="got one that is packed, of 4000"):
+        checkpoint.read(tmp_path / "x.pt")
+
+
 def test_a_checkpoint_names_no_package_to_import(folder, tmp_path, monkeypatch):
     """Catches data.root=pkg://MODULE of a checkpoint, which imported that module, and names that leave the data."""
     (tmp_path / "evil").mkdir()

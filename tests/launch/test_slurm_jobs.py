@@ -12,7 +12,7 @@ import pytest
 from tiny_run import ROOT, gsbench, overrides
 
 from gsbench.errors import InputError
-from gsbench.launch import plan, processes, status
+from gsbench.launch import plan, processes, slurm, status
 from gsbench.launch.__main__ import main
 from gsbench.launch.command import RunConfig, compose_run, hydra_with
 from gsbench.launch.plan import Ended, Plan
@@ -159,6 +159,25 @@ def test_a_missing_image_is_named_before_anything_is_submitted(log, tmp_path, mo
     assert message in capsys.readouterr().err
     assert not (log / "sbatch").exists()
     assert [path.parent for path in plan.find(tmp_path / "mini")] == [folder]
+
+
+def test_what_a_cluster_prints_besides_is_passed_by(log, tmp_path):
+    """Catches a stack trace, or jobs that nobody waits for, where SLURM_CLUSTERS or a site's own sbatch adds a line."""
+    squeue, sbatch = (log.with_name("fakes") / name for name in ("squeue", "sbatch"))
+    squeue.write_text("#!/bin/bash\necho 'CLUSTER: east'\necho '7 0 PENDING Priority'\necho '7 1 RUNNING'\n")
+    assert slurm.queue(["7_0"]).states == {"7_0": "PENDING Priority", "7_1": "RUNNING"}
+    with hydra_with(None):
+        configs = [compose_run(["+exp=mini", "scene=suzanne", "+launch=slurm"])]
+    (tmp_path / "job").mkdir()
+    for printed, job in (("Welcome to east\\n7;east", "7"), ("Welcome", None)):
+        sbatch.write_text(f"#!/bin/bash\nprintf '{printed}\\n'\n")
+        squeue.write_text('#!/bin/bash\n[ "$4" = 7 ] || echo "7 0 RUNNING"\n')
+        if job is None:
+            with pytest.raises(InputError, match="expected the number of a job, got 'Welcome"):
+                slurm.launch(configs, Plan("slurm", []), tmp_path / "job")
+        else:
+            slurm.launch(configs, Plan("slurm", []), tmp_path / "job")
+            assert plan.read(tmp_path / "job" / plan.FILE_NAME).job == job
 
 
 @pytest.mark.parametrize("name", ["a,b", "a:b"])

@@ -1,5 +1,6 @@
 """Published studies: three tables that give back every record as it was, and refuse what no study has written."""
 
+import errno
 import gzip
 from collections.abc import Callable
 from pathlib import Path
@@ -129,6 +130,22 @@ def test_a_run_is_published_once_and_only_if_it_finished_on_a_clean_commit(tmp_p
     files.write(make(), folder / "3" / files.FILE_NAME)
     (folder / "0" / files.FILE_NAME).unlink()
     assert "3 runs in" in publish(folder, folder / files.PUBLISHED / "x")
+
+
+def test_a_full_disk_leaves_the_earlier_study_whole(tmp_path, monkeypatch):
+    """Catches new runs beside the views of before, which are in no table any more."""
+
+    def full(path: Path, data: bytes) -> None:
+        if path.name.startswith(study.CURVES_FILE):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        path.write_bytes(data)
+
+    study.write([make()], tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(study, "write_atomically", full)
+    with pytest.raises(OSError, match="No space"):
+        study.write(hard(), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_study_that_a_spreadsheet_saved_is_read(tmp_path):
