@@ -60,15 +60,15 @@ def write(records: Iterable[Record], folder: Path) -> None:
     tables = {RUNS_FILE: _csv(runs, first + rest)}
     for name, rows, columns in ((VIEWS_FILE, views, ["view", *VIEWS]), (CURVES_FILE, curves, list(CURVES))):
         tables[name] = gzip.compress(_csv(rows, ["run", *columns]), mtime=0)
-    new = {folder / f"{name}.new": table for name, table in tables.items()}
+    files_beside = {folder / f"{name}.new": table for name, table in tables.items()}
     try:  # all before the first is replaced: an earlier study stays whole if the disk is full
-        for path, table in new.items():
+        for path, table in files_beside.items():
             write_atomically(path, table)
     except BaseException:
-        for path in new:
+        for path in files_beside:
             path.unlink(missing_ok=True)
         raise
-    for path in new:
+    for path in files_beside:
         path.replace(path.with_suffix(""))
 
 
