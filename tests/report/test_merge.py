@@ -47,7 +47,7 @@ def test_runs_of_other_people_commits_and_machines_are_rows_of_their_own(tmp_pat
     """Catches a mean over two people, two commits or two machines, seconds that are lost or ranked across machines, a
     row without its commit or machine, an average over other scenes than a row beside it has, and a variant in every
     name that all share."""
-    bob = runs_of("7dgs", 28.0, provenance=OTHER_COMMIT | {"device": "GPU"}, cost={"train_s": 6.0})
+    bob = runs_of("7dgs", 28.0, provenance=OTHER_COMMIT | {"device": "GPU"}, cost={"train_s": 6.0}, curve=[])
     bob = [r for r in bob if r.scene == "suzanne"]
     carol = runs_of("7dgs", 30.0)
     carol[0] = but(carol[0], provenance=OTHER_COMMIT)
@@ -95,7 +95,7 @@ def test_protocols_and_data_are_told_apart(tmp_path):
 def test_a_run_that_two_publish_counts_once_and_other_numbers_are_told(tmp_path):
     """Catches a run that counts twice or hides one of other numbers, and a repetition that passes for the same run."""
     first, second, third = runs_of("4dgs", 24.0)[:3]
-    elsewhere_run = but(second, provenance={"device": "GPU"}, cost={"train_s": 1.0})
+    elsewhere_run = but(second, provenance={"device": "GPU"}, cost={"train_s": 100.0})
     forged = but(third, metrics={"ssim": 0.95})
     forged = dataclasses.replace(forged, per_view=[dataclasses.replace(v, ssim=0.95) for v in forged.per_view])
     longer = but(
