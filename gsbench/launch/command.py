@@ -96,9 +96,9 @@ def hydra_with(config_dir: Path | None) -> Iterator[None]:
     """
     if config_dir is not None and not config_dir.is_dir():
         raise InputError(f"--config-dir: expected a folder of YAML files, got '{config_dir}', which is none")
-    for own in CONF.rglob("*.yaml") if config_dir else ():
-        file = Path(config_dir or "", own.relative_to(CONF))
-        if file.is_file() and file.read_bytes() != own.read_bytes():
+    for shipped in CONF.rglob("*.yaml") if config_dir else ():
+        file = Path(config_dir or "", shipped.relative_to(CONF))
+        if file.is_file() and file.read_bytes() != shipped.read_bytes():
             raise InputError(f"--config-dir: {file}: expected another name than that of a file of gsbench's: rename it")
     register_schema()
     Plugins.instance().register(UserConfigs)
