@@ -67,6 +67,12 @@ def test_the_clip_is_played_and_time_is_frozen(page, monkeypatch):
     page.set("play", False)
 
 
+def test_controls_whose_names_do_not_suffice_have_hints(page):
+    """Catches a control that nothing explains."""
+    labels = ("reset", "save image", "freeze time", "freeze direction", "harmonics", "colours", "background")
+    assert [label for label in labels if not page.control(label).hint] == []
+
+
 def test_effects_are_switched_off_and_on(page):
     """Catches a switch without effect or that cannot be undone, and a frozen direction that follows the camera."""
     start = page.look(fov=0.7, image_width=64, image_height=65)
