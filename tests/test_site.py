@@ -29,7 +29,7 @@ LOADED = re.compile(r'<(?:link\b[^>]*?\shref|[a-z]+\b[^>]*?\ssrc)="([^"]*)"')  #
 DEAD = "http://127.0.0.1:9"  # a proxy that nothing listens at
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/models.md", "docs/config.md", "docs/results.md"])
+@pytest.mark.parametrize("page", tables.TABLES)
 def test_a_page_is_what_code_and_records_say(page):
     """Catches a model, a key, a default or a published record that was changed without its page."""
     assert (ROOT / page).read_text() == tables.filled(page), "write it anew by docs/site/tables.py"

@@ -104,6 +104,7 @@ TABLES: dict[str, dict[str, Callable[[Path], str]]] = {
     "docs/models.md": {"models": lambda _: models()},
     "docs/config.md": {"config": lambda _: config()},
     "docs/results.md": blocks.RESULTS,
+    "docs/tuning.md": {"trials": blocks.trials},
 }
 
 

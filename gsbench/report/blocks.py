@@ -1,4 +1,4 @@
-"""Make the tables of README.md and docs/results.md from the published studies: each block is one function."""
+"""Make the tables of README.md and docs/ from the published studies: each block is one function."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -72,6 +72,8 @@ ABLATIONS = {
     "no_time_split": "Gaussians split in space only",
     "fixed_lambda": "constant λ, the coefficients in the exponents of the opacity",
 }
+# Of conf/trial/; the last is that of models whose rates are constant in the recipe.
+TRIALS = ["recipe", "many", "fast", "slow", "further", "long_rates", "constant", "falling"]
 OF_TREX = {
     "psnr_db": Column("PSNR, last iteration"),
     "psnr_best_on_test_db": Column("best on test"),
@@ -276,36 +278,36 @@ def lengths(published: Path) -> str:
 LAST, BEST, OF_PAPER = {"": "db"}, {", best": "best_on_test_db"}, {", paper": "best_on_test_db paper"}
 
 
-def dnerf(published: Path, models: list[str], quantities: dict[str, str]) -> str:
-    """Return PSNR on D-NeRF at the paper's protocol, by scene and on average; `quantities` are of LAST, BEST, OF_PAPER.
+def dnerf(published: Path, quantities: dict[str, dict[str, str]]) -> str:
+    """Return PSNR on D-NeRF at the paper's protocol, by scene and on average.
 
-    Each model has a column for each quantity. Scenes that lack one of them are left out.
+    `quantities` has for each model those of LAST, BEST and OF_PAPER that are shown. Scenes that lack one are left out.
     """
     rows = paper_tables.table1(paper_tables.of_the_paper(load(published / "dnerf")))
     rows = rows[(rows.table == "paper") & (rows.recipe == POINTS)]
-    table = _psnr_by_model(rows.set_index(["scene", "model"]), models, quantities)
+    table = _psnr_by_model(rows.set_index(["scene", "model"]), quantities)
     table = table.reindex([*paper.PROTOCOLS[DNERF].scenes, paper.AVERAGE]).dropna()
     scenes = rows.scenes[rows.scene == paper.AVERAGE].max()
     table = table.astype(float).rename(index={paper.AVERAGE: f"mean of {scenes:.0f}"}).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
 
 
-def _psnr_by_model(scores: pd.DataFrame, models: list[str], quantities: dict[str, str]) -> pd.DataFrame:
+def _psnr_by_model(scores: pd.DataFrame, quantities: dict[str, dict[str, str]]) -> pd.DataFrame:
     """Return a column of scenes for each quantity of each model, from scores by scene and model."""
     return pd.DataFrame(
         {
             f"{model}{title}": scores[f"psnr_{quantity}"].xs(model, level="model")
-            for model in models
-            for title, quantity in quantities.items()
+            for model, columns in quantities.items()
+            for title, quantity in columns.items()
         }
     )
 
 
-def dnerf400(published: Path, models: list[str], quantities: dict[str, str]) -> str:
+def dnerf400(published: Path, quantities: dict[str, dict[str, str]]) -> str:
     """Return the table of `dnerf` for trainings with `+recipe=quick`, with all scenes of the study dnerf400."""
     averages = only(published, "dnerf400").runs.groupby(["scene", "model"]).mean(numeric_only=True)
     scores = averages.join(paper.table1().loc[DNERF].psnr_db.rename("psnr_best_on_test_db paper"))
-    table = _psnr_by_model(scores, models, quantities)
+    table = _psnr_by_model(scores, quantities)
     table = pd.concat([table, table.mean().to_frame(f"mean of {len(table)}").T]).rename_axis("scene")
     return block(table, **{name: Column(name) for name in table})
 
@@ -322,7 +324,7 @@ def dnerf400_costs(published: Path) -> str:
         "gaussians": Column("Gaussians", 0),
         "gaussians paper": Column("Gaussians, paper", 0),
     }
-    return block(runs[list(columns)].groupby("model").mean().loc[OF_TABLE_1], **columns)
+    return block(runs[list(columns)].groupby("model").mean().loc[[*OF_TABLE_1, "auto"]], **columns)
 
 
 def dnerf200(published: Path) -> str:
@@ -418,10 +420,22 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
     return pd.concat(rows).astype(float)
 
 
+def trials(published: Path) -> str:
+    """Return PSNR on val of each model with the recipe, and its changes by conf/trial/: means over six scenes."""
+    named = {trial: study(published / f"tuning.{trial}")["tuning"].runs.assign(trial=trial) for trial in TRIALS[:-1]}
+    others = pd.concat([only(published, f"tuning.{models}").runs for models in ("successors", "rivals")])
+    others = others.assign(trial=others.variant.str.removeprefix("trial=").str.split(".").str[-1])
+    runs = pd.concat([*named.values(), others])
+    psnr = runs.pivot(index=["model", "trial"], columns="scene", values="psnr_db").mean(axis=1, skipna=False).unstack()
+    table = psnr.sub(psnr.recipe, axis=0).assign(recipe=psnr.recipe)[TRIALS]
+    columns = {name: Column(f"`{name}`", signed=name != "recipe") for name in TRIALS}
+    return block(table.rename_axis("model"), **columns)
+
+
 README: dict[str, Callable[[Path], str]] = {
     "cost": cost,
     "worth": worth,
-    "dnerf400": lambda published: dnerf400(published, ["4dgs", "7dgs"], BEST | OF_PAPER),
+    "dnerf400": lambda published: dnerf400(published, dict.fromkeys(["4dgs", "7dgs"], BEST | OF_PAPER)),
     "dnerf_signs": dnerf_signs,
 }
 _OF_RESULTS = (
@@ -436,8 +450,10 @@ _OF_RESULTS = (
     on_demand,
 )
 RESULTS: dict[str, Callable[[Path], str]] = {
-    "dnerf400": lambda published: dnerf400(published, OF_TABLE_1, LAST | BEST | OF_PAPER),
+    "dnerf400": lambda published: dnerf400(
+        published, dict.fromkeys(OF_TABLE_1, LAST | BEST | OF_PAPER) | {"auto": LAST | BEST}
+    ),
     "dnerf400_costs": dnerf400_costs,
-    "dnerf": lambda published: dnerf(published, OF_TABLE_1, LAST | BEST | OF_PAPER),
+    "dnerf": lambda published: dnerf(published, dict.fromkeys(OF_TABLE_1, LAST | BEST | OF_PAPER)),
     **{write.__name__: write for write in _OF_RESULTS},
 }

@@ -76,7 +76,7 @@ def against(study: str, seeds: Sequence[int], others: Sequence[int]) -> Numbers:
 def blocks() -> dict[str, list[float]]:
     """The numbers in the cells of the tables that are written into README and docs, in order of size."""
     numbers_of: dict[str, list[float]] = {}
-    for name in ("README.md", "docs/results.md"):
+    for name in ("README.md", "docs/results.md", "docs/tuning.md"):
         text = site.filled(name)
         for block, body in re.findall(r"<!-- written by \S+ (\w+) -->(.*?)<!-- end -->", text, re.DOTALL):
             lines = [line for line in body.splitlines() if line.startswith("|")]
