@@ -163,10 +163,11 @@ def test_odd_values_in_a_record_stop_nothing(odd):
 
 
 def test_an_average_stands_in_table_2_only_if_it_is_whole():
-    """Would catch an average of seven scenes beside those of eight."""
+    """Would catch an average of seven scenes beside those of eight, and one that does not say over how many it is."""
     for runs, expected in ((all_scenes("7dgs"), [33.5]), (all_scenes("7dgs")[1:], [])):
         rows = table2(results(*runs))
         assert rows.psnr_db[rows.source.str.startswith("measured")].tolist() == expected
+        assert ("| average over 8 scenes | 7dgs | 33.50 |" in shown(*runs)) == bool(expected)
 
 
 def technicolor(model: str, psnr: float, **changes: Any) -> list[Record]:
