@@ -329,6 +329,7 @@ def test_the_terminal_form_fits(width):
     lines = text.terminal(sections, width).splitlines()
     assert max(map(len, lines)) <= width
     assert any("for lack of width" in line for line in lines)
+    assert "for lack of width" not in text.terminal(sections, 1000)
     assert all(any(f"{name[:21]}..{name[-21:]}"[: width - 2] in line for line in lines) for name in names)
     printed = "".join("".join(lines).split())
     words = [part for section in sections for part in (section.title, section.text, *section.notes)]

@@ -283,13 +283,19 @@ def test_the_kept_length_is_the_one_before_val_falls():
 
 
 def test_settings_that_differ_within_a_scene_are_a_warning():
-    """Catches rows of two protocols side by side without a word, and a warning where only scenes differ."""
+    """Catches rows of two protocols side by side without a word, a warning where only scenes differ, and a scene of the
+    tuning that is shown as any other."""
     half = {"downscale": 2}
     rows = sections(run("a"), but(run("b"), protocol=half))["protocol"].table
     assert rows.setting[rows.note == "WARNING"].tolist() == ["downscale", "downscale"]
     assert "WARNING" not in sections(run("a"), run("b"))["protocol"].text
     by_scene = sections(run("a"), but(run("a", scene="x"), protocol=half))["protocol"].table
     assert not (by_scene.note == "WARNING").any()
+    notes = [sections(run("a", scene=scene))["protocol"].notes for scene in ("hook", "x")]
+    assert ["gsbench's own settings were tuned on hook (docs/tuning.md)." in of_scene for of_scene in notes] == [
+        True,
+        False,
+    ]
     dirty = sections(but(run("a"), provenance={"git_commit": f"{run().provenance.git_commit}-dirty"}))
     assert any("dirty" in note for note in dirty["protocol"].notes)
     assert dirty["runs"].table.commit.tolist() == ["0123456789ab-dirty"]
