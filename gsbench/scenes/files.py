@@ -92,6 +92,9 @@ class ImageFinder:
             path = find_inside(self._root, name.replace("\\", "/"), where)
         if os.path.isfile(path):
             return path
+        if not path.parent.is_dir():  # its name may have umlauts, too
+            spelt = (find_inside(self._root, unicodedata.normalize(form, name), where) for form in ("NFC", "NFD"))
+            path = next((other for other in spelt if other.parent.is_dir()), path)
         stem = without_suffix(path.name)
         suffix = path.name[len(stem) :]
         names = self._images(path.parent).get(unicodedata.normalize("NFC", stem))

@@ -23,6 +23,8 @@ _SIZE_TOLERANCE = math.sqrt(2)  # a scene keeps its size if that differs by at m
 _PLACE_TOLERANCE = 0.25  # .. and its place if cameras look at a point so near to the origin, in units of the size
 _PULL = 1e-4  # weight of the cameras' middle against their axes: decides where parallel axes leave a choice
 _ROUNDS = 30  # of reweighted least squares
+_WORSE = 2.0  # sum of distances to the axes by that after the first round, above which the rounds went astray
+_ROUNDING = 1e-12  # by which positions of one place differ in double precision, relative to their size
 _AHEAD = 0.5  # cosine between a camera's axis and the common point, above which the camera looks at the point
 _FAR_CAMERA = 5.0  # in units of the size and of the cameras' spread: a camera farther away has a wrong pose
 _ENOUGH_SEEN = 0.25  # share of the points below which a line says how many the training cameras see
@@ -47,6 +49,8 @@ def standard_scene(
     """Return a scene whose cameras and points are in single precision, in the standard place and size."""
     viewmats = np.stack([view.camera.viewmat.numpy() for view in train])
     centers = -np.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[..., 0]  # [C, 3]; R is rigid to 1e-4 only
+    is_one_place = bool(np.ptp(centers, axis=0).max() <= _ROUNDING * np.abs(centers).max())
+    centers = np.repeat(centers[:1], len(centers), axis=0) if is_one_place else centers
     axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)  # [C, 3] viewing directions
     visible, share = _seen_points(name, train, points)
     middle, size = place_and_size(centers, axes, visible)
@@ -65,7 +69,7 @@ def standard_scene(
         val=val,
         test=test,
         background=background,
-        extent=scene_extent(moved[is_near]),
+        extent=0.0 if is_one_place else scene_extent(moved[is_near]),
         points=points,
         fingerprint=fingerprint,
         repaired=repaired,
@@ -95,7 +99,7 @@ def place_and_size(
     middle = np.median(centers, axis=0)
     spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] take away what lies along an axis
-    target, weights = middle, np.ones(len(centers))
+    targets, sums, weights = [], [], np.ones(len(centers))
     # Sums of distances, not of their squares: iteratively reweighted least squares. With weights w, across P, centres c
     # and x = target - middle, sum w P (x - (c - middle)) + pull x = 0.
     for _ in range(_ROUNDS):
@@ -105,9 +109,13 @@ def place_and_size(
         target = middle + np.linalg.solve(matrix, (weighted @ (centers - middle)[:, :, None]).sum(0)[:, 0])
         offsets = target - centers
         to_axis = np.linalg.norm(across @ offsets[:, :, None], axis=(1, 2))  # [C] distances
+        targets.append(target)
+        sums.append(to_axis.sum())
         # An axis through the target would have an infinite weight.
         weights = 1 / np.maximum(to_axis, 1e-3 * np.median(np.linalg.norm(offsets, axis=1)) + 1e-300)
         weights /= weights.max()
+    if sums[-1] > _WORSE * sums[0]:  # of two cameras side by side, the one with more images draws the point to itself
+        target = targets[0]
     distances = np.linalg.norm(target - centers, axis=1)
     ahead = ((target - centers) * axes).sum(1)
     if np.median(ahead) > _AHEAD * np.median(distances) > 0:  # most cameras look at the target

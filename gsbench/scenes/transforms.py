@@ -326,6 +326,12 @@ def _read_lens(content: Mapping[str, Any], frame: Mapping[str, Any], size: Size,
         raise InputError(
             f"{where}: expected intrinsics as 'camera_angle_x' or 'fl_x' here or for the whole file, found neither"
         )
+    of_another_size = any(key in of_frame and content.get(key, frame[key]) != frame[key] for key in ("w", "h"))
+    if of_another_size and (missing := {"fl_x", "fl_y", "cx", "cy"} & merged.keys() - of_frame):
+        raise InputError(
+            f"{where}: {', '.join(sorted(missing))}: expected its own, as its w or h is not that of the whole file: "
+            "write them in the frame"
+        )
     where = where if of_frame else source
     _check_pinhole(merged, where)
     values = {

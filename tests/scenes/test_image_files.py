@@ -54,6 +54,14 @@ def test_names_that_macos_spells_otherwise(tiny):
         (tiny / split / "r_0.png").rename(tiny / split / "Ku\u0308che.png")
         edit(tiny, lambda c, split=split: c["frames"][0].update(file_path=f"{split}/K\u00fcche.png"), split)
     assert scenes.load(tiny).notes == ()
+    for split, kitchen in zip(SPLITS, ("K\u00fcche", "Ku\u0308che", "K\u00fcche"), strict=True):
+        (tiny / split).rename(tiny / f"{kitchen} {split}")
+        edit(
+            tiny,
+            lambda c, s=split: [f.update(file_path=f["file_path"].replace(s, f"K\u00fcche {s}")) for f in c["frames"]],
+            split,
+        )
+    assert scenes.load(tiny).notes == ()
 
 
 def test_images_without_alpha_beside_others_are_told(tiny):

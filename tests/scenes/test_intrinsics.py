@@ -84,6 +84,11 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "fisheye in a frame": ({"is_fisheye": False}, {"is_fisheye": 1}, r"frames\[1\]: is_fisheye"),
     "no model": ({"camera_model": None}, {}, "camera_model: expected a pinhole camera"),
     "panorama": ({"equirectangular": True}, {}, "equirectangular"),
+    "size of a frame alone": (
+        {"w": 8, "h": 6, "cx": 3.0},
+        {"w": 16, "h": 12, "fl_x": 20.0, "fl_y": 20.0, "cy": 6.0},
+        r"frames\[1\]: cx: expected its own, as its w or h is not that of the whole file",
+    ),
     "size of a frame": ({}, {"w": 16, "h": 8}, "expected 16x8 as its camera, .*, got 8x6"),
     "width alone": ({}, {"w": 16}, r"frames\[1\]: w: expected the images' own 8, got 16"),
     "half a pixel": ({}, {"w": 16.5, "h": 12}, r"frames\[1\]: w: "),

@@ -174,6 +174,25 @@ def test_points_of_another_place_are_told_or_refused(tmp_path):
     assert any("half of the points lie over 10 times as far away" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize("counts", [(8, 6), (2, 12), (8, 8)])
+def test_two_fixed_cameras_side_by_side_look_at_one_point(counts):
+    """Catches a scene in units of 2e-16: the camera with more images drew the point to its own place."""
+    centers = np.repeat([[-0.2, -4.0, 0.5], [0.2, -4.0, 0.5]], counts, axis=0)
+    place, size = place_and_size(centers, -centers / np.linalg.norm(centers, axis=1, keepdims=True))
+    assert np.linalg.norm(place) < 0.5
+    assert size == pytest.approx(4, abs=0.5)
+
+
+def test_a_camera_that_only_turns_is_at_one_place(tmp_path):
+    """Catches rounding errors of its position taken for the size of the scene: units of 4e-16."""
+    turned, place = circle(COUNT), np.array([0.3, -4.1, 0.7])
+    turned[:, :3, 3] = -turned[:, :3, :3] @ place
+    points = place + np.random.default_rng(0).normal(0, 3, (200, 3))
+    scene = load_scene(write_capture(tmp_path, viewmats=turned, points=points))
+    assert scene.extent == 0  # which a run refuses
+    assert 0.1 < scene.placement.unit < 10
+
+
 def moved_square(root: Path, scale: float, offset: tuple[float, float, float]) -> Path:
     """The moving square, scaled and moved as a whole."""
 
