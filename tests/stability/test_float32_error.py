@@ -5,12 +5,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from tiny_run import main_here, overrides, write_moving_square
 from tiny_training import compose, moving_square
 
@@ -351,3 +353,21 @@ def test_equal_images_have_no_change():
     assert not torch.allclose(exact.image, rendered[0], atol=1e-3)
     equal = [replace(view, pixels=image) for view, image in zip(VIEWS, rendered, strict=True)]
     assert psnr_float32(model, equal) == (0.0, "")
+
+
+def test_a_long_title_stays_over_its_pane(tmp_path, monkeypatch):
+    """Catches the name of a run with a long variant that is cut at the border or runs into the next title."""
+    drawn = []
+
+    class Kept(Figure):
+        def __init__(self, *arguments, **options) -> None:
+            super().__init__(*arguments, **options)
+            drawn.append(self)
+
+    monkeypatch.setattr(report, "Figure", Kept)
+    exact = SimpleNamespace(image=torch.zeros(8, 8, 3), bound=torch.zeros(8, 8))
+    title = "suzanne/7dgs,downscale=8,initial_points=500,iterations=30,gate=end/seed0"
+    shown = ("test/r_009", torch.zeros(8, 8, 3), exact)
+    report.draw(Exactness(title, 1, [], [], shown), tmp_path / "a.png")  # type: ignore[arg-type]
+    boxes = [axes.title.get_window_extent() for axes in drawn[0].axes[:2]]
+    assert 0 <= boxes[0].x0 < boxes[0].x1 < boxes[1].x0
