@@ -33,6 +33,7 @@ _COLUMNS = {
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
 _LARGEST = 1e30  # largest accepted number; its square in double and its sums in single precision are finite
+_LARGEST_LOG_SCALE = 40.0  # 1e17 world units, whose square is finite in single precision
 _LARGEST_LOGIT = math.log(ALPHA_MAX / (1 - ALPHA_MAX))
 _VALUE = 40  # bytes that a number of a Gaussian needs while it is read: in the file, in double and in single precision
 FILTER = "filter_3D"  # Mip-Splatting: standard deviation of the 3D smoothing filter, world units
@@ -90,14 +91,19 @@ def read_trained(path: Path) -> TrainedGaussians:
     require(needed, f"{path}: {len(vertices)} Gaussians", "use a smaller file")
     vertices = _with_finite_logits(vertices, path)
     read = {name: _table(vertices, group, path) for name, group in _COLUMNS.items()}
-    if not (read["quats"].square().sum(1) > 0).all():
-        raise InputError(f"{path}: rot_0..3: expected quaternions, some are zero")
+    zeros = int((read["quats"].square().sum(1) == 0).sum())
+    if zeros:
+        raise InputError(f"{path}: rot_0..3: expected quaternions, {zeros} of {len(vertices)} are zero: remove them")
     by_channel = _table(vertices, rest, path) if rest else torch.zeros(len(vertices), 0)
     read["logits"] = read["logits"][:, 0]
+    doubts = []
     if 0 <= read["logits"].min() < read["logits"].max() <= 1:
+        doubts += ["all values of opacity lie in [0, 1]: are they opacities?"]
+    if read["log_scales"].min() > 0:
+        doubts += ["all values of scale_0..2 are positive: are they sizes?"]
+    if doubts:
         print(
-            f"{path}: all values of opacity lie in [0, 1]: are they opacities? A PLY of 3DGS has their logits, and the "
-            f"logarithms of scales",
+            f"{path}: {' '.join(doubts)} A PLY of 3DGS has logits of opacities, and logarithms of scales",
             file=sys.stderr,
         )
     if FILTER in names:
@@ -218,7 +224,14 @@ def _fuse(
 
 
 def _table(vertices: NDArray[np.void], names: tuple[str, ...], path: Path) -> Tensor:  # [N, len(names)] float32
-    return torch.from_numpy(columns(vertices, names, path, _LARGEST).astype(np.float32))
+    if integers := [name for name in names if vertices.dtype[name].kind in "iu"]:
+        raise refused(
+            path,
+            f"{_shortened(integers)}: expected float or double, got {vertices.dtype[integers[0]].name}, as of "
+            f"quantised Gaussians: export a PLY of 3DGS by the program that wrote them",
+        )
+    largest = _LARGEST_LOG_SCALE if names == _COLUMNS["log_scales"] else _LARGEST
+    return torch.from_numpy(columns(vertices, names, path, largest).astype(np.float32))
 
 
 def _check_columns(names: Sequence[str], path: Path) -> list[str]:

@@ -71,7 +71,10 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     if not data.startswith(b"ply"):
         _check_readable(path, data)
     if not data.startswith(b"ply") or end is None:
-        raise InputError(f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes")
+        raise InputError(
+            f"{path}: expected a PLY: 'ply' first and 'end_header' within {_HEADER_LIMIT} bytes, the file begins with "
+            f"{data[:16]!r}: export or copy it again"
+        )
     lines = data[: end.start()].decode("ascii", "replace").splitlines()
     encoding, before, vertices, is_last = _read_header(lines, path)
     if encoding == "ascii":
@@ -82,7 +85,7 @@ def read_vertices(path: Path) -> NDArray[np.void]:
     if vertices.size > available:
         raise InputError(
             f"{path}: element vertex: expected {vertices.rows} x {vertices.dtype.itemsize} bytes, found "
-            f"{available}: truncated"
+            f"{available}: truncated, copy it again"
         )
     if is_last and data[start + vertices.size :].strip():
         raise _too_long(path, vertices)
@@ -155,7 +158,9 @@ def _read_ascii(body: bytes, skipped: int, vertices: _Element, path: Path, *, is
             raise _too_long(path, vertices)
         values = values[skipped:expected]
     if len(values) < vertices.values:
-        raise InputError(f"{path}: element vertex: expected {count} x {len(names)} values, the file is truncated")
+        raise InputError(
+            f"{path}: element vertex: expected {count} x {len(names)} values, the file is truncated: copy it again"
+        )
     try:
         table = np.array([float(value) for value in values]).reshape(count, len(names))
     except ValueError as error:
@@ -196,7 +201,7 @@ def columns(vertices: NDArray[np.void], names: Sequence[str], path: Path, larges
         named = ", ".join(name for name, column in zip(names, bad.T, strict=True) if column.any())
         raise InputError(
             f"{path}: {named:.80}: expected finite numbers, {int(bad.any(axis=1).sum())} of {len(bad)} "
-            f"vertices have others: remove them"
+            f"vertices have others, or larger ones than {largest:.3g}: remove them"
         )
     return table
 

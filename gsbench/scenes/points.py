@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -102,30 +103,42 @@ def share_of_points_seen(points: Points, cameras: Sequence[Camera], enough: floa
 def read_ply(path: Path) -> Points:
     """Read positions (float64) and colours of points from a PLY with `x y z` and `red green blue` or `f_dc_0..2`.
 
-    Integer colours are divided by the largest value of their type. Colours from `f_dc_0..2` are clamped to [0, 1]. A
-    property `time` in [0, 1] gives the points times: the union of the clouds of several frames has one. Other columns
-    are named on stderr.
+    Integer colours lie in 0..255, or in 0..65535 if one is larger. Colours from `f_dc_0..2`, which come first, are
+    clamped to [0, 1]. A property `time` in [0, 1] gives the points times: the union of the clouds of several frames has
+    one. Other columns are named on stderr.
     """
     vertices = read_vertices(path)
     means = columns(vertices, ("x", "y", "z"), path, _LARGEST)
     names = vertices.dtype.names or ()
     if others := [name for name in names if not _READ_OR_HARMLESS.fullmatch(name)]:
         print(f"{path}: columns of its points that are not read: {', '.join(others):.120}", file=sys.stderr)
-    if "red" in names:
-        colors = columns(vertices, ("red", "green", "blue"), path, _LARGEST)
-        kind = vertices.dtype["red"]
-        if kind.kind in "iu":
-            colors = colors / np.iinfo(kind).max
-        if colors.min() < 0 or colors.max() > 1:
-            raise InputError(f"{path}: red green blue: expected uchar 0..255 or float 0..1, some are outside")
-    elif "f_dc_0" not in names:
-        raise InputError(f"{path}: expected colours as red green blue, or as f_dc_0..2, found {names!r:.120}: add them")
-    else:
+    if "f_dc_0" in names:  # of trained Gaussians, beside which red green blue may be labels
         colors = (0.5 + SH_C0 * columns(vertices, ("f_dc_0", "f_dc_1", "f_dc_2"), path, _LARGEST)).clip(0, 1)
-    times = torch.from_numpy(columns(vertices, ("time",), path, 1.0)[:, 0]).float() if "time" in names else None
-    if times is not None and times.min() < 0:
-        raise InputError(f"{path}: time: expected numbers from 0 to 1, some are negative")
+    elif "red" in names:
+        colors = _rgb(vertices, path)
+    else:
+        raise InputError(f"{path}: expected colours as red green blue, or as f_dc_0..2, found {names!r:.120}: add them")
+    times = torch.from_numpy(columns(vertices, ("time",), path, _LARGEST)[:, 0]).float() if "time" in names else None
+    if times is not None and (times.min() < 0 or times.max() > 1):
+        raise InputError(
+            f"{path}: time: expected numbers from 0 to 1, got {times.min():g} to {times.max():g}: scale them"
+        )
     return Points(torch.from_numpy(means), torch.from_numpy(colors.astype(np.float32)), times)
+
+
+def _rgb(vertices: NDArray[np.void], path: Path) -> NDArray[np.float64]:  # [P, 3] in [0, 1]
+    """Return the colours `red green blue` of points; files of scripts have 0..255 as int or ushort too."""
+    names = ("red", "green", "blue")
+    colors = columns(vertices, names, path, _LARGEST)
+    kinds = {vertices.dtype[name].kind in "iu" for name in names}  # whether they are integers
+    white = 1 if kinds == {False} else 255 if colors.max() <= 255 else 65535
+    if len(kinds) > 1 or colors.min() < 0 or colors.max() > white:
+        types = ", ".join(vertices.dtype[name].name for name in names)
+        raise InputError(
+            f"{path}: red green blue: expected uchar 0..255, ushort 0..65535 or float 0..1, got "
+            f"{colors.min():g} to {colors.max():g} as {types}: convert them"
+        )
+    return colors / white
 
 
 def nearest_distances(means: Tensor) -> Tensor:  # [P, 3] -> [P] in the dtype and on the device of `means`

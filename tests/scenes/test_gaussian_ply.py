@@ -27,12 +27,13 @@ BEFORE = [
 
 
 def rows(degree: int = 0, *more: str, without: str = "", kind: str = "f4", **values: Any) -> np.ndarray:
-    """N Gaussians of ones but for some values; the columns are in no order that anyone agreed on."""
+    """N Gaussians of ones but for scales and some values; the columns are in no order that anyone agreed on."""
     rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
     names = [*sorted({*NEEDED, *rest, *values} - {without}, key=lambda name: name[::-1]), *more]
     table = np.ones(N, [(name, kind) for name in names])
-    for name, column in values.items():
-        table[name] = column
+    for name, column in (dict.fromkeys(NEEDED[7:10], -1) | values).items():
+        if name in names:
+            table[name] = column
     return table
 
 
@@ -113,7 +114,12 @@ REFUSED = [
     (rows(x=spoilt(np.nan)), r"a\.ply: x: expected finite numbers, 1 of 5 vertices"),
     (rows(scale_1=spoilt(-np.inf)), "scale_1: expected finite numbers, 1 of 5"),
     (rows(opacity=spoilt(np.nan)), "opacity: expected finite numbers, 1 of 5"),
-    (rows(rot_0=0, rot_1=0, rot_2=0, rot_3=0), "quaternions"),
+    (rows(rot_0=spoilt(0), rot_1=0, rot_2=0, rot_3=0), "expected quaternions, 1 of 5 are zero: remove them"),
+    (rows(scale_0=spoilt(120)), r"scale_0: .* 1 of 5 vertices have others, or larger ones than 40: remove them"),
+    (
+        rows(kind="u1", scale_0=9, scale_1=9, scale_2=9),
+        r"x, y, z: expected float or double, got uint8, as of quantised",
+    ),
     (rows(filter_3D=spoilt(-0.1)), "filter_3D: expected sizes of at least 0"),
     (rows(1, "trbf_center", "trbf_scale"), "trbf_center, trbf_scale are of Spacetime Gaussians"),
     (rows(1, *(f"motion_{i}" for i in range(9))), "motion_0..8 are of Spacetime Gaussians"),
@@ -154,7 +160,11 @@ def test_columns_that_change_no_image_are_named_in_one_line(path, capsys):
 def test_opacities_in_place_of_logits_are_asked_for(least, asked, path, capsys):
     """Catches a PLY of activated values, whose Gaussians are all half transparent and larger than a unit."""
     read_trained(write(path, rows(opacity=np.linspace(least, 1, N))))
-    assert ("are they opacities?" in capsys.readouterr().err) is asked
+    error = capsys.readouterr().err
+    assert ("are they opacities?" in error) is asked
+    assert "are they sizes?" not in error
+    read_trained(write(path, rows(scale_0=np.linspace(least, 1, N) + 0.01, scale_1=0.02, scale_2=0.02)))
+    assert ("are they sizes?" in capsys.readouterr().err) is asked
 
 
 @pytest.mark.parametrize("network", ["deformation.pth", "../../deform/iteration_7/deform.pth"])

@@ -72,6 +72,19 @@ def test_ply_of_3dgs(tmp_path):
     torch.testing.assert_close(colors[1], torch.tensor([0.5 + 0.28209479177387814, 1.0, 0.5]))
 
 
+@pytest.mark.parametrize(("kind", "white"), [("u1", 255), ("i4", 255), ("u4", 255), ("u2", 255), ("u2", 65535)])
+@pytest.mark.parametrize("byte_order", ["", "<"])
+def test_integer_colours_of_any_type(kind, white, byte_order, tmp_path):
+    """Catches points that are black, as 255 of an int is divided by the largest int, and labels beside f_dc_0..2."""
+    vertices = np.zeros(2, [*VERTEX[:3], *((name, kind) for name, _ in VERTEX[3:])])
+    vertices["red"], vertices["green"] = (0, white), white // 5
+    colors = read_ply(save(tmp_path, ply(vertices, byte_order))).colors
+    torch.testing.assert_close(colors, torch.tensor([[0, 0.2, 0], [1, 0.2, 0]]))
+    trained = np.zeros(2, [*vertices.dtype.descr, *((f"f_dc_{i}", "f4") for i in range(3))])
+    trained["red"] = 9
+    assert (read_ply(save(tmp_path, ply(trained, byte_order))).colors == 0.5).all()
+
+
 def test_ply_of_several_frames(tmp_path, capsys):
     """Catches times that are read as positions, in another type, where a cloud has none, or dropped in silence."""
     path = save(tmp_path, ply(np.zeros(3, [*VERTEX, ("nx", "f4"), ("t", "f4")])))
@@ -108,12 +121,15 @@ BAD_PLY = {
     "not a number, ascii": (GOOD_ASCII.replace(b"\n1 1", b"\n1 one"), "expected numbers"),
     "colour 256, ascii": (GOOD_ASCII.replace(b"1 1 1\n", b"1 1 256\n"), "blue"),
     "position not finite": (GOOD_ASCII.replace(b"\n1 1", b"\n1 nan"), "y: expected finite numbers, 3 of 3"),
-    "time after the end": (ply(np.full(1, 2, [*VERTEX, ("time", "f4")])), "time: expected finite numbers"),
+    "time after the end": (ply(np.full(1, 2, [*VERTEX, ("time", "f4")])), "from 0 to 1, got 2 to 2: scale them"),
     "time before the start": (
         GOOD_ASCII.replace(b"uchar red", b"float time\nproperty uchar red").replace(b"1 1 1\n", b"-0.5 1 1 1\n"),
-        "time: expected numbers from 0 to 1",
+        "time: expected numbers from 0 to 1, got -0.5",
     ),
-    "float colour of 255": (ply(np.full(1, 255, [(n, "f4") for n, _ in VERTEX])), "red green blue"),
+    "float colour of 255": (ply(np.full(1, 255, [(n, "f4") for n, _ in VERTEX])), "got 255 to 255 as float32"),
+    "colours of 32 bits": (ply(np.full(1, 70000, [(n, "i4") for n, _ in VERTEX])), "got 70000 to 70000 as int32"),
+    "colours of two types": (ply(np.ones(1, [*VERTEX[:5], ("blue", "f4")])), "as uint8, uint8, float32: convert"),
+    "a pointer of git lfs": (b"version https://git-lfs.github.com/spec/v1", "begins with b'version https://'"),
 }
 
 
