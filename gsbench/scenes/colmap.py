@@ -225,13 +225,15 @@ def read_images(file: ModelFile) -> list[PosedImage]:
 def points_beside(root: Path) -> tuple[Points | None, dict[str, str]]:
     """Return the initial points of a folder that has its cameras elsewhere, and the digest of their file by its name.
 
-    They are those of the COLMAP model in `sparse/0`, or of `points3d.ply`. If neither exists, there are none.
+    They are those of the COLMAP model in `sparse/0`, or of `points3d.ply`, in any case. Without both there are none.
     """
     if (root / "sparse" / "0").is_dir():
         file = read_part(root / "sparse" / "0", "points3D")
         return read_points(file), {file.path.relative_to(root).as_posix(): files.digest(file.data)}
-    ply = root / "points3d.ply"
-    return (read_ply(ply), {ply.name: files.digest(ply.read_bytes())}) if ply.exists() else (None, {})
+    for name in sorted(os.listdir(root), reverse=True):  # the lower case first
+        if name.lower() == "points3d.ply":
+            return read_ply(root / name), {name: files.digest((root / name).read_bytes())}
+    return None, {}
 
 
 def read_points(file: ModelFile) -> Points:

@@ -84,12 +84,14 @@ def open_video(path: Path) -> Iterator[cv2.VideoCapture]:
             video.release()
 
 
-def video_frames(path: Path) -> Generator[Pixels, None, None]:  # [H, W, 3]
-    """Yield the frames of a video, as far as OpenCV can read it."""
+def video_frames(path: Path, moments: list[float] | None = None) -> Generator[Pixels, None, None]:  # [H, W, 3]
+    """Yield the frames of a video, as far as OpenCV can read it; append their milliseconds to `moments`."""
     with open_video(path) as video:
         while video.grab():
             is_read, frame = video.retrieve()
             if is_read:
+                if moments is not None:
+                    moments.append(video.get(cv2.CAP_PROP_POS_MSEC))
                 yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)  # type: ignore[misc]  # OpenCV's stubs: any dtype
 
 

@@ -30,7 +30,10 @@ from gsbench.scenes.shots import Lens
 POSES = "poses_bounds.npy"
 TEST_CAMERA = "cam00"
 DECODED = "decoded"  # the folder of the frames, as [frames, height, width, 3] bytes for each camera
-_FILM = re.compile(r"cam\d\d(?:\.mp4)?")
+_FILM = re.compile(r"cam\d\d(?:\.(?i:mp4))?")
+_LIKE_FILM = re.compile(r"cam(?:era)?\D?(\d{1,9})(?:\.(?:mp4|mov|mkv|avi|webm|m4v))?", re.IGNORECASE)
+_UNSTEADY = 0.2  # relative difference of a step between frames from the usual one, above which a line tells it
+_SAME_RATE = 0.01  # relative difference of the frames a second of films of one rate, such as 29.97 and 30
 _MAX_POSES = 1 << 20  # bytes of poses_bounds.npy
 _ROW = 17  # numbers of a camera: a matrix [3, 5], and the depths of the nearest and farthest points
 _MOVING = 8  # bytes a pixel of the reduced test film while its moving part is found (gsbench.measure.regions)
@@ -45,6 +48,7 @@ class _Film:
     images: tuple[Path, ...]  # of a folder
     count: int  # of frames
     size: Size
+    rate: float | None = None  # frames a second of a video
 
     def digest(self) -> str:
         """Return the SHA-256 of the video, or that of the images."""
@@ -55,12 +59,15 @@ class _Film:
         with self.path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
-    def decoded(self, first: int, last: int) -> Iterator[Pixels]:  # each [H, W, 3] RGB
-        """Yield the frames from `first` to `last`, counted from 0; a video may end before its header says."""
+    def decoded(self, first: int, last: int, moments: list[float]) -> Iterator[Pixels]:  # each [H, W, 3] RGB
+        """Yield the frames from `first` to `last`, counted from 0; a video may end before its header says.
+
+        The milliseconds of a video's frames, from its first one on, are appended to `moments`.
+        """
         for path in self.images[first : last + 1]:
             yield images.decode_photo(images.read_image(path, str(path)), str(path))
         if not self.images:
-            yield from islice(images.video_frames(self.path), first, last + 1)
+            yield from islice(images.video_frames(self.path, moments), first, last + 1)
 
 
 def load(
@@ -110,7 +117,9 @@ def load(
     )
     notes.append(f"{POSES}: depths are not read; no distortion is stated")
     notes += [f"cameras left out: {', '.join(leave_out)}"] if leave_out else []
+    others = "" if points_file else ", ".join(sorted(path.name for path in root.glob("*.ply")))[:80]
     notes.append(f"initial points: {f'those of {next(iter(points_file))}' if points_file else 'random'}")
+    notes[-1] += f"; not read: {others}" if others else ""
     test, *train = by_film  # the test camera is cam00, the first
     return standard_scene(
         name=name,
@@ -169,11 +178,18 @@ def _list_films(root: Path) -> tuple[list[_Film], list[str]]:
     """Return the films in the order of their names, and sentences on what is not read; check that all have one size."""
     paths: dict[str, Path] = {}
     notes = []
-    for name in sorted(name for name in os.listdir(root) if _FILM.fullmatch(name)):  # cam00 before cam00.mp4
-        camera = name.removesuffix(".mp4")
+    listed = sorted(os.listdir(root))  # cam00 before cam00.mp4
+    for name in filter(_FILM.fullmatch, listed):
+        camera = os.path.splitext(name)[0]
         if camera in paths:
             notes.append(f"{name} is read, and not the folder {camera}")
         paths[camera] = files.find_inside(root, name, str(root))
+    numbers = {int(camera[3:]) for camera in paths}
+    if others := [name for name in listed if (like := _LIKE_FILM.fullmatch(name)) and int(like[1]) not in numbers]:
+        raise InputError(
+            f"{root}: expected films cam00.mp4 to cam99.mp4, or folders cam00 to cam99 of their frames, got "
+            f"{', '.join(others)[:80]} too: rename them, or move them away"
+        )
     if TEST_CAMERA not in paths or len(paths) < 2:
         raise InputError(f"{root}: expected {TEST_CAMERA}, the test camera, and others, got {', '.join(paths)[:120]}")
     if missing := [f"cam{n:02d}" for n in range(int(max(paths)[3:])) if f"cam{n:02d}" not in paths]:
@@ -183,17 +199,25 @@ def _list_films(root: Path) -> tuple[list[_Film], list[str]]:
         if film.size != films[0].size:
             expected, actual = (f"{x.size[0]}x{x.size[1]}" for x in (films[0], film))
             raise InputError(f"{film.path}: expected {expected} as {films[0].path.name}, got {actual}")
+    folders = [film for film in films if film.images]
+    starts = {_number_of(film.images[0].name) for film in folders}
+    if len(starts) > 1:
+        firsts = ", ".join(f"{film.name}/{film.images[0].name}" for film in folders)
+        notes.append(f"the first frames have different numbers, and are taken to be of one time: {firsts:.120}")
     return films, notes
+
+
+def _number_of(name: str) -> int | None:
+    """Return the number at the end of the name of a PNG or JPEG; None for other files."""
+    stem = files.without_suffix(name)
+    number = re.search(r"\d{1,9}$", stem) if stem != name else None
+    return None if number is None else int(number[0])
 
 
 def _open_folder(camera: str, path: Path) -> _Film:
     """Return the film of a folder of images, whose numbers must be consecutive."""
     folder = path / "images" if (path / "images").is_dir() else path
-    numbered = sorted(
-        (int(number[0]), file)
-        for file in os.listdir(folder)
-        if (stem := files.without_suffix(file)) != file and (number := re.search(r"\d{1,9}$", stem))
-    )
+    numbered = sorted((number, file) for file in os.listdir(folder) if (number := _number_of(file)) is not None)
     if not numbered:
         raise InputError(f"{folder}: expected a PNG or JPEG for each frame, with its number at the end of the name")
     for (before, _), (after, name_after) in pairwise(numbered):
@@ -217,13 +241,14 @@ def _open(camera: str, path: Path) -> _Film:
     if start[4:] != b"ftyp":  # other formats can name files and hosts, which OpenCV would open
         raise InputError(f"{path}: expected an MP4, the file is of another kind or damaged: copy it again")
     with images.open_video(path) as video:
+        rate = video.get(cv2.CAP_PROP_FPS)
         count, width, height = (
             int(video.get(key))
             for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         )
     if min(count, width, height) < 1:
         raise InputError(f"{path}: OpenCV cannot decode this film: copy it again, or write its frames to {camera}/")
-    return _Film(camera, path, (), count, (width, height))
+    return _Film(camera, path, (), count, (width, height), rate)
 
 
 def _read_rows(data: bytes, source: Path, films: Sequence[_Film]) -> NDArray[np.float64]:  # [cameras, 17]
@@ -234,10 +259,15 @@ def _read_rows(data: bytes, source: Path, films: Sequence[_Film]) -> NDArray[np.
         raise InputError(f"{source}: expected an array as numpy.save writes: {one_line(error)[:80]}") from None
     if not np.isfinite(rows).all():
         raise InputError(f"{source}: expected finite numbers, some are not: copy it again")
-    if rows.shape != (len(films), _ROW):
+    if rows.shape[1:] != (_ROW,):
         raise InputError(
-            f"{source}: expected {_ROW} numbers for each of {len(films)} films, {films[0].name} to "
-            f"{films[-1].name}, got {list(rows.shape)}: keep all films, and leave cameras out by scene.leave_out"
+            f"{source}: expected {_ROW} numbers for each film, 15 of the pose and 2 depths as of LLFF, got an array "
+            f"{list(rows.shape)}: write it so"
+        )
+    if len(rows) != len(films):
+        raise InputError(
+            f"{source}: expected a row for each of {len(films)} films, {films[0].name} to {films[-1].name}, got "
+            f"{len(rows)}: keep all films, and leave cameras out by scene.leave_out"
         )
     return rows
 
@@ -256,7 +286,19 @@ def _without(films: Sequence[_Film], leave_out: Sequence[str]) -> list[_Film]:
 
 
 def _range(films: Sequence[_Film], frames: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the first and the last frame; raise InputError if films are too short, or, without `frames`, differ."""
+    """Return the first and the last frame.
+
+    Raises:
+        InputError: films are too short, have frames at different rates, or, without `frames`, differ in length.
+    """
+    rates = [(film.rate, film) for film in films if film.rate]
+    if rates:
+        (slow, slowest), (fast, fastest) = (choice(rates, key=lambda pair: pair[0]) for choice in (min, max))
+        if fast > slow * (1 + _SAME_RATE):
+            raise InputError(
+                f"{fastest.path}: expected {slow:.4g} frames a second as {slowest.path.name}, got {fast:.4g}: are "
+                f"frames of one number of one time? Convert the films to one rate, or leave it out by scene.leave_out"
+            )
     shortest, longest = (choice(films, key=lambda film: film.count) for choice in (min, max))
     first, last = frames or (0, shortest.count - 1)
     if frames is None and shortest.count != longest.count:
@@ -316,18 +358,33 @@ def _views(film: _Film, camera: Camera, path: Path, frames: tuple[int, int], ren
 def _decode(film: _Film, frames: tuple[int, int], rendition: Rendition, size: Size, path: Path) -> None:
     """Write the reduced frames of a film to a file, which appears only when it is whole."""
     part = path.with_name(f"{path.name}.{os.getpid()}")
-    written = 0
+    written, moments = 0, list[float]()
     try:
         with part.open("wb") as file:
-            for pixels in film.decoded(*frames):
+            for pixels in film.decoded(*frames, moments):
                 if pixels.shape != (film.size[1], film.size[0], 3) or pixels.dtype != np.uint8:
+                    height, width, channels = pixels.shape
                     raise InputError(
-                        f"{film.path}: frame {frames[0] + written}: expected opaque RGB of 8 bits as others"
+                        f"{film.path}: frame {frames[0] + written}: expected opaque RGB of 8 bits and "
+                        f"{film.size[0]}x{film.size[1]} as others, got {channels} channels of {8 * pixels.itemsize} "
+                        f"bits and {width}x{height}: convert it"
                     )
                 file.write(np.ascontiguousarray(images.reduce_8_bits(pixels, rendition, size)).data)
                 written += 1
         if written != frames[1] - frames[0] + 1:
-            raise InputError(f"{film.path}: the film ends before frame {frames[0] + written}: copy it again")
+            raise InputError(
+                f"{film.path}: expected {film.count} frames as its header says, the film ends before frame "
+                f"{frames[0] + written}: copy it again, or choose other scene.frames"
+            )
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+    steps = np.diff(moments)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if (off := np.abs(steps - usual) > _UNSTEADY * usual + 1).any():  # + 1: milliseconds may be rounded
+        frame = int(off.argmax()) + 1
+        print(
+            f"{film.path}: frame {frame} comes {steps[frame - 1]:.4g} ms after the one before, others {usual:.4g} ms: "
+            f"are frames missing, or is its rate variable? Equal steps are supposed: convert it by ffmpeg -r",
+            file=sys.stderr,
+        )

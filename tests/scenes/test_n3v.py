@@ -33,9 +33,9 @@ def pixels_of(camera: int, frame: int) -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), (40 + 20 * camera, 60 + 30 * frame, 128), np.uint8)
 
 
-def write_film(path: Path, frames: list[np.ndarray]) -> None:
+def write_film(path: Path, frames: list[np.ndarray], rate: float = 30) -> None:
     height, width = frames[0].shape[:2]
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30, (width, height))
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
     for pixels in frames:
         film.write(pixels[..., ::-1])
     film.release()
@@ -127,28 +127,36 @@ def test_folders_of_frames_replace_films(root):
     for frame in range(FRAMES):
         write_image(root / f"cam02/images/{frame + 8}.png", pixels_of(2, frame))
         write_image(root / f"cam04/{frame:04d}.png", pixels_of(0, 0))
+        write_image(root / f"cam05/{frame:04d}.png", pixels_of(3, frame))
+    (root / "cam01.mp4").rename(root / "cam01.MP4")
+    np.save(root / "poses_bounds.npy", np.stack([row_of(camera) for camera in range(5)]))
     scene = scenes.load(root)
     views = {view.name: view for view in scene.train}
     for frame in range(FRAMES):
         assert np.array_equal(views[f"cam02/{frame:04d}"].pixels, pixels_of(2, frame))
     assert abs(float(views["cam04/0000"].image[0, 0, 0]) * 255 - 100) < 4
+    assert abs(float(views["cam01/0004"].image[0, 0, 1]) * 255 - 180) < 4
     assert "cam04.mp4 is read, and not the folder cam04" in scene.notes
+    firsts = "cam02/8.png, cam05/0000.png"
+    assert f"the first frames have different numbers, and are taken to be of one time: {firsts}" in scene.notes
     assert scene.fingerprint != first
 
 
 @pytest.mark.parametrize("kind", ["bin", "ply"])
 def test_initial_points(root, kind):
     """Catches points of the first frame that are left out, not told, or not part of the fingerprint."""
+    (root / "points3D_downsample2.ply").touch()
+    assert "initial points: random; not read: points3D_downsample2.ply" in scenes.load(root).notes
     without = scenes.load(root).fingerprint
     means = np.array([(0.5, -0.25, 0.0), (0.25, 0.5, 1.0)])
     if kind == "bin":
         Capture("PINHOLE", WIDTH, HEIGHT, (1, 1, 1, 1), [], np.empty((0, 4, 4)), means).write(root, kind)
     else:
-        write_points(root / "points3d.ply", means, COLOR)
+        write_points(root / "points3D.ply", means, COLOR)
     scene = scenes.load(root)
     assert scene.points is not None
     torch.testing.assert_close(scene.placement.to_user(scene.points.means).numpy(), means, rtol=0, atol=1e-6)
-    assert f"initial points: those of {'sparse/0/points3D.bin' if kind == 'bin' else 'points3d.ply'}" in scene.notes
+    assert f"initial points: those of {'sparse/0/points3D.bin' if kind == 'bin' else 'points3D.ply'}" in scene.notes
     assert scene.fingerprint != without
 
 
@@ -212,13 +220,13 @@ def mirrored(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def film(name: str, count: int, width: int = WIDTH) -> Callable[[Path], object]:
-    return lambda root: write_film(root / f"{name}.mp4", [np.zeros((HEIGHT, width, 3), np.uint8)] * count)
+def film(name: str, count: int, width: int = WIDTH, rate: float = 30) -> Callable[[Path], object]:
+    return lambda root: write_film(root / f"{name}.mp4", [np.zeros((HEIGHT, width, 3), np.uint8)] * count, rate)
 
 
 FAULTS: list[tuple[Callable[[Path], object], str]] = [
-    (poses(lambda rows: rows[:-1]), r"17 numbers for each of 4 films, cam00 to cam04, got \[3, 17\].*leave_out"),
-    (poses(lambda rows: rows[:, :-1]), r"got \[4, 16\]"),
+    (poses(lambda rows: rows[:-1]), "a row for each of 4 films, cam00 to cam04, got 3: .*leave_out"),
+    (poses(lambda rows: rows[:, :-1]), r"expected 17 numbers for each film, .* got an array \[4, 16\]: write it so"),
     (poses(lambda rows: rows * np.nan), "expected finite numbers, some are not: copy it again"),
     (poses(lambda rows: rows.astype(object)), "poses_bounds.npy: expected an array as numpy.save writes"),
     (poses(stretched), "poses_bounds.npy: cam02: expected a rigid world-to-camera matrix"),
@@ -227,6 +235,9 @@ FAULTS: list[tuple[Callable[[Path], object], str]] = [
     (poses(lambda rows: rows * np.where(np.arange(17) == 9, 2, 1)), "cam00.mp4: expected 64x24 as poses_bounds.npy"),
     (lambda root: (root / "poses_bounds.npy").write_bytes(b"\x93NUMPY"), "expected an array"),
     (film("cam02", FRAMES - 1), r"cam02.mp4: expected 5 frames as cam00.mp4, got 4.*scene.frames=\[0,3\]"),
+    (film("cam100", FRAMES), "expected films cam00.mp4 to cam99.mp4, .* got cam100.mp4 too: rename"),
+    (lambda root: (root / "cam02.mp4").rename(root / "cam_02.mov"), "got cam_02.mov too: rename"),
+    (film("cam02", FRAMES, rate=60), "cam02.mp4: expected 30 frames a second as cam00.mp4, got 60: .* to one rate"),
     (film("cam02", FRAMES, 2 * WIDTH), "cam02.mp4: expected 32x24 as cam00.mp4, got 64x24"),
     (lambda root: (root / "cam02.mp4").write_bytes(b"#EXTM3U\nhttp://localhost/"), "cam02.mp4: expected an MP4"),
     (lambda root: (root / "cam02.mp4").write_bytes((root / "cam02.mp4").read_bytes()[:60]), "OpenCV cannot decode"),
@@ -266,10 +277,36 @@ def test_a_film_that_ends_early_leaves_no_file(root, monkeypatch):
     with pytest.raises(InputError, match=r"cam05/4\.png"):
         scenes.load(root)
     assert sorted(path.name[:5] for path in (root / n3v.DECODED).iterdir()) == [*CAMERAS]
+    write_image(root / "cam05/4.png", np.zeros((HEIGHT // 2, WIDTH, 3), np.uint8))
+    with pytest.raises(
+        InputError, match=r"cam05: frame 4: expected .* 32x24 as others, got 3 channels of 8 bits and 32x12"
+    ):
+        scenes.load(root)
     monkeypatch.setattr(cv2.VideoCapture, "grab", lambda _: False)
-    with pytest.raises(InputError, match="the film ends before frame 1"):
+    with pytest.raises(InputError, match=r"the film ends before frame 1: copy it again, or choose other scene\.frames"):
         scenes.load(root, frames=(1, 2))
     assert len(list((root / n3v.DECODED).iterdir())) == len(CAMERAS)
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_frames_at_uneven_times_are_told(late, root, monkeypatch, capsys):
+    """Catches a film that has lost a frame, after which all are of another time, and a film of 29.97 that is blamed."""
+    write_film(root / "cam02.mp4", [pixels_of(2, frame) for frame in range(FRAMES)], 29.97)
+    plain, shown = cv2.VideoCapture.get, []
+
+    def get(video: cv2.VideoCapture, key: int) -> float:
+        value = plain(video, key)
+        if late and key == cv2.CAP_PROP_POS_MSEC:
+            shown.append(value)
+            value += 33 * (len(shown) == FRAMES)  # the last frame of cam00
+        return value
+
+    monkeypatch.setattr(cv2.VideoCapture, "get", get)
+    scenes.load(root)
+    error = capsys.readouterr().err
+    told = f"{root}/cam00.mp4: frame 4 comes 66.33 ms after the one before, others 33.33 ms: are frames missing"
+    assert (told in error) is late
+    assert "cam02.mp4: frame 1 comes" not in error
 
 
 def test_captures_with_llff_poses_stay_captures(taken):
