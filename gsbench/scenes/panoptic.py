@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import zipfile
 from dataclasses import dataclass
 from itertools import islice
@@ -24,6 +25,8 @@ from gsbench.scenes.shots import Lens, Shot
 IMAGES = "ims"
 MASKS = "seg"  # the folder of masks; a pixel is 1 where someone plays, 0 elsewhere
 POINTS = "init_pt_cld.npz"
+_NUMBER = re.compile(r"\d+(?=\D*$)")  # the last one in a name
+_SHOWN = 4  # numbers that a sentence names
 _MAX_POINTS = 1 << 30  # bytes of init_pt_cld.npz
 
 
@@ -68,6 +71,7 @@ def load(root: Path, name: str, rendition: Rendition) -> Scene:
     notes = [*train.notes, *test.notes]
     if shared := sorted(train.cameras & test.cameras):
         notes.append(f"cameras {', '.join(map(str, shared))} of test are cameras of train too")
+    notes += _out_of_step(train, test)
     loaded = shots.read([*train.shots, *test.shots], rendition)
     views = iter(loaded.views)  # first those of train
     digests = loaded.by_path(root)
@@ -115,6 +119,23 @@ def _read_split(root: Path, source: Path) -> _Split:
         raise InputError(f"{source}: fn: expected each image once, some appear twice: look for a copied line")
     numbers = {number for row in meta.cam_id for number in row}
     return _Split(listed, numbers, times, digest, files.unread(source.name, others))
+
+
+def _out_of_step(*splits: _Split) -> list[str]:
+    """Return a sentence if images of one time have different numbers at the end of their names, as if of other times.
+
+    A number that does not change with time, as in the names 000000/cam3, is of the camera.
+    """
+    rows = [[number for shot in split.shots for number in _NUMBER.findall(shot.name)] for split in splits]
+    if any(len(row) != len(split.shots) for row, split in zip(rows, splits, strict=True)):
+        return []
+    numbers = [np.array(row, object).reshape(split.times, -1) for row, split in zip(rows, splits, strict=True)]
+    by_time = np.concatenate(numbers, 1)  # [times, cameras] texts
+    odd = np.flatnonzero((by_time != by_time[:, :1]).any(1))
+    if not len(odd) or (by_time == by_time[0]).all():
+        return []
+    found = ", ".join(sorted({*by_time[odd[0]]})[:_SHOWN])
+    return [f"images of time {odd[0]} have different numbers in their names, such as {found}: are they of one moment?"]
 
 
 def _array(nested: list[Any], shape: tuple[int, ...], where: str) -> NDArray[np.float64]:

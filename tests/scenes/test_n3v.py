@@ -304,8 +304,8 @@ def test_frames_at_uneven_times_are_told(late, root, monkeypatch, capsys):
     monkeypatch.setattr(cv2.VideoCapture, "get", get)
     scenes.load(root)
     error = capsys.readouterr().err
-    told = f"{root}/cam00.mp4: frame 4 comes 66.33 ms after the one before, others 33.33 ms: are frames missing"
-    assert (told in error) is late
+    message = f"{root}/cam00.mp4: frame 4 comes 66.33 ms after the one before, others 33.33 ms: are frames missing"
+    assert (message in error) is late
     assert "cam02.mp4: frame 1 comes" not in error
 
 

@@ -92,6 +92,24 @@ def test_what_is_not_understood_is_told(root):
     assert "cameras 3 of test are cameras of train too" in notes
 
 
+def test_times_that_are_out_of_step_are_told(root):
+    """Catches test images of other moments than those of train, in silence, and numbers of cameras taken for times."""
+    edit(lambda content: content.update(fn=content["fn"][::-1]), "test")(root)
+    assert "images of time 0 have different numbers in their names, such as 000000, 000006: are" in str(
+        scenes.load(root).notes
+    )
+    for time in range(TIMES):
+        for camera in range(5):
+            for folder in ("ims", "seg"):
+                path = root / f"{folder}/{time}/cam{camera}.png"
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes((root / f"{folder}/{camera}/{3 * time:06d}.png").read_bytes())
+    for split, cameras in (("train", [0, 1, 3, 4]), ("test", [TEST_CAMERA])):
+        names = [[f"{time}/cam{camera}.png" for camera in cameras] for time in range(TIMES)]
+        edit(lambda content, names=names: content.update(fn=names), split)(root)
+    assert "are they of one moment" not in str(scenes.load(root).notes)
+
+
 def points(**arrays: np.ndarray) -> Callable[[Path], object]:
     return lambda root: np.savez(root / "init_pt_cld.npz", **arrays)
 
