@@ -134,8 +134,10 @@ def _out_of_step(*splits: _Split) -> list[str]:
     odd = np.flatnonzero((by_time != by_time[:, :1]).any(1))
     if not len(odd) or (by_time == by_time[0]).all():
         return []
-    found = ", ".join(sorted({*by_time[odd[0]]})[:_SHOWN])
-    return [f"images of time {odd[0]} have different numbers in their names, such as {found}: are they of one moment?"]
+    examples = ", ".join(sorted({*by_time[odd[0]]})[:_SHOWN])
+    return [
+        f"images of time {odd[0]} have different numbers in their names, such as {examples}: are they of one moment?"
+    ]
 
 
 def _array(nested: list[Any], shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
