@@ -150,13 +150,15 @@ def _disk() -> Iterator[Check]:
 
 def _compiler() -> Iterator[Check]:
     """Name the C++ compiler with which a build would start: that of CXX, or the first of COMPILERS."""
-    names = [name for name in (os.environ.get("CXX"), *COMPILERS) if name]
-    path = next((path for name in names if (path := shutil.which(name))), None)
-    if path is None:
-        yield Check("compiler", ABSENT, "none", "to build from source: apt-get install g++ python3-dev")
+    chosen = os.environ.get("CXX", "").split()  # perhaps with arguments, as in "ccache g++"
+    commands = [chosen] if chosen else [[name] for name in COMPILERS]
+    command = next((command for command in commands if shutil.which(command[0])), None)
+    if command is None:
+        name = f"none: CXX={' '.join(chosen)} is not there" if chosen else "none"
+        yield Check("compiler", ABSENT, name, "to build from source: apt-get install g++ python3-dev")
         return
-    done = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=TIMEOUT, check=False)
-    yield Check("compiler", OK, f"{(done.stdout.splitlines() or [path])[0]}")
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    yield Check("compiler", OK, f"{(done.stdout.splitlines() or command)[0]}")
 
 
 def _kernels() -> Iterator[Check]:

@@ -49,7 +49,7 @@ class Export(NamedTuple):
 def main(arguments: list[str] | None = None) -> int:
     """Write the PLY, the video or the images of the command line; return 0, or 2 after an error message."""
     try:
-        export = prepare(parser().parse_args(arguments))
+        export = prepare(parser().parse_args(joined(sys.argv[1:] if arguments is None else arguments)))
         options = export.options
         notes = []
         for name, write in WRITERS.items():
@@ -67,6 +67,14 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"gsbench.export: {why}{one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+def joined(words: list[str]) -> list[str]:
+    """Join a direction to its option, as argparse takes -1,0,0 for an option."""
+    if "--direction" not in words[:-1]:
+        return words
+    at = words.index("--direction")
+    return [*words[:at], f"--direction={words[at + 1]}", *words[at + 2 :]]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -124,6 +132,7 @@ def prepare(options: argparse.Namespace) -> Export:
         check_file("--video", options.video, *video.SUFFIXES)
     if options.images:
         check_parent(options.images)
+        check_folder("--images", options.images)
     if options.plys:
         check_clip(options)
     check_device(options.device)
@@ -169,13 +178,18 @@ def check_clip(options: argparse.Namespace) -> None:
             f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply"
         )
     check_parent(folder)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--plys: expected a folder, {folder} is a file: name another")
+    check_folder("--plys", folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             f"--plys: expected a new or an empty folder, {folder} has files, which a viewer would take "
             f"for frames: name another"
         )
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Raise InputError if the folder of an option is a file."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{option}: expected a folder, {folder} is a file: name another")
 
 
 def frame_count(options: argparse.Namespace) -> int:

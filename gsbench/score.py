@@ -126,8 +126,8 @@ def score(options: argparse.Namespace) -> tuple[Record, Path]:
     records.write(record, folder / records.FILE_NAME)
     for name, image in measured.images.items():
         write_png(image, folder / name)
-    if (measured.metrics["psnr"] or 0) < (measured.metrics["psnr_background_only"] or 0):
-        print(f"{config.scene.name}: PSNR is below that of the background alone: are these images of these views?")
+    if (measured.metrics["psnr"] or 0) <= (measured.metrics["psnr_background_only"] or 0):
+        print(f"{config.scene.name}: PSNR is not above that of the background alone: are these images of these views?")
     return record, folder
 
 

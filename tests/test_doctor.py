@@ -73,8 +73,10 @@ def test_the_compiler_is_the_one_that_builds(capsys, monkeypatch, tmp_path):
     compiler = tmp_path / "my-c++"
     compiler.write_text("#!/bin/sh\necho my compiler 1.0\n")
     compiler.chmod(0o755)
-    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("CXX", f"{compiler} -m64")  # as "ccache g++"
     assert checks(capsys)["compiler"].detail == "my compiler 1.0"
+    monkeypatch.setenv("CXX", "/no/such")
+    assert checks(capsys)["compiler"].detail == "none: CXX=/no/such is not there"
 
 
 def test_kernels_are_checked_on_an_image_that_is_not_empty():

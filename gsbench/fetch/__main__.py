@@ -62,7 +62,7 @@ def folder_of(path: Path) -> Path:
         InputError: the text is not a valid folder name.
     """
     try:
-        if "\0" not in str(path):
+        if "\0" not in str(path) and not path.expanduser().is_file():
             return path.expanduser()
     except RuntimeError:  # `~` of an unknown user
         pass
@@ -90,8 +90,11 @@ def fetch(source: Source) -> str:
     if not source.is_archive:
         path = download(source, source.folder)
         return f"{source.name}: {path} {'is there: nothing fetched' if there else 'fetched'}"
-    if there:
-        return f"{source.name}: {source.target} is there: nothing fetched; {scenes(scenes_in(source.target))}"
+    if there and any(source.target.iterdir()):
+        present = scenes_in(source.target)
+        if not present:
+            raise InputError(f"{source.name}: {source.target} is there, but {scenes({})}: remove it and fetch again")
+        return f"{source.name}: {source.target} is there: nothing fetched; {scenes(present)}"
     archive = download(source, source.folder.parent)
     digest = sha256_of(archive)
     try:

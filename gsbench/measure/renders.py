@@ -79,7 +79,7 @@ def _of_folder(
 ) -> CheckedRenders:
     """Check the images of a folder, and match them to views; arguments are as in `check_renders`."""
     listed = sorted((folder / name for name in os.listdir(folder)), key=_order)
-    images = [path for path in listed if path.suffix.lower() in SUFFIXES]
+    images = [path for path in listed if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
     files, matched = _matched(folder, images, views)
     kinds, sizes, digests = set(), set(), {}
     for file, view in zip(files, views, strict=True):
@@ -121,7 +121,7 @@ def _matched(
     """Return the image of each view, and whether images were matched by names or by order."""
     by_name: dict[str, Path] = {}
     for path in images:
-        name = without_suffix(path.stem if path.suffix == ".npy" else path.name)
+        name = without_suffix(path.stem if path.suffix.lower() == ".npy" else path.name)
         if name in by_name:
             raise InputError(f"{folder}: expected one image of a name, got {by_name[name].name} and {path.name}")
         by_name[name] = path
@@ -141,7 +141,20 @@ def _matched(
             f"{names[0]}.png, got {len(images)}",
             docs=HOW_TO,
         )
+    _check_order(folder, images, names)
     return list(images), "order"
+
+
+def _check_order(folder: Path, images: Sequence[Path], names: Sequence[str]) -> None:
+    """Raise InputError if an image has, among other words, the name of another view than that of its place."""
+    for path, own in zip(images, names, strict=True):
+        words = [name for name in names if re.search(rf"(?<![^\W_]){re.escape(name)}(?![^\W_])", path.stem)]
+        if words and own not in words:
+            raise InputError(
+                f"{folder}: expected images in the order of the views, as none has the name of a view, got {path.name} "
+                f"in the place of {own}: name it {words[0]}{path.suffix}, and so the others",
+                docs=HOW_TO,
+            )
 
 
 def _some(names: Sequence[str]) -> str:

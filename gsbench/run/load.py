@@ -108,6 +108,8 @@ def load_run(folder: str | Path, device: str = "cpu", backend: str = "auto") -> 
         True
     """
     path = Path(folder) / checkpoint.FILE_NAME
+    if Path(folder).is_file():
+        raise InputError(f"{folder}: expected the folder of a run, got a file: name the folder of a {path.name}")
     if not path.exists():
         raise InputError(
             f"{folder}: expected the folder of a run with a {checkpoint.FILE_NAME}, found none: "

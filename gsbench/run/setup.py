@@ -199,14 +199,14 @@ def check_machine(config: Config) -> None:
         perceptual.load(backbone, file, config.device)
 
 
-def check_folder(folder: Path) -> None:
-    """Create the folder of a run if needed; raise InputError if files cannot be written there."""
+def check_folder(folder: Path, key: str = "results") -> None:
+    """Create the folder of a run if needed; raise InputError, which names `key`, if files cannot be written there."""
     probe = folder / ".probe"
     try:
         write_atomically(probe, b"")
         probe.unlink()
     except OSError as error:
-        raise InputError(f"results: expected a folder that can be written, got {folder}: {error.strerror}") from None
+        raise InputError(f"{key}: expected a folder that can be written, got {folder}: {error.strerror}") from None
 
 
 def check_device(name: str) -> None:

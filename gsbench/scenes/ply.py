@@ -40,6 +40,7 @@ _COMPRESSED = {  # by the first bytes, or by the suffix
     ".splat": "SPLAT",
     ".ksplat": "KSPLAT",
 }
+SUFFIXES = (".ply", *(mark for mark in _COMPRESSED if isinstance(mark, str)))  # of files of Gaussians
 _PICKLE, _HEAD = b"data.pkl", 256  # name of the first file in a checkpoint of PyTorch, and where it stands
 
 

@@ -16,8 +16,9 @@ from gsbench.models.cameras import around
 from gsbench.models.registry import import_models
 from gsbench.process.ending import end_with
 from gsbench.run.load import load_run, scene_of
-from gsbench.run.setup import LEAST_GAUSSIANS, evaluated_views
+from gsbench.run.setup import LEAST_GAUSSIANS, check_folder, evaluated_views
 from gsbench.scenes.gaussian_ply import read_trained
+from gsbench.scenes.ply import SUFFIXES
 from gsbench.stability.float32_error import Shot, measure
 from gsbench.train.batches import generator
 
@@ -52,9 +53,12 @@ def main(arguments: list[str] | None = None) -> int:
     from gsbench.stability import report  # imports matplotlib
 
     try:
-        if options.model.suffix.lower() == ".ply":
+        if options.model.suffix.lower() in SUFFIXES:
             refuse_options(options, ("data_root", "model_module"), "a PLY")
-            subject = of_ply(options.model, options.out or OUT)
+            out = options.out or OUT
+            if not options.json:
+                check_folder(out, "--out")
+            subject = of_ply(options.model, out)
         else:
             refuse_options(options, ("out",), "a run")
             import_models(options.model_module)

@@ -149,8 +149,10 @@ def write_images(images: Iterable[Pixels], folder: Path) -> None:
 
 
 def check_file(option: str, path: Path, *suffixes: str) -> None:
-    """Raise InputError unless the file of an option ends in one of the suffixes and can be written into its folder."""
+    """Raise InputError unless an option names a file with one of the suffixes, in a folder that exists."""
     check_parent(path)
+    if path.is_dir():
+        raise InputError(f"{option}: expected a file name, {str(path)!a:.200} is a folder: name another")
     if path.suffix.lower() not in suffixes:
         raise InputError(
             f"{option}: expected a file name that ends in {' or '.join(suffixes)}, got {str(path)!a:.200}",

@@ -201,11 +201,15 @@ def test_a_hostile_or_damaged_archive_is_refused(archive, message, address, tmp_
 
 
 def test_an_archive_without_scenes_says_so(address, tmp_path, monkeypatch, capsys):
-    """Catches a line that ends in the middle where an archive has other files than it should."""
+    """Catches a line that ends in the middle where an archive has other files than it should, an empty folder that is
+    taken for the data, and success without data."""
     Handler.files["dnerf.zip"] = zipped({"a.txt": b"a"})
-    for _ in ("unpacked", "there"):
-        assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
-        assert capsys.readouterr().out.endswith("; no scene with a transforms_train.json is in it\n")
+    (tmp_path / "data/dnerf").mkdir(parents=True)  # as of a user who made the folder first
+    assert fetched(address, tmp_path, monkeypatch, "dnerf") == 0
+    assert capsys.readouterr().out.endswith("; no scene with a transforms_train.json is in it\n")
+    assert fetched(address, tmp_path, monkeypatch, "dnerf") == 2
+    error = f"dnerf: {tmp_path}/data/dnerf is there, but no scene with a transforms_train.json is in it: remove it"
+    assert error in capsys.readouterr().err
 
 
 def test_weights_go_where_they_are_looked_for(address, tmp_path, monkeypatch, capsys):
@@ -294,7 +298,8 @@ def test_what_cannot_be_fetched_is_told(tmp_path, monkeypatch, capsys):
             (line,) = capsys.readouterr().err.splitlines()
             assert "GSBENCH_MIRROR" in line
             assert line.isprintable()
-    for to in ("a\0b", "~nobody.of.that.name/x"):
+    (tmp_path / "file").touch()
+    for to in ("a\0b", "~nobody.of.that.name/x", str(tmp_path / "file")):
         for words in (["dnerf"], ["--list"]):
             assert main([*words, "--to", to]) == 2
             (line,) = capsys.readouterr().err.splitlines()

@@ -141,6 +141,30 @@ def test_names_that_are_no_views_are_matched_by_their_order(views, tmp_path):
     assert (renders.facts.matched, renders.facts.kind) == ("order", "8-bit PNG")
 
 
+def test_an_order_that_names_contradict_is_refused(views, tmp_path):
+    """Catches files that are scored on views of other names, as their names say these views and more."""
+    for name in ("1_r_1.png", "2_r_0.png"):
+        put(name, png(BYTES))(tmp_path)
+    refused(tmp_path, "got 1_r_1.png in the place of r_0: name it r_1.png", views)
+    for before, after in (
+        ("1_r_1.png", "r_0_r_1.png"),
+        ("2_r_0.png", "r_1.render.png"),
+        ("r_1.render.png", "r_10.png"),
+    ):
+        (tmp_path / before).rename(tmp_path / after)
+        if after != "r_0_r_1.png":
+            assert check_renders(tmp_path, views, (0.0, 0.0, 0.0)).facts.matched == "order"
+
+
+def test_names_in_capitals_and_hidden_files(views, tmp_path):
+    """Catches .NPY that is matched by order, and copies that macOS makes, taken for images."""
+    for name, shade in (("r_1.NPY", 0.5), ("r_0.NPY", 1.0)):
+        put(name, npy(shade * FLOATS))(tmp_path)
+    put("._r_0.png", b"macOS")(tmp_path)
+    renders = check_renders(tmp_path, views[::-1], (0.0, 0.0, 0.0))
+    assert (renders.facts.matched, renders.files, renders.others) == ("names", ("r_1.NPY", "r_0.NPY"), ("._r_0.png",))
+
+
 def test_alpha_is_composited_over_the_background(views, tmp_path):
     """Catches alpha that is ignored or premultiplied: what is transparent has the background's colour, not its own."""
     half = np.concatenate([BYTES, np.full((SIZE, SIZE, 1), 51, np.uint8)], axis=-1)

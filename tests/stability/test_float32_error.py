@@ -154,14 +154,17 @@ def test_an_orbit_is_a_full_circle_at_a_moment_each(run, monkeypatch):
 
 def test_what_cannot_be_read_or_written_is_one_line(tmp_path, capsys):
     """Catches a stack trace for no run, no PLY, an --out that is a file, and options that are not read."""
-    (tmp_path / "broken.ply").write_text("no")
+    for name in ("broken.ply", "a.splat", "run.pt"):
+        (tmp_path / name).write_text("no")
     for arguments, expected in (
         ([tmp_path], "expected the folder of a run"),
         ([tmp_path / "broken.ply"], "expected a PLY"),
+        ([tmp_path / "a.splat"], "this file is compressed (SPLAT): npx"),
+        ([tmp_path / "run.pt"], "run.pt: expected the folder of a run, got a file: name the folder of a checkpoint.pt"),
         ([write_ply(tmp_path / "few.ply", count=3)], f"{tmp_path / 'few.ply'}: expected at least 4 Gaussians, found 3"),
         ([tmp_path / "broken.ply", "--data-root", tmp_path], "--data-root: expected none with a PLY"),
         ([tmp_path, "--out", tmp_path], "--out: expected none with a run"),
-        ([write_ply(tmp_path / "right.ply"), "--out", tmp_path / "broken.ply"], f"{tmp_path / 'broken.ply'}"),
+        ([write_ply(tmp_path / "right.ply"), "--out", tmp_path / "broken.ply"], "--out: expected a folder that can"),
     ):
         assert main([*map(str, arguments)]) == 2
         line = capsys.readouterr().err.splitlines()[-1]  # the PLY has a note on its columns

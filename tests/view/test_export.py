@@ -61,7 +61,7 @@ def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 # ---- PLY files
 
 
-@pytest.mark.parametrize("place", [("--camera", "2"), (*ALONG, "--time", "0.5")])
+@pytest.mark.parametrize("place", [("--camera", "2"), (*ALONG, "--time", "0.5"), ("--direction", "-1,0,0")])
 def test_a_ply_says_what_it_holds(place, folder, tmp_path, capsys):
     """Catches a count of what is left out that is not that of the file."""
     assert exports(folder, "--ply", "a.ply", *place)
@@ -368,6 +368,9 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
         (("--video", "a\0.mp4"), "a file"),
         (("--images", "a\0"), "a file"),
         (("--images", "nowhere/a"), "nowhere"),
+        (("--images", "full/file"), "--images: expected a folder, full/file is a file: name another"),
+        (("--video", "full/a.mp4"), "--video: expected a file name, 'full/a.mp4' is a folder: name another"),
+        ((*PLY, "--direction", "-1,x"), "--direction: expected three numbers X,Y,Z"),
         ((*VIDEO, "--fps", "0"), "--fps"),
         ((*VIDEO, "--seconds", "inf"), "--seconds"),
         ((*VIDEO, "--width", "0"), "--width"),
@@ -392,14 +395,14 @@ PLY, VIDEO, CLIP = ("--ply", "a.ply"), ("--video", "a.mp4"), ("--plys", "clip")
 )
 def test_what_is_asked_wrong_is_answered_in_one_line(words, text, folder, tmp_path, capfd):
     """Catches a stack trace, a message that does not name the option, and a file that is left behind."""
-    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "a.mp4").mkdir(parents=True)
     (tmp_path / "full" / "file").touch()
     assert not exports(folder, *words)
     (line,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gsbench.export:")]
     assert text in line
     assert line.isprintable()
     assert len(line) < 400
-    assert sorted(tmp_path.rglob("*")) == [tmp_path / "full", tmp_path / "full" / "file"]
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "full", tmp_path / "full" / "a.mp4", tmp_path / "full" / "file"]
 
 
 def test_a_disk_that_refuses_a_video_is_named(folder, tmp_path, monkeypatch, capfd):
