@@ -147,12 +147,12 @@ def _matched(
 
 def _check_order(folder: Path, images: Sequence[Path], names: Sequence[str]) -> None:
     """Raise InputError if an image has, among other words, the name of another view than that of its place."""
-    for path, own in zip(images, names, strict=True):
+    for path, expected in zip(images, names, strict=True):
         words = [name for name in names if re.search(rf"(?<![^\W_]){re.escape(name)}(?![^\W_])", path.stem)]
-        if words and own not in words:
+        if words and expected not in words:
             raise InputError(
                 f"{folder}: expected images in the order of the views, as none has the name of a view, got {path.name} "
-                f"in the place of {own}: name it {words[0]}{path.suffix}, and so the others",
+                f"in the place of {expected}: name each as its view, such as {names[0]}{path.suffix}",
                 docs=HOW_TO,
             )
 

@@ -145,7 +145,7 @@ def test_an_order_that_names_contradict_is_refused(views, tmp_path):
     """Catches files that are scored on views of other names, as their names say these views and more."""
     for name in ("1_r_1.png", "2_r_0.png"):
         put(name, png(BYTES))(tmp_path)
-    refused(tmp_path, "got 1_r_1.png in the place of r_0: name it r_1.png", views)
+    refused(tmp_path, "got 1_r_1.png in the place of r_0: name each as its view, such as r_0.png", views)
     for before, after in (
         ("1_r_1.png", "r_0_r_1.png"),
         ("2_r_0.png", "r_1.render.png"),
