@@ -49,7 +49,7 @@ def record(model: str, scene: str, seed: int) -> dict[str, Any]:
             missing={},
             provenance=replace(golden.provenance, config={"seed": seed, "all": asdict(Config())}),
             per_view=[ViewScore(f"r_{i}", psnr + i / 10 - 0.95, 28.0, 0.9, 0.1) for i in range(20)],
-            curve=[Point(1500 * (i + 1), 30.0 * i, 20 + i / 3) for i in range(20)],
+            curve=[Point(1500 * (i + 1), 4.5 * i, 20 + i / 3) for i in range(20)],
         )
     )
 
