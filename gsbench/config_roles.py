@@ -104,7 +104,7 @@ def key_of(override: str) -> str:
 def in_order(words: Sequence[str]) -> list[str]:
     """Return the words of a command line with added configs in the order of ADDED, and then by name.
 
-    So the order in which they were typed does not matter. A record has it no more, and its words repeat the run.
+    So the order in which they were typed does not matter: a record, whose words must repeat the run, does not keep it.
     """
 
     def place(word: str) -> tuple[int, str]:
@@ -113,6 +113,11 @@ def in_order(words: Sequence[str]) -> list[str]:
 
     added = sorted((word for word in words if word.startswith("+")), key=place)
     return [*added, *(word for word in words if not word.startswith("+"))]
+
+
+def without_agr(label: str) -> str:
+    """Return the name of the model of a label, which says whether it has AGR: 7dgs of 7dgs_noagr."""
+    return label.removesuffix("_noagr").removesuffix("_agr")
 
 
 def _decided(keys: Plain) -> Plain:

@@ -19,7 +19,7 @@ from gsbench.run.setup import check_device, evaluated_views
 from gsbench.scenes import Camera, Scene, View
 from gsbench.view import video
 from gsbench.view.slice_ply import SlicePly, write_clip, write_ply
-from gsbench.view.video import check_file, check_parent
+from gsbench.view.video import check_file, check_folder
 
 PATHS = {"orbit": video.orbit, "spiral": video.spiral}
 READERS = {  # for each option, the outputs that read it
@@ -131,7 +131,6 @@ def prepare(options: argparse.Namespace) -> Export:
     if options.video:
         check_file("--video", options.video, *video.SUFFIXES)
     if options.images:
-        check_parent(options.images)
         check_folder("--images", options.images)
     if options.plys:
         check_clip(options)
@@ -177,19 +176,12 @@ def check_clip(options: argparse.Namespace) -> None:
             f"--plys: expected at least {LEAST_FILES} files, --fps {options.fps:g} and --seconds "
             f"{options.seconds:g} give {frame_count(options)}: raise them, or use --ply"
         )
-    check_parent(folder)
     check_folder("--plys", folder)
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             f"--plys: expected a new or an empty folder, {folder} has files, which a viewer would take "
             f"for frames: name another"
         )
-
-
-def check_folder(option: str, folder: Path) -> None:
-    """Raise InputError if the folder of an option is a file."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{option}: expected a folder, {folder} is a file: name another")
 
 
 def frame_count(options: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from gsbench.config_roles import without_agr
 from gsbench.errors import InputError, one_line, printable
 from gsbench.launch.command import Command, compose_run, hydra_with, runs_of
 from gsbench.measure import record as records
@@ -142,7 +143,7 @@ def _run_of(options: argparse.Namespace) -> tuple[RunSpec, Path]:
         if key not in KEYS:
             raise InputError(f"{word!r:.200}: expected a key of {', '.join(KEYS)}, as nothing is trained: leave it out")
     # Runs of gsbench have the name of a model, also with _agr or _noagr, or "auto".
-    if is_registered(options.name.removesuffix("_noagr").removesuffix("_agr")) or options.name == AUTO:
+    if is_registered(without_agr(options.name)) or options.name == AUTO:
         raise InputError(
             f"--name: expected a name that no model of gsbench has, got {options.name}: try {options.name}_official"
         )

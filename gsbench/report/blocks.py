@@ -422,10 +422,10 @@ def _removal(chapter: Results, model: str) -> pd.DataFrame:
 
 def trials(published: Path) -> str:
     """Return PSNR on val of each model with the recipe, and its changes by conf/trial/: means over six scenes."""
-    named = {trial: study(published / f"tuning.{trial}")["tuning"].runs.assign(trial=trial) for trial in TRIALS[:-1]}
+    studies = [study(published / f"tuning.{trial}")["tuning"].runs.assign(trial=trial) for trial in TRIALS[:-1]]
     others = pd.concat([only(published, f"tuning.{models}").runs for models in ("successors", "rivals")])
     others = others.assign(trial=others.variant.str.removeprefix("trial=").str.split(".").str[-1])
-    runs = pd.concat([*named.values(), others])
+    runs = pd.concat([*studies, others])
     psnr = runs.pivot(index=["model", "trial"], columns="scene", values="psnr_db").mean(axis=1, skipna=False).unstack()
     table = psnr.sub(psnr.recipe, axis=0).assign(recipe=psnr.recipe)[TRIALS]
     columns = {name: Column(f"`{name}`", signed=name != "recipe") for name in TRIALS}

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from gsbench.config_roles import flat
+from gsbench.config_roles import flat, without_agr
 from gsbench.errors import InputError
 from gsbench.measure import record as files
 from gsbench.measure.exact_views import MOST_PSNR
@@ -102,10 +102,12 @@ def _of_names(record: Record) -> str:
     """Return which name of a record is not that of its settings; "" if all are."""
     settings = dict(flat(record.provenance.config))
     for name, key in NAMES.items():
-        here, there = (str(value) for value in (getattr(record, name), settings.get(key)))
+        if key not in settings or (name == "model" and record.rendered_elsewhere):
+            continue
+        here, there = str(getattr(record, name)), str(settings[key])
         if name == "model":
-            here, there = (text.removesuffix("_noagr").removesuffix("_agr") for text in (here, there))
-        if key in settings and here != there and not (name == "model" and record.rendered_elsewhere):
+            here, there = without_agr(here), without_agr(there)
+        if here != there:
             return f"{name}: expected {there:.80}, as in provenance.config, got {here:.80}"
     return ""
 

@@ -131,11 +131,8 @@ class Candidates:
             InputError: the checkpoint is damaged.
             Stopped: a signal asked the process to end; the checkpoint is saved.
         """
-        spec, run, trainer = (
-            self.spec,
-            self._run(name),
-            self.trainer(name, quiet=bool(before)),
-        )  # all start from the same points
+        spec, run = self.spec, self._run(name)
+        trainer = self.trainer(name, quiet=bool(before))  # all start from the same points
         done, seconds = sum(each.steps for each in before), sum(each.candidate.seconds for each in before)
         error = frame_ms = None  # frame_ms stays None if the training fails or takes too long
         try:

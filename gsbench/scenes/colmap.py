@@ -131,12 +131,12 @@ def _list_shots(root: Path, posed: ModelFile, lenses: dict[int, Lens]) -> tuple[
     names, viewmats = [image.name for image in posed_images], np.stack([image.viewmat for image in posed_images])
     keys = [lenses[image.camera].key for image in posed_images]
     timed, digests = times.of_images(root, times.NamedImages(names, viewmats, keys, posed.path))
-    listed_shots, finder, named = [], ImageFinder(root), dict[str, str]()
+    listed_shots, finder, image_of_view = [], ImageFinder(root), dict[str, str]()
     for image, time in zip(posed_images, timed.values, strict=True):
         where = f"{posed.path}: image {image.name[:80]!a}"
         path = finder.find(f"{IMAGES}/{image.name}", where)
         name = files.without_suffix(path.relative_to(root / IMAGES).as_posix())
-        if (other := named.setdefault(name, image.name)) != image.name:
+        if (other := image_of_view.setdefault(name, image.name)) != image.name:
             raise InputError(
                 f"{where}: expected a file of its own, and a name that differs in more than its suffix, got "
                 f"{path.relative_to(root).as_posix()[:80]!a}, and {other[:80]!a} is there too: rename or remove one"

@@ -99,9 +99,8 @@ def draw(exactness: Exactness, path: Path) -> None:
     for pane, values in zip(axes[1:], (error, STEPS * exact.bound), strict=True):
         drawn = pane.imshow(np.clip(values.numpy(), *ROUNDING_SCALE), norm=scale, cmap="inferno")
     for pane, title in zip(axes, (f"{exactness.title}\n{name}", "error of float32", "bound"), strict=True):
-        pane.set_title(
-            title, fontsize=min(12, 400 / max(map(len, title.splitlines())))
-        )  # a long one stays over its pane
+        longest = max(map(len, title.splitlines()))
+        pane.set_title(title, fontsize=min(12, 400 / longest))  # a long one stays over its pane
         pane.set(xticks=[], yticks=[])
     figure.colorbar(drawn, ax=axes[1:], label="steps of 8 bits")
     png = io.BytesIO()

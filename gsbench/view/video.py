@@ -160,6 +160,13 @@ def check_file(option: str, path: Path, *suffixes: str) -> None:
         )
 
 
+def check_folder(option: str, folder: Path) -> None:
+    """Raise InputError unless an option names a folder, perhaps a new one, in a folder that exists."""
+    check_parent(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{option}: expected a folder, {folder} is a file: name another")
+
+
 def check_parent(path: Path) -> None:
     """Raise InputError unless `path` is a valid file name and its parent folder exists."""
     if not path.name or "\0" in str(path):
