@@ -91,7 +91,7 @@ def test_the_help_explains_keys(capsys):
         (["=3"], ["'=3': expected KEY=VALUE"]),
         (["model=7dgs"], ["+exp=NAME", "ablation, colmap, dnerf, frontier", "mini, n3v, panoptic, pbr"]),
         (["+exp=dnerf", "scene=trex"], ["data.root", "transforms_", "albertpumarola/D-NeRF"]),
-        (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["/nowhere/trex", "transforms_", "D-NeRF"]),
+        (["+exp=dnerf", "scene=trex", "data.root=/nowhere"], ["data.root=/nowhere", "transforms_", "D-NeRF"]),
         (["+exp=mini", "scene=custom", "scene.name=../sample"], ["scene: expected a name", "../sample"]),
     ],
 )

@@ -31,7 +31,7 @@ from gsbench.config import CONF, PATHS, Config, register_schema
 from gsbench.config_roles import ADDED, config_hash, facts, in_order, key_of, names_variant, training_hash
 from gsbench.errors import InputError, deleted_key, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
-from gsbench.run.settings import check_settings
+from gsbench.run.settings import check_settings, data_root
 
 NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{].*|''|\"\"|")  # values for Hydra
 QUESTIONS = ("--hydra-help", "--cfg", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
@@ -209,12 +209,17 @@ def compose_run(overrides: Sequence[str]) -> RunConfig:
 
 
 def check_runs(runs: Sequence[RunConfig]) -> None:
-    """Raise InputError if an override does nothing in any of the runs, or if two of them are one run."""
+    """Raise InputError if an override does nothing in any of the runs, if two are one run, or if there are no data."""
     for key in sorted({key_of(word) for run in runs for word in run.overrides}):
         needed = facts(key).needs
         if needed and all(OmegaConf.select(run.config, needed) in (None, facts(needed).absent) for run in runs):
             raise InputError(f"{key}: expected {needed} too, without which it does nothing: set it, or leave {key} out")
     _check_distinct(runs)
+    for run in runs:
+        data = run.config.data
+        # A folder of a Slurm job may exist on its nodes only.
+        if run.config.launch.by != "slurm" and not data_root(data.root).is_dir():
+            raise _no_data(data, f"data.root={data.root}: there is no such folder: set")
 
 
 def _check_distinct(runs: Sequence[RunConfig]) -> None:
@@ -265,13 +270,18 @@ def check_complete(config: DictConfig) -> None:
     if OmegaConf.is_missing(config.scene, "name"):
         raise InputError("scene=custom: expected the name of a scene: add scene.name=FOLDER, a folder in data.root")
     if OmegaConf.is_missing(config.data, "root"):
-        raise InputError(
-            f"data.root is not set: add data.root=PATH, the folder that holds the scenes of "
-            f"{config.data.dataset} ({', '.join(config.data.scenes)}), each with "
-            f"transforms_{{train,val,test}}.json and the images they name. "
-            f"Published at: {config.data.published}",
-            docs="data.md#what-is-read",
-        )
+        raise _no_data(config.data, "data.root is not set: add")
+
+
+def _no_data(data: DictConfig, wrong: str) -> InputError:
+    """Return the error that `data.root` names no folder of data; `wrong` is the beginning of its message."""
+    scenes = f" ({', '.join(data.scenes)})" if data.scenes else ""
+    published = f". Published at: {data.published}" if data.published else ""
+    return InputError(
+        f"{wrong} data.root=PATH, the folder that holds the scenes of {data.dataset}{scenes}, each with "
+        f"transforms_{{train,val,test}}.json and the images they name{published}",
+        docs="data.md#what-is-read",
+    )
 
 
 def explain(error: Exception) -> str:

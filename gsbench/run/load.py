@@ -13,8 +13,8 @@ from gsbench.errors import InputError, one_line
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
 from gsbench.reading import parse
-from gsbench.run.settings import check_values
-from gsbench.run.setup import PACKAGE, build_with_placeholders, check_scene_names, load_scene
+from gsbench.run.settings import PACKAGE, check_values
+from gsbench.run.setup import build_with_placeholders, check_scene_names, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Placement
 from gsbench.schedule import Schedule

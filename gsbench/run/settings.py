@@ -1,6 +1,7 @@
 """Check what a user asks for, before a file is read and before torch is imported; name the models of model=auto."""
 
 import dataclasses
+import importlib.resources
 import itertools
 import os
 import re
@@ -18,6 +19,7 @@ from gsbench.train.hooks import check_step, hook_types
 
 AUTO = "auto"
 CANDIDATES = ("moving", "static")  # with and without time, of which model=auto trains one
+PACKAGE = "pkg://"  # in front of the module whose files data.root names
 HOW_TO = "effects.md#comparing-models-on-val"
 
 
@@ -180,3 +182,19 @@ def lpips_weights(config: Config) -> dict[str, Path]:
     """Return the weight files of LPIPS networks in the settings, by network ("alex", "vgg")."""
     files = {"alex": config.protocol.lpips_alex, "vgg": config.protocol.lpips_vgg}
     return {backbone: Path(os.path.expanduser(file)) for backbone, file in files.items() if file}
+
+
+def data_root(root: str) -> Path:
+    """Return the folder of a data set, given as a path or as `pkg://module` for data inside a Python package.
+
+    Raises:
+        InputError: the module does not exist, or the path is invalid.
+    """
+    if "\0" in root:
+        raise InputError(f"data.root: expected a path, got {root!r:.200}")
+    if not root.startswith(PACKAGE):
+        return Path(os.path.expanduser(root))
+    try:
+        return Path(str(importlib.resources.files(root.removeprefix(PACKAGE))))
+    except (ImportError, ValueError, TypeError) as error:
+        raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None

@@ -1,6 +1,5 @@
 """Build the model and load the scene that settings name, and check that they and this machine can do the run."""
 
-import importlib.resources
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -19,7 +18,7 @@ from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
-from gsbench.run.settings import check_device_name, lpips_weights
+from gsbench.run.settings import check_device_name, data_root, lpips_weights
 from gsbench.scenes import Points, Scene, View
 from gsbench.scenes.gaussian_ply import TrainedGaussians, read_trained, share_seen
 from gsbench.train.batches import generator
@@ -27,7 +26,6 @@ from gsbench.train.hooks import hook_types
 from gsbench.train.losses import WINDOW
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-PACKAGE = "pkg://"  # in front of the module whose files data.root names
 LEAST_GAUSSIANS = 4  # the fewest Gaussians to start from: initial scales come from three neighbours
 ENOUGH_SEEN = 0.5  # share of Gaussians to start from that a camera sees; below it a line says so
 
@@ -129,22 +127,6 @@ def check_scene_names(config: Config) -> None:
     """Raise InputError unless the scene's name, and every folder in its published name, is a name of a folder."""
     for name in (config.scene.name, *(config.scene.released_as or config.scene.name).split("/")):
         run_path(Path(), config.experiment, name, config.model.name, config.seed)
-
-
-def data_root(root: str) -> Path:
-    """Return the folder of a data set, given as a path or as `pkg://module` for data inside a Python package.
-
-    Raises:
-        InputError: the module does not exist, or the path is invalid.
-    """
-    if "\0" in root:
-        raise InputError(f"data.root: expected a path, got {root!r:.200}")
-    if not root.startswith(PACKAGE):
-        return Path(os.path.expanduser(root))
-    try:
-        return Path(str(importlib.resources.files(root.removeprefix(PACKAGE))))
-    except (ImportError, ValueError, TypeError) as error:
-        raise InputError(f"data.root: expected pkg://MODULE of an installed package, got {root!r}: {error}") from None
 
 
 def trained_start(config: Config) -> TrainedGaussians | None:

@@ -100,6 +100,10 @@ def test_the_runs_of_a_command(words, runs):
         ("+exp=ablation scene=dust model=6dgs", "time_only: expected no other model beside it than 4dgs"),
         ("+exp=mini scene=dust train.coarse=[4,300]", r"coarse=\[4,300\]: Invalid value assigned: int is not"),
         ("+exp=mini scene=dust ~protocol", "'protocol.name': expected a value, got none: set it"),
+        (
+            "+exp=dnerf data.root=/nowhere",
+            r"root=/nowhere: there is no such folder: set data.root=PATH, .* D-NeRF \(bounc",
+        ),
         (f"{JOB} launch.sbatch.qos=x", r"'launch.sbatch.qos': expected \+ .*: type \+launch.sbatch.qos"),
         *(
             (f"{JOB} launch.{word}", rf"launch\.{word.partition('=')[0]}: expected .*\d")
@@ -119,14 +123,16 @@ def test_a_command_without_runs_is_refused(words, message):
     """Catches a sweep of no run that ends well, options of Hydra, a word or a launcher's key that would be dropped in
     silence, a key without the one that it needs, a scene that is no scene, one folder that several runs share, and a
     job that is submitted and fails, or is never requeued, for a number out of its range; an ablation without its model,
-    and a scene called all."""
+    a scene called all, and a failed run for each scene of a folder that does not exist."""
     with pytest.raises(InputError, match=message):
         check_runs([compose_run(run) for run in runs_of(parse(words.split()))[0]])
 
 
 def test_a_sweep_of_different_runs_is_allowed():
-    """Catches a sweep over protocols, results or PLYs refused as one run, and a key that one run does not read."""
-    several = ("protocol=gsbench,published", "results=a,b", "+init.ply=a,b", "effects.budget_db=1 effects.gate=end,off")
+    """Catches a sweep over protocols, results or PLYs refused as one run, a key that one run does not read, and data
+    that only the nodes of a cluster have."""
+    several = ["protocol=gsbench,published", "results=a,b", "+init.ply=a,b", "effects.budget_db=1 effects.gate=end,off"]
+    several += ["+launch=slurm data.root=/nowhere"]
     for words in several:
         runs = runs_of(parse(["+exp=mini", "-m", "scene=dust", *words.split()]))[0]
         check_runs([compose_run(run) for run in runs])
