@@ -9,18 +9,23 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsbench.errors import InputError, did_you_mean, one_line
+from gsbench.errors import InputError, check_known, did_you_mean, one_line
 from gsbench.models.base import GaussianModel
 
 _REGISTRY: dict[str, type[GaussianModel]] = {}
+HOW_TO = "adding_a_model.md"
 ENTRY_POINTS = "gsbench.models"  # the group in which an installed package lists its modules of models
 M = TypeVar("M", bound=type[GaussianModel])
 
 
 def register(name: str) -> Callable[[M], M]:
-    """Return a class decorator that registers a model as `name`; raises InputError if another class has the name."""
+    """Return a class decorator that registers a model as `name`.
+
+    The decorator raises InputError if another class has the name, or if the class is no model.
+    """
 
     def enter(model: M) -> M:
+        _check_class(name, model)
         other = _REGISTRY.get(name, model)
         # A module that is imported again registers a new class of the same name, which replaces the old one.
         if (other.__module__, other.__qualname__) != (model.__module__, model.__qualname__):
@@ -29,6 +34,18 @@ def register(name: str) -> Callable[[M], M]:
         return model
 
     return enter
+
+
+def _check_class(name: str, model: type) -> None:
+    """Raise InputError unless a class is a model whose lists of names are tuples."""
+    if not (isinstance(model, type) and issubclass(model, GaussianModel)):
+        raise InputError(f"model '{name}': expected a subclass of GaussianModel, got {model!r:.80}", docs=HOW_TO)
+    for attribute in ("observes", "centers", "geometry"):
+        names = getattr(model, attribute, None)
+        if not isinstance(names, tuple) or not all(isinstance(each, str) for each in names):
+            raise InputError(f"model '{name}': {attribute}: expected a tuple of names, got {names!r:.80}", docs=HOW_TO)
+    for each in model.observes:
+        check_known(f"model '{name}': observes:", each, ("time", "direction"))
 
 
 def find(name: str, module: str | None = None) -> type[GaussianModel]:
@@ -42,7 +59,8 @@ def find(name: str, module: str | None = None) -> type[GaussianModel]:
     _import_all()
     import_models(module, f"model.module={module!a:.80}")
     if not isinstance(name, str) or name not in _REGISTRY:
-        raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}")
+        hint = "" if module else " A model of yours needs module: NAME in its YAML."
+        raise InputError(f"model '{name}' is not known. {did_you_mean(name, _REGISTRY)}{hint}", docs=HOW_TO)
     return _REGISTRY[name]
 
 
@@ -68,6 +86,8 @@ def import_models(
     """Import a Python module that registers models; raises InputError with the file and line if the import fails."""
     if module is None:
         return
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise InputError(f"{named_by}: expected the name of a module, such as package.module", docs=HOW_TO)
     try:
         importlib.import_module(module)
     except InputError:
@@ -80,7 +100,7 @@ def import_models(
         raise InputError(
             f"{named_by}: expected a Python module that can be imported: {where}"
             f"{type(error).__name__}: {one_line(error)}{advice}",
-            docs="adding_a_model.md",
+            docs=HOW_TO,
         ) from None
 
 
@@ -113,7 +133,7 @@ def build(name: str, *, module: str | None = None, **options: Any) -> GaussianMo
         lacks = ", ".join(sorted(model.__abstractmethods__))
         raise InputError(
             f"model '{name}': expected all methods that a model needs, {model.__name__} lacks {lacks}",
-            docs="adding_a_model.md",
+            docs=HOW_TO,
         )
     # A constructor passes unknown options on to its base, so the options are those of all base classes.
     parameters: dict[str, inspect.Parameter] = {}

@@ -16,6 +16,7 @@ from gsbench.measure import perceptual
 from gsbench.measure.atomic import write_atomically
 from gsbench.measure.record import run_path
 from gsbench.models import GaussianModel
+from gsbench.models.rehearsal import rehearse
 from gsbench.run.grammar import typed
 from gsbench.run.identity import hash_of
 from gsbench.run.settings import check_device_name, data_root, lpips_weights
@@ -34,7 +35,7 @@ def build(config: Config) -> GaussianModel:
     """Build the model that the settings name, without Gaussians.
 
     Raises:
-        InputError: the model or an option is unknown, or a training hook needs another model.
+        InputError: the model or an option is unknown, its code has a mistake, or a training hook needs another model.
     """
     options: dict[str, Any] = {
         "module": config.model.module,
@@ -48,6 +49,7 @@ def build(config: Config) -> GaussianModel:
             key = {"agr": "agr", "backend": "raster.backend"}.get(name, f"model.{name}")
             raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
     model = models.build(config.model.name, **options, **config.model.options)
+    rehearse(model, config.model.name)
     for hook in hook_types():
         hook.check_model(model, config)
     return model

@@ -1,5 +1,5 @@
 // One Gaussian of Universal Beta Splatting over position p, direction and, if TIME, time: its conditional 3D Gaussian
-// with the exponent of its Beta profile, and the gradients. The formulas are those of gsbench/models/ubs.py.
+// with the exponent of its Beta profile, and the gradients. The formulas are those of gsbench/models/beta.py.
 #pragma once
 
 #include "beta_slice.h"
