@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from gsbench.errors import InputError, one_line
-from gsbench.models.base import CHILDREN, GaussianModel, Raw
+from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
+from gsbench.models.gated import has_gates
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.scenes.scene import Points
 
@@ -21,7 +22,7 @@ SHAPES = {"means": [N, 3], "factors": [N, 3, 3], "opacity_factor": [N], "beta_ex
 
 
 def rehearse(model: GaussianModel, name: str) -> None:
-    """Initialise, slice and split four Gaussians of a copy of a model that has none yet.
+    """Initialise, slice, split and freeze four Gaussians of a copy of a model that has none yet.
 
     Raises:
         InputError: a method raises an error, or returns what no training can use. The message names the method, and the
@@ -42,21 +43,26 @@ def rehearse(model: GaussianModel, name: str) -> None:
     raw: Raw = dict(model.splats.items())
     with _named(model, name, "condition"), torch.enable_grad():
         first, second = (model.condition(raw, query) for _ in range(2))
-        _check(isinstance(first, Conditioned), f"a Conditioned, got a {type(first).__name__}")
+        _check_conditioned(first)
         for field, value, again in zip(Conditioned._fields, first, second, strict=True):
-            if value is not None and again is not None:
-                _check_sliced(field, value.detach())
-                _check(torch.equal(value, again), f"the same {field} for the same query and parameters, got others")
+            is_same = value is again or (value is not None and again is not None and torch.equal(value, again))
+            _check(is_same, f"the same {field} for the same query and parameters, got others")
         _check_gradients(first, {key: raw[key] for key in (*model.centers, *model.geometry)})
     with _named(model, name, "slice"):
         model.slice(query)
     with _named(model, name, "split"):
-        children = model.split(model.raw_of(torch.tensor([0, 0, 1, 1])), torch.Generator().manual_seed(0))
-        _check_rows(children, 2 * CHILDREN)
-        for key, value in children.items():
-            _check(key in raw, f"raw parameters, got '{key}', which is none: {', '.join(raw)}")
-            shape = [2 * CHILDREN, *raw[key].shape[1:]]
-            _check(list(value.shape) == shape, f"{key} of shape {shape}, got {list(value.shape)}")
+        rows = torch.tensor([0, 0, 1, 1])
+        _check_changed(model.split(model.raw_of(rows), torch.Generator().manual_seed(0)), raw)
+    if has_gates(model):
+        with _named(model, name, "static"):
+            _check_conditioned(model.static(raw))
+        with _named(model, name, "frozen"):
+            frozen = model.frozen(model.raw_of(torch.arange(N)), [query], torch.ones(1, N))
+            expected = ["static", *model.observes] if model.observes else []
+            is_right = set(frozen) <= set(expected) and ("static" in frozen or not expected)
+            _check(is_right, f"static, and others of {expected}, got {list(frozen)}")
+            for changed in frozen.values():
+                _check_changed(changed, raw)
 
 
 def _check_rows(raw: Raw, rows: int) -> None:
@@ -68,7 +74,23 @@ def _check_rows(raw: Raw, rows: int) -> None:
         _check(bool(value.isfinite().all()), f"finite {key}, got {value.flatten().tolist()[:N]}")
 
 
-def _check_sliced(field: str, value: Tensor) -> None:
+def _check_changed(changed: Raw, raw: Raw) -> None:
+    """Raise InputError unless these are new values of raw parameters of N Gaussians."""
+    _check_rows(changed, N)
+    for key, value in changed.items():
+        _check(key in raw, f"raw parameters, got '{key}', which is none: {', '.join(raw)}")
+        shape = list(raw[key].shape)
+        _check(list(value.shape) == shape, f"{key} of shape {shape}, got {list(value.shape)}")
+
+
+def _check_conditioned(sliced: Conditioned) -> None:
+    _check(isinstance(sliced, Conditioned), f"a Conditioned, got a {type(sliced).__name__}")
+    for field, value in sliced._asdict().items():
+        if value is not None:
+            _check_field(field, value.detach())
+
+
+def _check_field(field: str, value: Tensor) -> None:
     _check(list(value.shape) == SHAPES[field], f"{field} of shape {SHAPES[field]}, got {list(value.shape)}")
     _check(value.dtype == torch.float32, f"{field} of torch.float32, got {value.dtype}")
     _check(bool(value.isfinite().all()), f"finite {field}, got {value.flatten().tolist()[:N]}")

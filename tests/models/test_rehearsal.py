@@ -11,11 +11,12 @@ from torch import Tensor
 from gsbench.errors import InputError
 from gsbench.models import build, registry
 from gsbench.models.base import SHRINK, GaussianModel
+from gsbench.models.gated import GatedModel
 from gsbench.models.gaussian_batch import Conditioned
 from gsbench.models.rehearsal import rehearse
 
 
-class Balls(GaussianModel):
+class Balls(GatedModel, gates=True):
     """Round Gaussians, as in docs/adding_a_model.md."""
 
     geometry = ("radii",)
@@ -31,6 +32,12 @@ class Balls(GaussianModel):
 
     def split(self, raw: Any, generator: torch.Generator) -> Any:
         return {"radii": raw["radii"] - math.log(SHRINK)}
+
+    def static(self, raw: Any) -> Any:
+        return self.condition(raw, None)
+
+    def frozen(self, raw: Any, queries: Any, weights: Tensor) -> Any:
+        return {}
 
 
 def factors(raw: Any) -> Tensor:
@@ -84,11 +91,15 @@ def test_no_mistake_is_seen_in_a_right_model(variant):
         ({"split": lambda *_: {"radiii": torch.ones(4, 1)}}, "split: expected raw parameters, got 'radiii'"),
         ({"split": lambda *_: {"radii": torch.ones(2, 1)}}, r"split: expected radii with 4 rows, .*, got \[2, 1\]"),
         ({"split": lambda *_: {"radii": torch.ones(4, 3)}}, r"split: expected radii of shape \[4, 1\], got \[4, 3\]"),
+        ({"static": lambda _, raw: raw}, "static: expected a Conditioned, got a dict"),
+        ({"frozen": lambda *_: {"static": {}}}, r"frozen: .* of \[\], got \['static'\]"),
+        ({"observes": ("time",)}, r"frozen: expected static, and .*, 'time'\], got \[\]"),
+        ({"observes": ("time",), "frozen": lambda *_: {"static": {"times": torch.ones(4)}}}, "frozen: .* got 'times'"),
     ],
 )
 def test_a_mistake_is_named(members, message):
     """Catches a mistake that ends a training in its midst, or that makes its result another model's, in silence."""
-    model = type("Mine", (Balls,), {"__module__": __name__} | members)()
+    model = type("Mine", (Balls,), {"__module__": __name__} | members, gates=True)()
     with pytest.raises(InputError, match=f"^model 'mine': .*{message}"):
         rehearse(model, "mine")
 
