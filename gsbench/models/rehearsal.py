@@ -1,6 +1,5 @@
 """Rehearse a model on four Gaussians before a training, so that mistakes in its code are found at the start."""
 
-import copy
 import inspect
 import traceback
 from collections.abc import Iterator
@@ -22,13 +21,13 @@ SHAPES = {"means": [N, 3], "factors": [N, 3, 3], "opacity_factor": [N], "beta_ex
 
 
 def rehearse(model: GaussianModel, name: str) -> None:
-    """Initialise, slice, split and freeze four Gaussians of a copy of a model that has none yet.
+    """Initialise, slice, split and freeze four Gaussians of a model, which is of no use afterwards.
 
     Raises:
         InputError: a method raises an error, or returns what no training can use. The message names the method, and the
             line of the model's file where it raised an error.
     """
-    model, points = copy.deepcopy(model), torch.eye(N, 3)
+    points = torch.eye(N, 3)
     with _named(model, name, "initial_geometry"):
         geometry = model.initial_geometry(Points(points, points), torch.ones(N), torch.Generator().manual_seed(0))
         _check_rows(geometry, N)

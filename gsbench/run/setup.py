@@ -48,8 +48,9 @@ def build(config: Config) -> GaussianModel:
         if name in (*options, "name"):
             key = {"agr": "agr", "backend": "raster.backend"}.get(name, f"model.{name}")
             raise InputError(f"model.options: expected no '{name}', which has a key of its own: set {key}")
-    model = models.build(config.model.name, **options, **config.model.options)
-    rehearse(model, config.model.name)
+    options |= config.model.options
+    rehearse(models.build(config.model.name, **options), config.model.name)
+    model = models.build(config.model.name, **options)
     for hook in hook_types():
         hook.check_model(model, config)
     return model
