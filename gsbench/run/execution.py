@@ -5,12 +5,14 @@ A finished run is not trained again: its record is kept, or it is measured again
 
 import gc
 import sys
+import sysconfig
 import traceback
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from gsbench import models
+from gsbench.config import HERE
 from gsbench.config_roles import listed, measuring_differences, training_differences, training_hash
 from gsbench.errors import InputError, one_line, printable
 from gsbench.gates import messages
@@ -287,7 +289,14 @@ def reason_of(error: Exception, folder: Path) -> str:
         return text
     path = folder / TRACEBACK
     path.write_text("".join(traceback.format_exception(error)))
-    return f"an error that gsbench did not foresee, {type(error).__name__}: {text}; please report it, with {path}"
+    raised = f"{type(error).__name__}: {text}"
+    libraries = tuple(map(sysconfig.get_path, ("stdlib", "purelib", "platlib")))
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename).is_relative_to(HERE):
+            break
+        if not frame.filename.startswith(libraries):  # such as a model of the user's
+            return f"an error in {Path(frame.filename).name}, line {frame.lineno}: {raised}; see {path}"
+    return f"an error that gsbench did not foresee, {raised}; please report it, with {path}"
 
 
 def write(record: Record, folder: Path) -> None:

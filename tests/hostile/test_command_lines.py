@@ -1,5 +1,7 @@
 """Hostile command lines: each ends in one line and the exit status of docs/runs.md, and never in a stack trace."""
 
+import re
+
 import pytest
 from tiny_run import main_here, overrides
 
@@ -29,8 +31,8 @@ from gsbench.measure import record
         (["device=cpu:5"], 2, "device 'cpu:5' is not known"),
         (["model.lr.means=1"], 2, "model.lr.means': expected values of its keys, start, end"),
         (["optim.lr=1"], 2, "config key 'optim': expected a value, it has no keys"),
-        (["data.root='~nobody0/x'"], 1, "data.root=~nobody0/x: expected a folder"),
-        (["data.root=pkg://nosuch"], 1, "data.root: expected pkg://MODULE"),
+        (["data.root='~nobody0/x'"], 2, "data.root=~nobody0/x: there is no such folder"),
+        (["data.root=pkg://nosuch"], 2, "data.root: expected pkg://MODULE"),
         (["scene.downscale=16"], 1, "scene.downscale=16: expected images of at least 11 pixels"),
     ],
 )
@@ -76,18 +78,26 @@ def test_a_reader_who_has_gone_costs_no_record(square, tmp_path, monkeypatch, ca
     capsys.readouterr()
 
 
-def test_an_error_that_nobody_foresaw_is_a_record(square, tmp_path, monkeypatch, capsys):
-    """Catches a fault of gsbench's own, as in a new model, that ends the sweep and leaves neither a row nor a stack."""
+def fault(*_: object) -> None:
+    raise ZeroDivisionError("here")
 
-    def fault(*_: object) -> None:
-        raise ZeroDivisionError("here")
 
-    monkeypatch.setattr("gsbench.run.execution.Execution.measure", fault)
+@pytest.mark.parametrize(
+    ("measure", "reason", "frame"),
+    [
+        (None, "an error that gsbench did not foresee, TypeError: .*; please report it, with", "execution.py"),
+        (fault, r"an error in test_command_lines.py, line \d+: ZeroDivisionError: here; see", "in fault"),
+    ],
+)
+def test_an_error_that_nobody_foresaw_is_a_record(measure, reason, frame, square, tmp_path, monkeypatch, capsys):
+    """Catches a fault of gsbench's own, as in a new model, that ends the sweep and leaves neither a row nor a stack,
+    and one of a user's code that is said to be gsbench's."""
+    monkeypatch.setattr("gsbench.run.execution.Execution.measure", measure)
     words = [*overrides(square, tmp_path, "model=3dgs"), "-m", "seed=0,1"]
     assert main_here(*words) == 1
     written = [record.read(path) for path in record.find(tmp_path)]
     assert [run.status for run in written] == ["failed", "failed"]
     for run, path in zip(written, record.find(tmp_path), strict=True):
-        assert "did not foresee, ZeroDivisionError: here" in str(run.reason)
-        assert "in fault" in path.with_name("traceback.txt").read_text()
+        assert re.match(reason, str(run.reason))
+        assert frame in path.with_name("traceback.txt").read_text()
     capsys.readouterr()
