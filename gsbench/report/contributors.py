@@ -87,7 +87,7 @@ def _conflicts(repeats: pd.DataFrame) -> list[Section]:
 def _trainings(results: Results) -> list[Section]:
     """Return the settings in which two contributors' trainings of one model and variant differ."""
     runs = results.runs[~results.runs.rendered_elsewhere]
-    runs = runs.assign(variant=[without(variant, "from") for variant in runs.variant])  # `merge.told_apart` adds it
+    runs = runs.assign(variant=[without(variant, "from") for variant in runs.variant])  # which `merge` adds
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for _, same in runs.drop_duplicates([*RUN[:-1], "contributor"]).groupby(RUN[:-1]):  # all but the seed
         first, *others = same.itertuples()

@@ -2,8 +2,8 @@
 
 A run is left out, and the reason named, if it did not finish or if no commit reproduces it.
 
-Rows are told apart by names, which all sections group by. Runs measured by another protocol are another experiment, and
-a scene with other data is another scene. Of a model that several people trained, the runs of whoever has the most in
+Names distinguish rows, as all sections group by them. Runs measured by another protocol are another experiment, and a
+scene with other data is another scene. Of a model that several people trained, the runs of whoever has the most in
 the experiment keep its name; the others' are a variant, such as "7dgs from=bob".
 """
 
@@ -62,7 +62,7 @@ def read(folders: Sequence[Path]) -> Results:
         training=[training_hash(record.provenance.config) for record in results.runs.record],
         protocol=[protocol_of(record) for record in results.runs.record],
     )
-    return Results(told_apart(runs), results.views, results.curves, results.faults)
+    return Results(with_distinct_names(runs), results.views, results.curves, results.faults)
 
 
 def contributors(folders: Sequence[Path]) -> dict[str, Path]:
@@ -113,7 +113,7 @@ def protocol_of(record: Record) -> str:
     return printable(", ".join([f"protocol {name}", *shown]))
 
 
-def told_apart(runs: pd.DataFrame) -> pd.DataFrame:
+def with_distinct_names(runs: pd.DataFrame) -> pd.DataFrame:
     """Return runs whose names tell protocols, data and contributors apart: columns experiment, scene and variant."""
     runs = runs.assign(experiment=runs.experiment + " (" + runs.protocol + ")")
     place = ["experiment", "dataset"]

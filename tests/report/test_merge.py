@@ -73,7 +73,7 @@ def test_runs_of_other_people_commits_and_machines_are_rows_of_their_own(tmp_pat
     assert ("suzanne", "carol") in best
 
 
-def test_protocols_and_data_are_told_apart(tmp_path):
+def test_protocols_and_data_are_with_distinct_names(tmp_path):
     """Catches a table with two backgrounds, and a scene whose images two people have otherwise, under one name."""
     white, black = ([but(r, protocol={"background": b}) for r in runs_of("4dgs", 24.0)] for b in ("white", "black"))
     recoded = [but(r, provenance={"data_hash": "ff" * 32}) if r.scene == "suzanne" else r for r in black]
