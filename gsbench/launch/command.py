@@ -31,7 +31,7 @@ from gsbench.config import CONF, PATHS, Config, register_schema
 from gsbench.config_roles import ADDED, config_hash, facts, in_order, key_of, names_variant, training_hash
 from gsbench.errors import InputError, deleted_key, did_you_mean
 from gsbench.run.grammar import check_override, quoted_value, typed
-from gsbench.run.settings import check_settings, data_root
+from gsbench.run.settings import EMBEDDED, check_settings, data_root
 
 NO_NAME = re.compile(r"true|false|null|nan|[-+]?inf|[-+]?[\d.]+(e[-+]?\d+)?|[\[{].*|''|\"\"|")  # values for Hydra
 QUESTIONS = ("--hydra-help", "--cfg", "--info", "-i", "--shell-completion", "-sc")  # options that Hydra answers
@@ -217,8 +217,8 @@ def check_runs(runs: Sequence[RunConfig]) -> None:
     _check_distinct(runs)
     for run in runs:
         data = run.config.data
-        # A folder of a Slurm job may exist on its nodes only.
-        if run.config.launch.by != "slurm" and not data_root(data.root).is_dir():
+        # A folder of a Slurm job may exist on its nodes only; to look for the embedded data would import torch.
+        if run.config.launch.by != "slurm" and data.root != EMBEDDED and not data_root(data.root).is_dir():
             raise _no_data(data, f"data.root={data.root}: there is no such folder: set")
 
 

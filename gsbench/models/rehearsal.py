@@ -14,6 +14,7 @@ from gsbench.models.base import GaussianModel, Raw
 from gsbench.models.camera_time import CameraTime
 from gsbench.models.gated import has_gates
 from gsbench.models.gaussian_batch import Conditioned
+from gsbench.models.registry import HOW_TO
 from gsbench.scenes.scene import Points
 
 N = 4  # Gaussians
@@ -30,7 +31,7 @@ def rehearse(model: GaussianModel, name: str) -> None:
     points = torch.eye(N, 3)
     with _named(model, name, "initial_geometry"):
         geometry = model.initial_geometry(Points(points, points), torch.ones(N), torch.Generator().manual_seed(0))
-        _check_rows(geometry, N)
+        _check_rows(geometry)
         missing = {*model.centers, *model.geometry} - {"means", *geometry}
         _check(not missing, f"all parameters of `centers` and `geometry`, {', '.join(sorted(missing))} is missing")
     with _named(model, name, "initialise"):
@@ -64,18 +65,18 @@ def rehearse(model: GaussianModel, name: str) -> None:
                 _check_changed(changed, raw)
 
 
-def _check_rows(raw: Raw, rows: int) -> None:
-    """Raise InputError unless these are raw parameters with so many rows of finite numbers."""
+def _check_rows(raw: Raw) -> None:
+    """Raise InputError unless these are raw parameters of N Gaussians, in finite numbers."""
     _check(isinstance(raw, dict), f"raw parameters by name, got a {type(raw).__name__}")
     for key, value in raw.items():
         _check(isinstance(value, Tensor) and value.dim() > 0, f"a tensor {key}, got {value!r:.60}")
-        _check(len(value) == rows, f"{key} with {rows} rows, one for each Gaussian, got {list(value.shape)}")
+        _check(len(value) == N, f"{key} with {N} rows, one for each Gaussian, got {list(value.shape)}")
         _check(bool(value.isfinite().all()), f"finite {key}, got {value.flatten().tolist()[:N]}")
 
 
 def _check_changed(changed: Raw, raw: Raw) -> None:
     """Raise InputError unless these are new values of raw parameters of N Gaussians."""
-    _check_rows(changed, N)
+    _check_rows(changed)
     for key, value in changed.items():
         _check(key in raw, f"raw parameters, got '{key}', which is none: {', '.join(raw)}")
         shape = list(raw[key].shape)
@@ -122,4 +123,4 @@ def _named(model: GaussianModel, name: str, method: str) -> Iterator[None]:
         where = f"{Path(file).name}, line {lines[-1]}: " if lines else ""
         what = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
         message = f"model '{name}': {method}: {where}{what}{one_line(error)}"
-        raise InputError(message, docs="adding_a_model.md") from error
+        raise InputError(message, docs=HOW_TO) from error

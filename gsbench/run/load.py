@@ -13,14 +13,13 @@ from gsbench.errors import InputError, one_line
 from gsbench.models import GaussianModel
 from gsbench.models.registry import is_registered
 from gsbench.reading import parse
-from gsbench.run.settings import PACKAGE, check_values
+from gsbench.run.settings import EMBEDDED, PACKAGE, check_values
 from gsbench.run.setup import build_with_placeholders, check_scene_names, load_scene
 from gsbench.scenes import Scene
 from gsbench.scenes.scene import Placement
 from gsbench.schedule import Schedule
 from gsbench.train import checkpoint
 
-EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"
 LARGEST_EXTENT = 1e18  # world units: squares stay finite in single precision
 Side = Annotated[int, Meta(ge=1, le=1 << 16)]  # pixels
 THREE = Meta(min_length=3, max_length=3)

@@ -20,6 +20,7 @@ from gsbench.train.hooks import check_step, hook_types
 AUTO = "auto"
 CANDIDATES = ("moving", "static")  # with and without time, of which model=auto trains one
 PACKAGE = "pkg://"  # in front of the module whose files data.root names
+EMBEDDED = f"{PACKAGE}gsbench.scenes.sample"  # the data that gsbench brings
 HOW_TO = "effects.md#comparing-models-on-val"
 
 
